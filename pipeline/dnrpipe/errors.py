@@ -1,0 +1,7 @@
+"""Errors that are the user's to mend: one clear line, exit code 2, no traceback."""
+
+from __future__ import annotations
+
+
+class UserError(Exception):
+    """Bad input. The message says what is wrong, where, and what to do."""

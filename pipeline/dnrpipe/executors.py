@@ -1,0 +1,259 @@
+"""Task lists on local worker processes.
+
+A renderer runs in a process of its own: bpy is process-global state, and a bad LLVM or GL driver kills
+the process it lives in. The parent survives, reports, retries a task once on a fresh worker, and goes on.
+
+Protocol: ``python -m dnrpipe.executors MODULE``. The worker calls ``MODULE.Worker(common)`` once, then
+``worker(task) -> result`` for every JSON line on standard input. Answers are JSON lines on a private copy
+of standard output; what libraries print goes to the log file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+MAX_ATTEMPTS = 2
+
+
+@dataclass
+class TaskResult:
+    """Outcome of one task: ``result`` when it succeeded, else ``error`` (one line)."""
+
+    task: dict[str, Any]
+    result: dict[str, Any] | None = None
+    error: str | None = None
+    attempts: int = 1
+    seconds: float = 0.0
+
+
+@dataclass
+class _Slot:
+    process: subprocess.Popen[str] | None = None
+    died: int = 0
+
+
+@dataclass
+class Retry:
+    """A worker died or a task failed; the task is tried again."""
+
+    task: dict[str, Any]
+    reason: str
+
+
+def run_tasks(
+    module: str,
+    common: dict[str, Any],
+    tasks: Sequence[dict[str, Any]],
+    *,
+    workers: int,
+    log: Path,
+    timeout: float = 3600.0,
+    environment: dict[str, str] | None = None,
+) -> Iterator[TaskResult | Retry]:
+    """Run ``tasks`` on ``workers`` processes; yield a TaskResult per task, and a Retry for each new try.
+
+    Args:
+        module: importable module with a class ``Worker(common)`` that is callable with a task.
+        common: JSON-able, sent once to each worker.
+        log: file to which the workers' output is appended.
+        timeout: seconds after which a silent task counts as hung; its worker is killed.
+        environment: variables added to the workers' environment.
+
+    Closing the iterator (Ctrl-C in the consumer) kills the workers.
+    """
+    pending: queue.SimpleQueue[tuple[dict[str, Any], int]] = queue.SimpleQueue()
+    for task in tasks:
+        pending.put((task, 1))
+    outcomes: queue.SimpleQueue[TaskResult | Retry] = queue.SimpleQueue()
+    stopping = threading.Event()
+    remaining = threading.Semaphore(0)
+    open_tasks = _Counter(len(tasks))
+    slots = [_Slot() for _ in range(max(1, min(workers, len(tasks))))]
+    log.parent.mkdir(parents=True, exist_ok=True)
+
+    def serve(slot: _Slot) -> None:
+        # The thread lives as long as its worker: PR_SET_PDEATHSIG follows the spawning thread.
+        try:
+            while not stopping.is_set() and open_tasks.value > 0:
+                try:
+                    task, attempt = pending.get(timeout=0.05)
+                except queue.Empty:
+                    continue
+                started = time.monotonic()
+                try:
+                    if slot.process is None or slot.process.poll() is not None:
+                        slot.process = _spawn(module, common, log, environment)
+                    answer = _ask(slot.process, task, timeout)
+                except WorkerDied as death:
+                    _kill(slot.process)
+                    slot.process = None
+                    answer = {"error": str(death), "retry": True}
+                if stopping.is_set():
+                    return
+                seconds = time.monotonic() - started
+                if "error" not in answer:
+                    open_tasks.add(-1)
+                    outcomes.put(TaskResult(task, answer["result"], None, attempt, seconds))
+                elif attempt < MAX_ATTEMPTS and answer.get("retry", True):
+                    outcomes.put(Retry(task, answer["error"]))
+                    pending.put((task, attempt + 1))
+                else:
+                    open_tasks.add(-1)
+                    outcomes.put(TaskResult(task, None, answer["error"], attempt, seconds))
+        finally:
+            _close(slot.process, force=stopping.is_set())
+            remaining.release()
+
+    threads = [threading.Thread(target=serve, args=(slot,), daemon=True) for slot in slots]
+    for thread in threads:
+        thread.start()
+    try:
+        yielded = 0
+        while yielded < len(tasks):
+            outcome = outcomes.get()
+            yielded += isinstance(outcome, TaskResult)
+            yield outcome
+    finally:
+        stopping.set() if open_tasks.value > 0 else None
+        if stopping.is_set():
+            for slot in slots:
+                _kill(slot.process)
+        for thread in threads:
+            thread.join(timeout=10)
+
+
+class WorkerDied(RuntimeError):
+    """The worker process ended or hung while a task was under way."""
+
+
+@dataclass
+class _Counter:
+    value: int
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def add(self, step: int) -> None:
+        with self.lock:
+            self.value += step
+
+
+def _spawn(
+    module: str, common: dict[str, Any], log: Path, environment: dict[str, str] | None
+) -> subprocess.Popen[str]:
+    with log.open("a") as sink:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "dnrpipe.executors", module],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=sink,
+            text=True,
+            env={**os.environ, "PYTHONUNBUFFERED": "1", **(environment or {})},
+        )
+    assert process.stdin is not None
+    try:
+        process.stdin.write(json.dumps(common) + "\n")
+        process.stdin.flush()
+    except OSError:
+        raise WorkerDied(_epitaph(process)) from None
+    return process
+
+
+def _ask(process: subprocess.Popen[str], task: dict[str, Any], timeout: float) -> dict[str, Any]:
+    assert process.stdin is not None and process.stdout is not None
+    timer = threading.Timer(timeout, process.kill)
+    timer.daemon = True
+    timer.start()
+    started = time.monotonic()
+    try:
+        try:
+            process.stdin.write(json.dumps(task) + "\n")
+            process.stdin.flush()
+            line = process.stdout.readline()
+        except OSError:
+            line = ""
+        if not line:
+            hung = time.monotonic() - started >= timeout
+            raise WorkerDied(f"worker hung for {timeout:.0f} s" if hung else _epitaph(process))
+        return json.loads(line)
+    finally:
+        timer.cancel()
+
+
+def _epitaph(process: subprocess.Popen[str]) -> str:
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(timeout=5)
+    code = process.returncode
+    if code is not None and code < 0:
+        with contextlib.suppress(ValueError):
+            return f"worker was killed by {signal.Signals(-code).name}"
+    return f"worker ended with exit code {code}"
+
+
+def _kill(process: subprocess.Popen[str] | None) -> None:
+    if process is not None and process.poll() is None:
+        process.kill()
+
+
+def _close(process: subprocess.Popen[str] | None, *, force: bool) -> None:
+    if process is None:
+        return
+    with contextlib.suppress(OSError):
+        if process.stdin:
+            process.stdin.close()
+    if force:
+        _kill(process)
+    try:
+        process.wait(timeout=20)
+    except subprocess.TimeoutExpired:  # a library that hangs at exit; its work is on disk already
+        process.kill()
+        process.wait()
+    if process.stdout:
+        process.stdout.close()
+
+
+def _die_with_parent() -> None:
+    """Ask Linux to kill this worker when the thread that started it dies; elsewhere stdin's end serves."""
+    if sys.platform == "linux":
+        import ctypes
+
+        parent_death_signal = 1  # PR_SET_PDEATHSIG
+        ctypes.CDLL(None, use_errno=True).prctl(parent_death_signal, signal.SIGKILL)
+
+
+def _worker_main(module: str) -> int:
+    _die_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    answers = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+    common = json.loads(sys.stdin.readline())
+    worker = importlib.import_module(module).Worker(common)
+    for line in sys.stdin:
+        try:
+            answer = {"result": worker(json.loads(line))}
+        except Exception as error:  # reported to the parent, the traceback goes to the log
+            import traceback
+
+            traceback.print_exc()
+            reason = " ".join(str(error).split()) or type(error).__name__
+            answer = {"error": reason, "retry": not isinstance(error, ValueError)}
+        answers.write(json.dumps(answer) + "\n")
+        answers.flush()
+    answers.flush()
+    sys.stderr.flush()
+    os._exit(0)  # bpy and Dr.Jit may crash in their own shutdown after all work is written
+
+
+if __name__ == "__main__":
+    raise SystemExit(_worker_main(sys.argv[1]))

@@ -1,0 +1,212 @@
+"""Settings: one nested model per stage; presets; dnrpipe.toml < environment < flags.
+
+Flags are remembered in the workspace, so `dnrpipe select --budget 25` still holds when
+`dnrpipe report` runs. Unknown keys are errors that name the key and its neighbours.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from dnrtrain.settings import LossWeights, ModelSettings, Step1Settings, Step2Settings, Strict
+from pydantic import Field, ValidationError
+
+from .errors import UserError
+
+ENVIRONMENT_PREFIX = "DNRPIPE_"
+ENVIRONMENT_OTHER = {"DNRPIPE_WORKSPACE", "DNRPIPE_CACHE", "DNRPIPE_PRESET"}
+
+
+class CameraSettings(Strict):
+    """Which views exist."""
+
+    source: str = Field("auto", description="auto (= dome), dome, sphere, scene, animation, or a transforms.json")
+    train: int = Field(100, ge=1, le=100_000, description="candidate views")
+    val: int = Field(100, ge=0, le=100_000)
+    test: int = Field(200, ge=0, le=100_000)
+    width: int = Field(800, ge=8, le=16384)
+    height: int = Field(800, ge=8, le=16384)
+    distance: float = Field(1.0, gt=0, description="1 = the bounding sphere just fits the frame")
+    seed: int = Field(0, ge=0)
+
+
+class PassSettings(Strict):
+    """Rasterised colour and G-buffers."""
+
+    raster: Literal["auto", "eevee", "workbench", "cycles-direct"] = "auto"
+    raster_samples: int = Field(4, ge=1, le=4096)
+    coverage_samples: int = Field(16, ge=1, le=4096, description="samples of the coverage pass")
+    workers: int = Field(0, ge=0, description="0 = one per core")
+
+
+class RaytraceSettings(Strict):
+    """Path tracing with Mitsuba."""
+
+    spp: int = Field(256, ge=1, le=1_000_000)
+    evaluation_spp: int = Field(512, ge=1, le=1_000_000, description="samples of held-out references")
+    max_depth: int = Field(12, ge=1, le=10_000, description="path vertices; 2 = direct light")
+    variant: Literal["auto", "cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb"] = "auto"
+    seed: int = Field(0, ge=0)
+    workers: int = Field(0, ge=0, description="0 = one per core")
+
+
+class SelectSettings(Strict):
+    """Which of the candidates are ray-traced."""
+
+    budget: int = Field(25, ge=1, description="views to ray-trace")
+    policy: Literal["rl", "random", "farthest"] = "rl"
+    seed: int = Field(0, ge=0)
+    step1: Step1Settings = Step1Settings()
+
+
+class FinetuneSettings(Strict):
+    """Step 2."""
+
+    seed: int = Field(0, ge=0)
+    step2: Step2Settings = Step2Settings()
+
+
+class Settings(Strict):
+    """Everything that decides what a run computes."""
+
+    preset: str = "draft"
+    cameras: CameraSettings = CameraSettings()
+    passes: PassSettings = PassSettings()
+    model: ModelSettings = ModelSettings()
+    select: SelectSettings = SelectSettings()
+    raytrace: RaytraceSettings = RaytraceSettings()
+    finetune: FinetuneSettings = FinetuneSettings()
+    device: str = Field("auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="torch device")
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    # Minutes on two CPU cores.
+    "draft": {
+        "cameras": {"train": 40, "val": 4, "test": 12, "width": 128, "height": 128},
+        "raytrace": {"spp": 128, "evaluation_spp": 256},
+        "model": {"texture_size": 128, "width": 24, "depth": 3, "aggregator": "residual"},
+        "select": {"step1": {"epochs": 12}},
+        "finetune": {"step2": {"epochs": 30, "photometric": "l1"}},
+    },
+    "standard": {
+        "cameras": {"train": 100, "val": 10, "test": 50, "width": 384, "height": 384},
+        "raytrace": {"spp": 256, "evaluation_spp": 512},
+        "model": {"texture_size": 256, "width": 32, "depth": 4, "aggregator": "residual"},
+        "select": {"step1": {"epochs": 30}},
+        "finetune": {"step2": {"epochs": 60, "photometric": "l1"}},
+    },
+    # The paper's numbers: every default of the models above is the paper's.
+    "paper": {},
+}
+
+
+def resolve(
+    preset: str | None,
+    overrides: Mapping[str, Any],
+    *,
+    toml_files: list[Path] | None = None,
+    environment: Mapping[str, str] | None = None,
+) -> Settings:
+    """Layer preset < toml files (in order) < environment < overrides, and validate.
+
+    ``overrides`` and the files are nested dicts. A preset named in a later layer replaces the earlier
+    one. Raises UserError naming the layer and the key.
+    """
+    environment = os.environ if environment is None else environment
+    layers: list[tuple[str, dict[str, Any]]] = []
+    for path in toml_files or []:
+        try:
+            layers.append((str(path), tomllib.loads(path.read_text(encoding="utf-8"))))
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+            raise UserError(f"{path}: not valid TOML ({error})") from None
+    layers.append(("environment", _from_environment(environment)))
+    layers.append(("flags", dict(overrides)))
+    name = preset
+    for _, layer in layers:
+        name = layer.get("preset", name) if preset is None else preset
+    name = name or "draft"
+    if name not in PRESETS:
+        raise UserError(f"unknown preset '{name}'; choose one of {', '.join(PRESETS)}")
+    merged: dict[str, Any] = {}
+    _merge(merged, PRESETS[name])
+    for source, layer in layers:
+        _check_keys(source, layer, Settings)
+        _merge(merged, layer)
+    merged["preset"] = name
+    try:
+        return Settings.model_validate(merged)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise UserError(f"setting {where}: {first['msg'].lower()}, got {first['input']!r}") from None
+
+
+def parse_assignment(text: str) -> dict[str, Any]:
+    """``finetune.step2.epochs=20`` -> nested dict. The value is read as TOML, else as a string."""
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise UserError(f"--set {text!r}: expected KEY=VALUE, e.g. --set finetune.step2.epochs=20")
+    return _nest(key.strip().split("."), _toml_value(value.strip()))
+
+
+def merge(base: dict[str, Any], extra: Mapping[str, Any]) -> dict[str, Any]:
+    """``base`` with ``extra`` merged into a copy, recursively."""
+    result: dict[str, Any] = {}
+    _merge(result, base)
+    _merge(result, extra)
+    return result
+
+
+def _from_environment(environment: Mapping[str, str]) -> dict[str, Any]:
+    """``DNRPIPE_FINETUNE__STEP2__EPOCHS=20`` -> nested dict."""
+    result: dict[str, Any] = {}
+    for name, value in sorted(environment.items()):
+        if name == "DNRPIPE_PRESET":
+            result["preset"] = value
+        elif name.startswith(ENVIRONMENT_PREFIX) and name not in ENVIRONMENT_OTHER:
+            _merge(result, _nest(name.removeprefix(ENVIRONMENT_PREFIX).lower().split("__"), _toml_value(value)))
+    return result
+
+
+def _toml_value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _nest(keys: list[str], value: Any) -> dict[str, Any]:
+    for key in reversed(keys):
+        value = {key: value}
+    return value
+
+
+def _merge(target: dict[str, Any], extra: Mapping[str, Any]) -> None:
+    for key, value in extra.items():
+        if isinstance(value, Mapping):
+            branch = target.get(key)
+            target[key] = dict(branch) if isinstance(branch, dict) else {}
+            _merge(target[key], value)
+        else:
+            target[key] = value
+
+
+def _check_keys(source: str, layer: Mapping[str, Any], model: type[Strict], prefix: str = "") -> None:
+    for key, value in layer.items():
+        if key not in model.model_fields:
+            near = difflib.get_close_matches(key, model.model_fields, n=1)
+            hint = f"did you mean '{prefix}{near[0]}'?" if near else f"known: {', '.join(model.model_fields)}"
+            raise UserError(f"{source}: unknown setting '{prefix}{key}'; {hint}")
+        nested = model.model_fields[key].annotation
+        if isinstance(value, Mapping):
+            if not (isinstance(nested, type) and issubclass(nested, Strict)):
+                raise UserError(f"{source}: setting '{prefix}{key}' is a single value, not a table")
+            _check_keys(source, value, nested, f"{prefix}{key}.")
+
+
+__all__ = ["PRESETS", "LossWeights", "Settings", "merge", "parse_assignment", "resolve"]

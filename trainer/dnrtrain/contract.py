@@ -1,0 +1,240 @@
+"""The data contract between the pipeline and the trainer: views, channels, frames, units.
+
+Notation
+    world    Blender's: right-handed, Z up, scene units as in the file
+    camera   OpenGL's: +X right, +Y up, -Z forward
+    c2w      camera-to-world, row-major 4x4
+    pixel    (0, 0) is top left; centres at half integers; (cx, cy) in pixels from the top left corner
+    EXR      float32; R G B A is linear Rec.709 radiance with premultiplied alpha
+
+Channels of a passes file (``passes/<split>/<view>.exr``)
+    R G B A               rasterised colour (only where the view has one)
+    depth.Z               planar depth in scene units, 0 where mask is 0
+    normal.X/Y/Z          world-space shading normal, unit; 0 where mask is 0
+    uv.U/V                atlas coordinates in [0, 1), V up; 0 where mask is 0
+    position.X/Y/Z        world position; 0 where mask is 0
+    object.Id             1-based object number (float), 0 = background
+    mask                  1 where the ray through the pixel centre hits a surface, else 0
+    coverage              fraction of the pixel's area that surfaces cover, in [0, 1] (box filter)
+All but R G B A and coverage are sampled at the pixel centre, never filtered.
+
+Channels of a ray-traced file (``raytraced/<split>/<view>.exr``)
+    R G B A               linear Rec.709 radiance, premultiplied, box filter, transparent background
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from .atomic import write_json
+
+RASTER_CHANNELS = ("R", "G", "B", "A")
+GBUFFER_CHANNELS = (
+    "depth.Z",
+    "normal.X",
+    "normal.Y",
+    "normal.Z",
+    "uv.U",
+    "uv.V",
+    "position.X",
+    "position.Y",
+    "position.Z",
+    "object.Id",
+    "mask",
+    "coverage",
+)
+SPLITS = ("train", "val", "test")
+Split = Literal["train", "val", "test", "novel"]
+
+
+class ContractError(ValueError):
+    """Input that breaks the data contract; the message names what, where and what to do."""
+
+
+class View(BaseModel):
+    """One pinhole camera. Lengths in pixels (intrinsics) and scene units (c2w).
+
+    ``name`` is unique within its split and is the stem of its files.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str = Field(pattern=r"^[A-Za-z0-9_.-]+$")
+    width: int = Field(ge=1, le=16384)
+    height: int = Field(ge=1, le=16384)
+    fl_x: float = Field(gt=0)
+    fl_y: float = Field(gt=0)
+    cx: float
+    cy: float
+    c2w: tuple[tuple[float, ...], ...]
+
+    @field_validator("fl_x", "fl_y", "cx", "cy")
+    @classmethod
+    def _finite(cls, value: float) -> float:
+        if not math.isfinite(value):
+            raise ValueError("must be finite")
+        return value
+
+    @field_validator("c2w")
+    @classmethod
+    def _rigid(cls, value: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
+        matrix = np.asarray(value, dtype=np.float64)
+        if matrix.shape != (4, 4):
+            raise ValueError(f"transform must be 4x4, is {matrix.shape}")
+        if not np.isfinite(matrix).all():
+            raise ValueError("transform contains NaN or infinity")
+        rotation = matrix[:3, :3]
+        if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+            raise ValueError("transform is not a rotation and a translation (scaled, sheared or mirrored)")
+        return value
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """Camera-to-world as float64 [4, 4]."""
+        return np.asarray(self.c2w, dtype=np.float64)
+
+    @property
+    def position(self) -> np.ndarray:
+        """Camera centre in world space, float64 [3]."""
+        return self.matrix[:3, 3]
+
+    def ray_directions(self) -> np.ndarray:
+        """Unit world-space directions from the camera through pixel centres, float32 [H, W, 3]."""
+        x = (np.arange(self.width) + 0.5 - self.cx) / self.fl_x
+        y = -(np.arange(self.height) + 0.5 - self.cy) / self.fl_y
+        grid_x, grid_y = np.meshgrid(x, y)
+        camera = np.stack([grid_x, grid_y, -np.ones_like(grid_x)], axis=-1)
+        world = camera @ self.matrix[:3, :3].T
+        return (world / np.linalg.norm(world, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def write_cameras(path: Path, views: Sequence[View], split: str) -> None:
+    """Write views as a NeRF ``transforms`` file with per-frame intrinsics, atomically."""
+    frames = [
+        {
+            "file_path": f"{split}/{view.name}",
+            "w": view.width,
+            "h": view.height,
+            "fl_x": view.fl_x,
+            "fl_y": view.fl_y,
+            "cx": view.cx,
+            "cy": view.cy,
+            "transform_matrix": [list(row) for row in view.c2w],
+        }
+        for view in views
+    ]
+    write_json(path, {"camera_model": "OPENCV", "frames": frames})
+
+
+def read_cameras(path: Path) -> list[View]:
+    """Read a ``transforms`` file that :func:`write_cameras` wrote. Raises ContractError."""
+    return parse_transforms(path)
+
+
+def parse_transforms(path: Path, default_size: tuple[int, int] | None = None) -> list[View]:
+    """Read views from any NeRF / nerfstudio / instant-ngp ``transforms.json``.
+
+    Intrinsics may stand per frame or once per file: ``fl_x``/``fl_y``, or ``camera_angle_x``/``_y``
+    (radians); ``cx``/``cy`` default to the image centre; ``w``/``h`` default to ``default_size``
+    (width, height). When the file gives a size and ``default_size`` differs, the file wins.
+
+    Raises:
+        ContractError: not JSON, no frames, NaN, missing intrinsics, lens distortion, not a rigid pose.
+    """
+    try:
+        data: Any = json.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ContractError(f"{path}: no such camera file") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ContractError(f"{path}: not a JSON camera file ({error})") from None
+    if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
+        raise ContractError(f"{path}: has no 'frames'; expected a NeRF transforms.json")
+    views: list[View] = []
+    for index, frame in enumerate(data["frames"]):
+        try:
+            views.append(_parse_frame(frame, data, index, default_size))
+        except (ValueError, TypeError, KeyError) as error:
+            reason = str(error).replace("\n", " ")
+            if hasattr(error, "errors"):
+                reason = "; ".join(e["msg"].removeprefix("Value error, ") for e in error.errors())  # type: ignore[attr-defined]
+            raise ContractError(f"{path}: frame {index}: {reason}") from None
+    names = [view.name for view in views]
+    if len(set(names)) != len(names):
+        views = [view.model_copy(update={"name": f"{i:04d}"}) for i, view in enumerate(views)]
+    return views
+
+
+def _parse_frame(frame: Any, shared: dict[str, Any], index: int, size: tuple[int, int] | None) -> View:
+    def value(key: str) -> float | None:
+        found = frame.get(key, shared.get(key))
+        return None if found is None else float(found)
+
+    for key in ("k1", "k2", "k3", "k4", "p1", "p2"):
+        if value(key):
+            raise ValueError(f"lens distortion ({key}) is not supported; undistort the cameras first")
+    width, height = value("w"), value("h")
+    if width is None or height is None:
+        if size is None:
+            raise ValueError("has no image size ('w', 'h')")
+        width, height = size
+    if not (math.isfinite(width) and math.isfinite(height)):
+        raise ValueError("image size is not finite")
+    angle_x, angle_y = value("camera_angle_x"), value("camera_angle_y")
+    fl_x = value("fl_x")
+    if fl_x is None:
+        if angle_x is None:
+            raise ValueError("has no focal length ('fl_x' or 'camera_angle_x')")
+        fl_x = 0.5 * width / math.tan(0.5 * angle_x)
+    fl_y = value("fl_y")
+    if fl_y is None:
+        fl_y = 0.5 * height / math.tan(0.5 * angle_y) if angle_y is not None else fl_x
+    cx, cy = value("cx"), value("cy")
+    name = Path(str(frame.get("file_path") or f"{index:04d}")).name
+    stem = name.rsplit(".", 1)[0] if name.lower().endswith((".png", ".jpg", ".jpeg", ".exr")) else name
+    matrix = np.asarray(frame["transform_matrix"], dtype=np.float64)
+    return View(
+        name="".join(c if c.isalnum() or c in "_.-" else "_" for c in stem),
+        width=int(width),
+        height=int(height),
+        fl_x=fl_x,
+        fl_y=fl_y,
+        cx=width / 2 if cx is None else cx,
+        cy=height / 2 if cy is None else cy,
+        c2w=tuple(tuple(float(x) for x in row) for row in matrix),
+    )
+
+
+class SceneFrame(BaseModel):
+    """What the trainer must know of the scene beside pixels (``scene/frame.json``).
+
+    near, far: planar depth range, scene units, that normalises depth to [0, 1].
+    center, radius: bounding sphere, scene units.
+    exposure: stops, applied in linear space before the display transform.
+    view_transform: name of the scene's view transform ("Standard", "AgX", ...).
+    display_lut: file beside this one with the baked display transform, or None for plain sRGB.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    near: float = Field(gt=0)
+    far: float = Field(gt=0)
+    center: tuple[float, float, float]
+    radius: float = Field(gt=0)
+    exposure: float = 0.0
+    gamma: float = 1.0
+    view_transform: str = "Standard"
+    display_lut: str | None = None
+
+
+def require_channels(path: Path, present: Iterable[str], wanted: Iterable[str]) -> None:
+    """Raise ContractError naming the channels of ``path`` that are missing."""
+    missing = sorted(set(wanted) - set(present))
+    if missing:
+        raise ContractError(f"{path}: channels {', '.join(missing)} are missing; run `dnrpipe prepare` again")

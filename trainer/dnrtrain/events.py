@@ -1,0 +1,44 @@
+"""What training tells its caller. Schedules yield these; they never print."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True)
+class EpochEnd:
+    """One epoch is done and its checkpoint is on disk.
+
+    losses: mean of each loss term over the epoch's steps. val: metrics on validation views or {}.
+    seconds: wall time; cpu_seconds: process time; steps: optimiser steps; skipped: non-finite steps.
+    """
+
+    stage: str
+    epoch: int
+    epochs: int
+    losses: dict[str, float]
+    val: dict[str, float]
+    seconds: float
+    cpu_seconds: float
+    steps: int
+    skipped: int = 0
+    device: str = "cpu"
+
+
+@dataclass(frozen=True)
+class Selected:
+    """Step 1 is done: names of the chosen views, in order, and what the policy says of itself."""
+
+    views: list[str]
+    policy: str
+    details: dict[str, float | str | list[float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Note:
+    """Something the user should know (weights missing, a loss term dropped, steps skipped)."""
+
+    text: str
+
+
+Event = EpochEnd | Selected | Note
