@@ -149,9 +149,7 @@ class _Counter:
             self.value += step
 
 
-def _spawn(
-    module: str, common: dict[str, Any], log: Path, environment: dict[str, str] | None
-) -> subprocess.Popen[str]:
+def _spawn(module: str, common: dict[str, Any], log: Path, environment: dict[str, str] | None) -> subprocess.Popen[str]:
     with log.open("a") as sink:
         process = subprocess.Popen(
             [sys.executable, "-m", "dnrpipe.executors", module],

@@ -13,8 +13,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from dnrtrain.settings import LossWeights, ModelSettings, Step1Settings, Step2Settings, Strict
 from pydantic import Field, ValidationError
+
+from dnrtrain.settings import LossWeights, ModelSettings, Step1Settings, Step2Settings, Strict
 
 from .errors import UserError
 
@@ -25,49 +26,51 @@ ENVIRONMENT_OTHER = {"DNRPIPE_WORKSPACE", "DNRPIPE_CACHE", "DNRPIPE_PRESET"}
 class CameraSettings(Strict):
     """Which views exist."""
 
-    source: str = Field("auto", description="auto (= dome), dome, sphere, scene, animation, or a transforms.json")
-    train: int = Field(100, ge=1, le=100_000, description="candidate views")
-    val: int = Field(100, ge=0, le=100_000)
-    test: int = Field(200, ge=0, le=100_000)
-    width: int = Field(800, ge=8, le=16384)
-    height: int = Field(800, ge=8, le=16384)
-    distance: float = Field(1.0, gt=0, description="1 = the bounding sphere just fits the frame")
-    seed: int = Field(0, ge=0)
+    source: str = Field(
+        default="auto", description="auto (= dome), dome, sphere, scene, animation, or a transforms.json"
+    )
+    train: int = Field(default=100, ge=1, le=100_000, description="candidate views")
+    val: int = Field(default=100, ge=0, le=100_000)
+    test: int = Field(default=200, ge=0, le=100_000)
+    width: int = Field(default=800, ge=8, le=16384)
+    height: int = Field(default=800, ge=8, le=16384)
+    distance: float = Field(default=1.0, gt=0, description="1 = the bounding sphere just fits the frame")
+    seed: int = Field(default=0, ge=0)
 
 
 class PassSettings(Strict):
     """Rasterised colour and G-buffers."""
 
     raster: Literal["auto", "eevee", "workbench", "cycles-direct"] = "auto"
-    raster_samples: int = Field(4, ge=1, le=4096)
-    coverage_samples: int = Field(16, ge=1, le=4096, description="samples of the coverage pass")
-    workers: int = Field(0, ge=0, description="0 = one per core")
+    raster_samples: int = Field(default=4, ge=1, le=4096)
+    coverage_samples: int = Field(default=16, ge=1, le=4096, description="samples of the coverage pass")
+    workers: int = Field(default=0, ge=0, description="0 = one per core")
 
 
 class RaytraceSettings(Strict):
     """Path tracing with Mitsuba."""
 
-    spp: int = Field(256, ge=1, le=1_000_000)
-    evaluation_spp: int = Field(512, ge=1, le=1_000_000, description="samples of held-out references")
-    max_depth: int = Field(12, ge=1, le=10_000, description="path vertices; 2 = direct light")
+    spp: int = Field(default=256, ge=1, le=1_000_000)
+    evaluation_spp: int = Field(default=512, ge=1, le=1_000_000, description="samples of held-out references")
+    max_depth: int = Field(default=12, ge=1, le=10_000, description="path vertices; 2 = direct light")
     variant: Literal["auto", "cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb"] = "auto"
-    seed: int = Field(0, ge=0)
-    workers: int = Field(0, ge=0, description="0 = one per core")
+    seed: int = Field(default=0, ge=0)
+    workers: int = Field(default=0, ge=0, description="0 = one per core")
 
 
 class SelectSettings(Strict):
     """Which of the candidates are ray-traced."""
 
-    budget: int = Field(25, ge=1, description="views to ray-trace")
+    budget: int = Field(default=25, ge=1, description="views to ray-trace")
     policy: Literal["rl", "random", "farthest"] = "rl"
-    seed: int = Field(0, ge=0)
+    seed: int = Field(default=0, ge=0)
     step1: Step1Settings = Step1Settings()
 
 
 class FinetuneSettings(Strict):
     """Step 2."""
 
-    seed: int = Field(0, ge=0)
+    seed: int = Field(default=0, ge=0)
     step2: Step2Settings = Step2Settings()
 
 
@@ -81,7 +84,7 @@ class Settings(Strict):
     select: SelectSettings = SelectSettings()
     raytrace: RaytraceSettings = RaytraceSettings()
     finetune: FinetuneSettings = FinetuneSettings()
-    device: str = Field("auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="torch device")
+    device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="torch device")
 
 
 PRESETS: dict[str, dict[str, Any]] = {

@@ -16,53 +16,57 @@ class Strict(BaseModel):
 class ModelSettings(Strict):
     """The deferred neural renderer (paper section III-D; DNR, Thies et al. 2019, section 4)."""
 
-    texture_size: int = Field(512, ge=8, le=8192, description="texels per side of the finest texture level")
-    texture_levels: int = Field(4, ge=1, le=12, description="levels of the texture pyramid, summed")
-    texture_channels: int = Field(16, ge=12, le=256, description="channels; 9 of them meet the harmonics")
-    spherical_harmonics: bool = Field(True, description="multiply 9 channels by bands 0-2 of the view direction")
+    texture_size: int = Field(default=512, ge=8, le=8192, description="texels per side of the finest texture level")
+    texture_levels: int = Field(default=4, ge=1, le=12, description="levels of the texture pyramid, summed")
+    texture_channels: int = Field(default=16, ge=12, le=256, description="channels; 9 of them meet the harmonics")
+    spherical_harmonics: bool = Field(
+        default=True, description="multiply 9 channels by bands 0-2 of the view direction"
+    )
     aggregator: Literal["concat", "residual", "early"] = Field(
-        "concat",
+        default="concat",
         description="concat: the paper's; residual: fused as a residual on the UV texture; early: 9-channel input",
     )
     modalities: Literal["uv", "uv+depth", "uv+normal", "uv+depth+normal"] = "uv+depth+normal"
-    width: int = Field(64, ge=4, le=512, description="channels of the U-Net's first level")
-    depth: int = Field(4, ge=1, le=6, description="down-samplings of the U-Net")
+    width: int = Field(default=64, ge=4, le=512, description="channels of the U-Net's first level")
+    depth: int = Field(default=4, ge=1, le=6, description="down-samplings of the U-Net")
 
 
 class Step1Settings(Strict):
     """Step 1: coarse DNR and selector on rasterised images (paper equations 2-5)."""
 
-    epochs: int = Field(50, ge=1, description="one epoch is as many steps as there are candidate views")
-    learning_rate: float = Field(1e-3, gt=0)
-    learning_rate_end: float = Field(1e-4, gt=0)
-    weight_rl: float = Field(0.1, ge=0, description="lambda_RL")
-    weight_dnr: float = Field(1.0, ge=0, description="lambda_DNRc")
-    gamma: float = Field(0.99, ge=0, le=1, description="discount factor")
-    epsilon_start: float = Field(0.9, ge=0, le=1)
-    epsilon_end: float = Field(0.05, ge=0, le=1)
+    epochs: int = Field(default=50, ge=1, description="one epoch is as many steps as there are candidate views")
+    learning_rate: float = Field(default=1e-3, gt=0)
+    learning_rate_end: float = Field(default=1e-4, gt=0)
+    weight_rl: float = Field(default=0.1, ge=0, description="lambda_RL")
+    weight_dnr: float = Field(default=1.0, ge=0, description="lambda_DNRc")
+    gamma: float = Field(default=0.99, ge=0, le=1, description="discount factor")
+    epsilon_start: float = Field(default=0.9, ge=0, le=1)
+    epsilon_end: float = Field(default=0.05, ge=0, le=1)
     reward: Literal["neg-loss", "pos-loss", "improvement"] = "neg-loss"
-    embedding: int = Field(64, ge=4, description="width of camera embedding and hidden vector")
+    embedding: int = Field(default=64, ge=4, description="width of camera embedding and hidden vector")
 
 
 class LossWeights(Strict):
     """The six losses of step 2 (paper, implementation details)."""
 
-    photometric: float = Field(1.0, ge=0)
-    ssim: float = Field(0.1, ge=0)
-    perceptual: float = Field(0.1, ge=0)
-    frequency: float = Field(0.01, ge=0)
-    total_variation: float = Field(0.001, ge=0)
-    regularisation: float = Field(0.1, ge=0)
+    photometric: float = Field(default=1.0, ge=0)
+    ssim: float = Field(default=0.1, ge=0)
+    perceptual: float = Field(default=0.1, ge=0)
+    frequency: float = Field(default=0.01, ge=0)
+    total_variation: float = Field(default=0.001, ge=0)
+    regularisation: float = Field(default=0.1, ge=0)
 
 
 class Step2Settings(Strict):
     """Step 2: fine-tuning on the selected ray-traced views."""
 
-    epochs: int = Field(100, ge=1, description="passes over the selected views")
-    batch: int = Field(1, ge=1, description="views per optimiser step")
-    learning_rate: float = Field(1e-3, gt=0)
-    learning_rate_end: float = Field(1e-4, gt=0)
+    epochs: int = Field(default=100, ge=1, description="passes over the selected views")
+    batch: int = Field(default=1, ge=1, description="views per optimiser step")
+    learning_rate: float = Field(default=1e-3, gt=0)
+    learning_rate_end: float = Field(default=1e-4, gt=0)
     photometric: Literal["l1", "mse"] = "mse"
-    augment: bool = Field(True, description="random flips and quarter turns")
-    precision: Literal["auto", "float32", "bfloat16"] = Field("auto", description="auto: bfloat16 where it is fast")
+    augment: bool = Field(default=True, description="random flips and quarter turns")
+    precision: Literal["auto", "float32", "bfloat16"] = Field(
+        default="auto", description="auto: bfloat16 where it is fast"
+    )
     loss: LossWeights = LossWeights()

@@ -1,0 +1,60 @@
+# The project's habits. `make help` lists them.
+PYTHON  ?= $(shell command -v python3.11 || command -v python3)
+VENV    := .venv
+BIN     := $(VENV)/bin
+STAMP   := $(VENV)/.installed
+DEMO    := demo-output
+# The LLVM that Mitsuba needs, X11/GL that Blender links, and a browser for the report's screenshot test.
+APT     := libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1 libatomic1 libllvm19 libegl1 libgl1-mesa-dri
+APT_DEV := chromium
+
+.DEFAULT_GOAL := help
+.PHONY: help setup system browser demo test lint types imports docs docs-check bench clean
+
+help:  ## this list
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
+
+setup: system $(STAMP)  ## .venv with everything, system libraries where this is Debian and we are root
+	@$(BIN)/dnrpipe weights >/dev/null || echo "no perceptual weights: training will say so and drop that loss"
+
+system:
+	@sh tools/system-libraries.sh $(APT)
+
+$(STAMP): pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check torch==2.13.0
+	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[render,train,dev]'
+	@touch $@
+
+demo: setup  ## the demo scene from .blend to report; prints the report's path
+	@$(BIN)/dnrpipe run blender_scenes/demo.blend --budget 25 -w $(DEMO)/demo.dnr
+	@$(BIN)/dnrpipe render -w $(DEMO)/demo.dnr --orbit 60
+	@$(BIN)/dnrpipe report -w $(DEMO)/demo.dnr
+
+test: setup browser lint types imports docs-check  ## lint, types, import rules, documentation, all tests
+	$(BIN)/pytest -q
+
+browser:
+	@sh tools/system-libraries.sh $(APT_DEV)
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(STAMP)
+	$(BIN)/pyright
+
+imports: $(STAMP)
+	$(BIN)/lint-imports
+
+docs: $(STAMP)  ## regenerate the CLI reference from --help
+	$(BIN)/python tools/cli_reference.py docs/cli.md
+
+docs-check: $(STAMP)
+	$(BIN)/python tools/cli_reference.py --check docs/cli.md
+
+bench: setup  ## time the parts that the README speaks of
+	$(BIN)/python tools/bench.py
+
+clean:  ## remove what make made
+	rm -rf $(VENV) $(DEMO) .pytest_cache .ruff_cache .hypothesis

@@ -1,0 +1,198 @@
+"""Which views exist: domes and spheres around the scene, its own cameras, camera files.
+
+Notation
+    center, radius   bounding sphere of the scene, scene units
+    elevation        angle above the horizontal plane through the centre, radians
+    fl               focal length in pixels
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dnrtrain.contract import SPLITS, ContractError, View, parse_transforms
+
+from .errors import UserError
+from .settings import CameraSettings
+
+DEFAULT_LENS = 50.0  # mm on a 36 mm sensor: Blender's default camera
+DEFAULT_SENSOR = 36.0
+LOWEST, HIGHEST = math.radians(5.0), math.radians(85.0)
+# Splits drawn from different streams, so that asking for more of one leaves the others as they were.
+_STREAM = {"train": 0, "val": 1, "test": 2}
+
+
+def make_cameras(summary: dict[str, Any], settings: CameraSettings) -> dict[str, list[View]]:
+    """Views of each split for a prepared scene (``scene/summary.json``).
+
+    Raises UserError: a source that the scene does not have, or a broken camera file.
+    """
+    source = settings.source
+    if source in ("auto", "dome", "sphere"):
+        return {
+            split: sphere_views(
+                summary,
+                settings,
+                count=getattr(settings, split),
+                stream=_STREAM[split],
+                hemisphere=source != "sphere",
+            )
+            for split in SPLITS
+        }
+    if source == "scene":
+        cameras = [c for c in summary["cameras"] if c["type"] == "PERSP"]
+        if not cameras:
+            raise UserError("--cameras scene: the scene has no perspective camera; use --cameras dome")
+        return split_views([_scene_view(c, settings) for c in cameras], settings)
+    if source == "animation":
+        frames = [f for f in summary["animation"] if f.get("type", "PERSP") == "PERSP"]
+        if len(frames) < 2:
+            raise UserError("--cameras animation: the active camera does not move; use --cameras scene or dome")
+        return split_views([_scene_view(f, settings) for f in frames], settings)
+    try:
+        views = parse_transforms(Path(source), (settings.width, settings.height))
+    except ContractError as error:
+        raise UserError(str(error)) from None
+    return split_views(views, settings)
+
+
+def sphere_views(
+    summary: dict[str, Any], settings: CameraSettings, *, count: int, stream: int, hemisphere: bool
+) -> list[View]:
+    """``count`` views on a (hemi)sphere that looks at the scene's centre.
+
+    Directions are a Fibonacci lattice with a random turn and jitter: even like the lattice, and two
+    splits never share a direction. The lens is the scene camera's where it has one.
+    """
+    rng = np.random.default_rng([settings.seed, stream])
+    center = np.asarray(summary["bounds"]["center"], dtype=np.float64)
+    radius = float(summary["bounds"]["radius"])
+    focal, distance = _framing(summary, settings, radius)
+    low, high = (math.sin(LOWEST), math.sin(HIGHEST)) if hemisphere else (-math.sin(HIGHEST), math.sin(HIGHEST))
+    turn = rng.uniform(0, 2 * math.pi)
+    order = (np.arange(count) + rng.uniform(0, 1, count)) / max(count, 1)
+    # Uniform in height is uniform in area on a sphere (Archimedes).
+    heights = low + (high - low) * order
+    azimuths = turn + math.pi * (3 - math.sqrt(5)) * np.arange(count) + rng.normal(0, 0.15, count)
+    order = rng.permutation(count)
+    views = []
+    for index, (z, azimuth) in enumerate(zip(heights[order], azimuths[order], strict=True)):
+        ring = math.sqrt(max(0.0, 1 - z * z))
+        direction = np.array([ring * math.cos(azimuth), ring * math.sin(azimuth), z])
+        views.append(_look_at_view(f"{index:04d}", center + distance * direction, center, focal, settings))
+    return views
+
+
+def orbit_views(
+    summary: dict[str, Any], settings: CameraSettings, count: int, elevation_degrees: float = 25.0
+) -> list[View]:
+    """A turntable: ``count`` views at one elevation, evenly spaced over a full turn."""
+    center = np.asarray(summary["bounds"]["center"], dtype=np.float64)
+    focal, distance = _framing(summary, settings, float(summary["bounds"]["radius"]))
+    elevation = math.radians(elevation_degrees)
+    views = []
+    for index in range(count):
+        azimuth = 2 * math.pi * index / count
+        direction = np.array(
+            [
+                math.cos(elevation) * math.cos(azimuth),
+                math.cos(elevation) * math.sin(azimuth),
+                math.sin(elevation),
+            ]
+        )
+        views.append(_look_at_view(f"{index:04d}", center + distance * direction, center, focal, settings))
+    return views
+
+
+def split_views(views: Sequence[View], settings: CameraSettings) -> dict[str, list[View]]:
+    """Deal given views out to the splits: every k-th to test and val, the rest are candidates.
+
+    At most the settings' numbers of val and test views are taken, and never more than a fifth of all
+    for either, so that a short list still trains. One view serves as its own candidate only.
+    """
+    count = len(views)
+    test = min(settings.test, count // 5)
+    val = min(settings.val, count // 5)
+    chosen_test = _spread(range(count), test)
+    rest = [i for i in range(count) if i not in chosen_test]
+    chosen_val = _spread(rest, val)
+    train = [i for i in rest if i not in chosen_val]
+    return {
+        "train": [views[i] for i in train],
+        "val": [views[i] for i in sorted(chosen_val)],
+        "test": [views[i] for i in sorted(chosen_test)],
+    }
+
+
+def depth_range(views: Sequence[View], summary: dict[str, Any]) -> tuple[float, float]:
+    """(near, far) planar depth, scene units, that holds the bounding sphere for every view."""
+    center = np.asarray(summary["bounds"]["center"])
+    radius = float(summary["bounds"]["radius"])
+    planar = [float(-(np.linalg.inv(v.matrix) @ np.append(center, 1.0))[2]) for v in views]
+    near = max(min(planar) - radius, 1e-3 * radius)
+    return near, max(max(planar) + radius, near * 1.001)
+
+
+def _framing(summary: dict[str, Any], settings: CameraSettings, radius: float) -> tuple[float, float]:
+    """(focal length in pixels, camera distance): the bounding sphere fits the shorter side."""
+    active = next((c for c in summary["cameras"] if c.get("active") and c["type"] == "PERSP"), None)
+    lens, sensor = (active["lens"], active["sensor_width"]) if active else (DEFAULT_LENS, DEFAULT_SENSOR)
+    focal = lens / sensor * max(settings.width, settings.height)
+    half_angle = math.atan(0.5 * min(settings.width, settings.height) / focal)
+    # A sphere touches the edge of the frustum at radius / sin(half angle).
+    return focal, settings.distance * radius / math.sin(half_angle)
+
+
+def _look_at_view(name: str, position: np.ndarray, target: np.ndarray, focal: float, settings: CameraSettings) -> View:
+    forward = target - position
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    c2w = np.eye(4)
+    c2w[:3, 0], c2w[:3, 1], c2w[:3, 2], c2w[:3, 3] = right, np.cross(right, forward), -forward, position
+    return View(
+        name=name,
+        width=settings.width,
+        height=settings.height,
+        fl_x=focal,
+        fl_y=focal,
+        cx=settings.width / 2,
+        cy=settings.height / 2,
+        c2w=tuple(tuple(float(x) for x in row) for row in c2w),
+    )
+
+
+def _scene_view(camera: dict[str, Any], settings: CameraSettings) -> View:
+    """Blender camera -> View. Sensor fit and shift as in Blender's manual, "Camera / Lens"."""
+    width, height = settings.width, settings.height
+    fit = camera["sensor_fit"]
+    if fit == "AUTO":
+        fit = "HORIZONTAL" if width >= height else "VERTICAL"
+        sensor = camera["sensor_width"]
+    else:
+        sensor = camera["sensor_width"] if fit == "HORIZONTAL" else camera["sensor_height"]
+    side = width if fit == "HORIZONTAL" else height
+    focal = camera["lens"] / sensor * side
+    name = f"frame{camera['frame']:05d}" if "frame" in camera else camera["name"]
+    return View(
+        name="".join(c if c.isalnum() or c in "_-" else "_" for c in name),
+        width=width,
+        height=height,
+        fl_x=focal,
+        fl_y=focal,
+        cx=width / 2 - camera["shift_x"] * side,
+        cy=height / 2 + camera["shift_y"] * side,
+        c2w=tuple(tuple(float(x) for x in row) for row in camera["c2w"]),
+    )
+
+
+def _spread(items: Sequence[int], count: int) -> set[int]:
+    if count == 0:
+        return set()
+    positions = (np.arange(count) + 0.5) * len(items) / count
+    return {items[int(p)] for p in positions}

@@ -1,0 +1,108 @@
+"""What the user sees while a stage runs: lines and progress bars, never from inside the trainer.
+
+Progress goes to standard error. With ``--json`` so do messages, and standard output carries one JSON value.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from rich.console import Console as RichConsole
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+PLAIN_INTERVAL = 10.0  # seconds between progress lines when standard error is not a terminal
+
+
+class Bar:
+    """One running progress bar. ``advance`` counts units; ``note`` is shown at its end."""
+
+    def __init__(self, label: str, total: int, done: int, progress: Progress | None, stream: Any) -> None:
+        self.label, self.total, self.done = label, total, done
+        self._first = done
+        self._progress = progress
+        self._task = progress.add_task(label, total=total, completed=done, note="") if progress else None
+        self._stream = stream
+        self._started = self._last = time.monotonic()
+
+    def advance(self, count: int = 1, note: str = "") -> None:
+        self.done += count
+        if self._progress is not None and self._task is not None:
+            self._progress.update(self._task, completed=self.done, note=note)
+            return
+        now = time.monotonic()
+        if now - self._last >= PLAIN_INTERVAL and self.done < self.total:
+            self._last = now
+            rate = (now - self._started) / max(1, self.done - self._first)
+            left = rate * (self.total - self.done)
+            print(
+                f"{self.label}: {self.done}/{self.total}, {clock(left)} left {note}".rstrip(),
+                file=self._stream,
+            )
+            self._stream.flush()
+
+
+class Console:
+    """Messages and bars of one command."""
+
+    def __init__(self, *, json_mode: bool = False, quiet: bool = False) -> None:
+        self.json_mode = json_mode
+        self.quiet = quiet
+        self._rich = RichConsole(stderr=True, highlight=False)
+
+    def say(self, text: str) -> None:
+        """A line for the user; standard output, or standard error under ``--json``."""
+        if not self.quiet:
+            print(text, file=sys.stderr if self.json_mode else sys.stdout, flush=True)
+
+    def warn(self, text: str) -> None:
+        """A line that should not be missed: standard error, also when quiet."""
+        print(f"warning: {text}", file=sys.stderr, flush=True)
+
+    def result(self, value: Any) -> None:
+        """The command's JSON answer (only under ``--json``)."""
+        if self.json_mode:
+            print(json.dumps(value, indent=2), flush=True)
+
+    @contextmanager
+    def bar(self, label: str, total: int, done: int = 0) -> Iterator[Bar]:
+        """A progress bar with time left; a line every ten seconds where there is no terminal."""
+        if self.quiet or total <= 0 or not self._rich.is_terminal:
+            yield Bar(label, total, done, None, _Silent() if self.quiet else sys.stderr)
+            return
+        with Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[note]}"),
+            console=self._rich,
+        ) as progress:
+            yield Bar(label, total, done, progress, sys.stderr)
+
+
+class _Silent:
+    def write(self, text: str) -> None: ...
+
+    def flush(self) -> None: ...
+
+
+def clock(seconds: float) -> str:
+    whole = round(seconds)
+    return (
+        f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
+        if whole >= 3600
+        else f"{whole // 60}:{whole % 60:02d}"
+    )

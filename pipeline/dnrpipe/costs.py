@@ -1,0 +1,336 @@
+"""The ledger: what every piece of work cost, one JSON line each (``costs.jsonl``).
+
+Work that makes training data or weights is booked as ``training``; ray-traced references of held-out
+views as ``evaluation`` (a user who only wants the renderer never pays for them); frames of the finished
+renderer as ``inference``.
+
+Seconds are wall seconds of one unit of work. Units that ran side by side carry ``workers`` > 1: their wall
+share is ``seconds / workers`` (exact when the workers were busy throughout, an estimate otherwise).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable, Collection, Iterable, Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from .errors import UserError
+
+StageName = Literal["prepare", "select", "raytrace", "finetune", "evaluate", "render"]
+Purpose = Literal["training", "evaluation", "inference"]
+Unit = Literal["scene", "view", "epoch"]
+
+STAGE_ORDER: tuple[str, ...] = get_args(StageName)
+PURPOSE_ORDER: tuple[str, ...] = get_args(Purpose)
+
+
+class CostRecord(BaseModel):
+    """One unit of work that cost time.
+
+    time: unix seconds when it ended. run: id of the command that did it. name: what it was, e.g.
+    ``train/0007`` or ``epoch 3``. seconds: wall. workers: how many such units ran side by side.
+    width, height: pixels. spp: samples per pixel. steps: optimiser steps. peak_mb: peak memory, MiB.
+    noise: estimated relative error of the ray-traced view. cache_hit: the result was found, not computed;
+    ``seconds`` is then what the look-up took. detail: anything JSON-able, without NaN.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    time: float = Field(ge=0)
+    run: str
+    stage: StageName
+    purpose: Purpose
+    unit: Unit
+    name: str
+    seconds: float = Field(ge=0)
+    cpu_seconds: float = Field(default=0.0, ge=0)
+    device: str = "cpu"
+    workers: int = Field(default=1, ge=1)
+    width: int | None = Field(default=None, ge=1)
+    height: int | None = Field(default=None, ge=1)
+    spp: int | None = Field(default=None, ge=1)
+    steps: int | None = Field(default=None, ge=0)
+    peak_mb: float | None = Field(default=None, ge=0)
+    noise: float | None = Field(default=None, ge=0)
+    cache_hit: bool = False
+    detail: dict[str, Any] = Field(default_factory=dict)
+
+    @field_validator("detail")
+    @classmethod
+    def _json(cls, value: dict[str, Any]) -> dict[str, Any]:
+        try:
+            json.dumps(value, allow_nan=False)
+        except TypeError as error:  # pydantic turns ValueError into ValidationError, not TypeError
+            raise ValueError(str(error)) from None
+        return value
+
+    @property
+    def wall_seconds(self) -> float:
+        """Share of the wall clock: seconds divided by how many units ran side by side."""
+        return self.seconds / self.workers
+
+
+class Ledger:
+    """An append-only file of cost records. Several processes may append at once.
+
+    It is the one file not written by temp + rename: a rename would lose a concurrent append. Each record
+    is a single ``write`` with O_APPEND and an fsync; a line torn by a crash costs that line only.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+
+    def append(self, record: CostRecord) -> None:
+        """Append one record, durably. A torn last line is closed with a newline first.
+
+        Raises:
+            OSError: the file cannot be written (read-only, disk full).
+        """
+        line = json.dumps(record.model_dump(), allow_nan=False).encode("ascii") + b"\n"
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(self.path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
+        try:
+            end = os.lseek(descriptor, 0, os.SEEK_END)
+            if end > 0:
+                os.lseek(descriptor, end - 1, os.SEEK_SET)
+                if os.read(descriptor, 1) != b"\n":
+                    line = b"\n" + line
+            written = os.write(descriptor, line)
+            if written != len(line):
+                raise OSError(f"{self.path}: only {written} of {len(line)} bytes written; is the disk full?")
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+    def read(self) -> list[CostRecord]:
+        """All whole records in file order; [] when there is no ledger yet. Torn lines are left out.
+
+        Raises:
+            UserError: a whole line is not a cost record (foreign file, newer version).
+        """
+        return self._parse()[0]
+
+    def torn_lines(self) -> int:
+        """How many lines a crash cut short: work whose cost is not in the sums."""
+        return self._parse()[1]
+
+    def _parse(self) -> tuple[list[CostRecord], int]:
+        try:
+            data = self.path.read_bytes()
+        except FileNotFoundError:
+            return [], 0
+        records: list[CostRecord] = []
+        torn = 0
+        for number, line in enumerate(data.split(b"\n"), start=1):
+            if not line.strip():
+                continue
+            try:
+                value = json.loads(line)
+            except ValueError:  # JSONDecodeError, and UnicodeDecodeError of a block of zeros or noise
+                torn += 1
+                continue
+            try:
+                records.append(CostRecord.model_validate(value))
+            except ValidationError as error:
+                first = error.errors()[0]
+                where = ".".join(str(part) for part in first["loc"]) or "record"
+                raise UserError(
+                    f"{self.path}:{number}: not a cost record ({where}: {first['msg'].lower()}); "
+                    "move the file away to start a new ledger"
+                ) from None
+        return records, torn
+
+
+class CostSum(BaseModel):
+    """Totals of some records. seconds: summed over units; wall_seconds: estimate on the wall clock."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    seconds: float = 0.0
+    wall_seconds: float = 0.0
+    cpu_seconds: float = 0.0
+    records: int = 0
+    cache_hits: int = 0
+    peak_mb: float | None = None
+
+
+def total(records: Iterable[CostRecord]) -> CostSum:
+    """Sum of the records; seconds are summed exactly (fsum), so the order does not matter."""
+    chosen = list(records)
+    peaks = [r.peak_mb for r in chosen if r.peak_mb is not None]
+    return CostSum(
+        seconds=math.fsum(r.seconds for r in chosen),
+        wall_seconds=math.fsum(r.wall_seconds for r in chosen),
+        cpu_seconds=math.fsum(r.cpu_seconds for r in chosen),
+        records=len(chosen),
+        cache_hits=sum(r.cache_hit for r in chosen),
+        peak_mb=max(peaks) if peaks else None,
+    )
+
+
+def by_stage(records: Sequence[CostRecord]) -> dict[str, CostSum]:
+    """Totals per stage, in the order of the pipeline; stages without records are absent."""
+    return _group(records, STAGE_ORDER, lambda r: r.stage)
+
+
+def by_purpose(records: Sequence[CostRecord]) -> dict[str, CostSum]:
+    """Totals per purpose: training, evaluation, inference; absent where there are none."""
+    return _group(records, PURPOSE_ORDER, lambda r: r.purpose)
+
+
+def _group(records: Sequence[CostRecord], order: Sequence[str], key: Callable[[CostRecord], str]) -> dict[str, CostSum]:
+    sums = {name: total(r for r in records if key(r) == name) for name in order}
+    return {name: value for name, value in sums.items() if value.records}
+
+
+def traced_views(records: Sequence[CostRecord], purpose: str, only: Collection[str] | None = None) -> list[CostRecord]:
+    """The last *computed* record of each ray-traced view (cache hits left out), in order of appearance.
+
+    A view that was traced twice (other spp, other settings) counts once, with what it costs now. Ray
+    tracing is what has samples per pixel, whichever stage asked for it. ``only``: names such as
+    ``train/0007`` to keep, e.g. those of the present selection.
+    """
+    latest: dict[str, CostRecord] = {}
+    for record in records:
+        traced = record.unit == "view" and record.spp is not None and record.stage in ("raytrace", "evaluate")
+        if traced and record.purpose == purpose and not record.cache_hit:
+            latest[record.name] = record
+    return [record for name, record in latest.items() if only is None or name in only]
+
+
+def latest_epochs(records: Sequence[CostRecord], stage: str) -> list[CostRecord]:
+    """The last record of each epoch of a training stage: what it costs once, repeated runs left out."""
+    return list({r.name: r for r in records if r.stage == stage and r.unit == "epoch"}.values())
+
+
+def upfront_seconds(records: Sequence[CostRecord], only: Collection[str] | None = None) -> float:
+    """Wall seconds until the renderer exists: all training work once, at its latest cost.
+
+    Conversion, passes, both training steps and tracing of the training views; repeated runs, evaluation
+    and views that are no longer chosen (``only``, see :func:`traced_views`) are left out.
+    """
+    latest: dict[tuple[str, str, str], CostRecord] = {}
+    for record in records:
+        if record.purpose != "training" or record.cache_hit:
+            continue
+        if record.stage == "raytrace" and only is not None and record.name not in only:
+            continue
+        latest[(record.stage, record.unit, record.name)] = record
+    return total(latest.values()).wall_seconds
+
+
+class TracingComparison(BaseModel):
+    """Ray-tracing the chosen views against ray-tracing every candidate; wall seconds.
+
+    ``saved_seconds`` is gross; ``net_saved_seconds`` takes off what choosing the views cost (stage
+    ``select``) and is negative where choosing cost more than it saved.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    views: int
+    candidates: int
+    seconds_per_view: float
+    actual_seconds: float
+    all_seconds: float
+    saved_seconds: float
+    selection_seconds: float
+    net_saved_seconds: float
+
+
+def tracing_all_would_cost(
+    records: Sequence[CostRecord], n_candidates: int, only: Collection[str] | None = None
+) -> TracingComparison | None:
+    """Mean seconds per ray-traced training view × candidates, against what was spent on the chosen ones.
+
+    Assumes that the candidates not traced cost what the traced ones cost on average. ``only``: see
+    :func:`traced_views`. None while no training view was traced.
+    Raises ValueError when ``n_candidates`` is negative.
+    """
+    if n_candidates < 0:
+        raise ValueError(f"n_candidates must not be negative, is {n_candidates}")
+    views = traced_views(records, "training", only)
+    if not views:
+        return None
+    actual = math.fsum(r.wall_seconds for r in views)
+    mean = actual / len(views)
+    everything = mean * max(n_candidates, len(views))
+    selection = total(latest_epochs(records, "select")).wall_seconds
+    return TracingComparison(
+        views=len(views),
+        candidates=max(n_candidates, len(views)),
+        seconds_per_view=mean,
+        actual_seconds=actual,
+        all_seconds=everything,
+        saved_seconds=everything - actual,
+        selection_seconds=selection,
+        net_saved_seconds=everything - actual - selection,
+    )
+
+
+def break_even_frames(upfront_seconds: float, traced_frame: float, neural_frame: float) -> int | None:
+    """From how many frames on the neural renderer, made in ``upfront_seconds``, has paid for itself.
+
+    ``traced_frame`` and ``neural_frame``: seconds per frame. None where a neural frame is not cheaper.
+    """
+    gain = traced_frame - neural_frame
+    return math.ceil(upfront_seconds / gain) if gain > 0 else None
+
+
+def summarise(
+    records: Sequence[CostRecord],
+    *,
+    n_candidates: int | None = None,
+    only: Collection[str] | None = None,
+    torn_lines: int = 0,
+) -> dict[str, Any]:
+    """Everything ``dnrpipe costs`` and the report print, as JSON-able values.
+
+    Args:
+        n_candidates: number of candidate views; without it ``tracing_all`` is None.
+        only: names of the training views that count as chosen (``train/0007``); None = all in the ledger.
+        torn_lines: see :meth:`Ledger.torn_lines`.
+
+    Keys: total, by_stage, by_purpose, by_stage_and_purpose (see :class:`CostSum`; every run is in them,
+    repeated work too); raytraced (per purpose: views, spp, mean and largest seconds per view on one
+    worker, wall seconds, mean estimated noise); tracing_all (see :class:`TracingComparison`); runs,
+    devices, torn_lines.
+    """
+    raytraced: dict[str, dict[str, Any]] = {}
+    for purpose in PURPOSE_ORDER:
+        views = traced_views(records, purpose, only if purpose == "training" else None)
+        if not views:
+            continue
+        noises = [r.noise for r in views if r.noise is not None]
+        raytraced[purpose] = {
+            "views": len(views),
+            "spp": sorted({r.spp for r in views if r.spp is not None}),
+            "seconds_per_view": math.fsum(r.seconds for r in views) / len(views),
+            "slowest_view_seconds": max(r.seconds for r in views),
+            "wall_seconds": math.fsum(r.wall_seconds for r in views),
+            "noise": math.fsum(noises) / len(noises) if noises else None,
+        }
+    comparison = None if n_candidates is None else tracing_all_would_cost(records, n_candidates, only)
+    stages = by_stage(records)
+    return {
+        "total": total(records).model_dump(),
+        "by_stage": {name: value.model_dump() for name, value in stages.items()},
+        "by_purpose": {name: value.model_dump() for name, value in by_purpose(records).items()},
+        "by_stage_and_purpose": {
+            name: {
+                purpose: value.model_dump()
+                for purpose, value in by_purpose([r for r in records if r.stage == name]).items()
+            }
+            for name in stages
+        },
+        "raytraced": raytraced,
+        "tracing_all": comparison.model_dump() if comparison else None,
+        "runs": len({r.run for r in records}),
+        "devices": sorted({r.device for r in records}),
+        "torn_lines": torn_lines,
+    }

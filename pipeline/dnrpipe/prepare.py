@@ -1,0 +1,210 @@
+"""Stage `prepare`: scene file -> census, Mitsuba bundle, cameras, raster passes and G-buffers."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+from dnrtrain.atomic import write_json
+from dnrtrain.contract import SPLITS, SceneFrame, View, read_cameras, write_cameras
+
+from .cameras import depth_range, make_cameras
+from .console import Console
+from .costs import CostRecord
+from .errors import UserError
+from .executors import Retry, run_tasks
+from .settings import Settings
+from .stages import STAGES, Outcome, fingerprint
+from .tasks import run_view_tasks, view_record, worker_count
+from .workspace import Workspace, digest
+
+SCENE_VERSION = 1  # raise when the conversion or the G-buffer scene changes what it writes
+PASSES_VERSION = 1
+# Evaluation needs G-buffers of test views only; their rasterised colour would never be read.
+RASTERISED = ("train", "val")
+
+
+def run(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
+    """Do what is missing: convert the scene, place the cameras, render the passes."""
+    scene_print = scene_fingerprint(workspace)
+    summary = _convert(workspace, console, run_id, scene_print)
+    views = _place_cameras(workspace, settings, summary)
+    engine, reason = _raster_engine(settings, console)
+    tasks = [
+        pass_task(workspace, settings, view, split, scene_print, engine, raster=split in RASTERISED)
+        for split in SPLITS
+        for view in views[split]
+    ]
+
+    def book(task: dict[str, Any], result: dict[str, Any], workers: int) -> CostRecord:
+        purpose = "evaluation" if Path(task["output"]).parent.name == "test" else "training"
+        return view_record(
+            run=run_id,
+            stage="prepare",
+            purpose=purpose,
+            task=task,
+            result=result,
+            workers=workers,
+            device="cpu",
+        )
+
+    run_view_tasks(
+        "passes",
+        "dnrpipe.blender.passes",
+        pass_common(workspace, settings, engine),
+        tasks,
+        workspace=workspace,
+        console=console,
+        stage="prepare",
+        workers=worker_count(settings.passes.workers),
+        book=book,
+    )
+    output = fingerprint(STAGES["prepare"], workspace, settings)
+    assert output is not None
+    return Outcome(
+        output,
+        {
+            "raster_engine": engine,
+            "raster_reason": reason,
+            "views": {split: len(views[split]) for split in SPLITS},
+            "triangles": summary["triangles"],
+        },
+    )
+
+
+def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
+    """(passes on disk, passes wanted)."""
+    wanted = settings.cameras.train + settings.cameras.val + settings.cameras.test
+    if "prepare" in workspace.manifest.stages:
+        wanted = sum(workspace.manifest.stages["prepare"].detail["views"].values())
+    present = sum(1 for split in SPLITS for _ in (workspace.root / "passes" / split).glob("[!.]*.exr"))
+    return min(present, wanted), wanted
+
+
+def scene_fingerprint(workspace: Workspace) -> str:
+    """Hash of what the converted scene comes from."""
+    return digest([SCENE_VERSION, workspace.manifest.source.sha256])
+
+
+def split_views(workspace: Workspace) -> dict[str, list[View]]:
+    """The views of each split, as `prepare` placed them."""
+    return {split: read_cameras(workspace.cameras(split)) for split in SPLITS if workspace.cameras(split).exists()}
+
+
+def read_summary(workspace: Workspace) -> dict[str, Any]:
+    """``scene/summary.json``: bounds, cameras, counts."""
+    return json.loads((workspace.scene / "summary.json").read_text(encoding="utf-8"))
+
+
+def pass_task(
+    workspace: Workspace,
+    settings: Settings,
+    view: View,
+    split: str,
+    scene_print: str,
+    engine: str,
+    *,
+    raster: bool,
+    output: Path | None = None,
+) -> dict[str, Any]:
+    """Task of :class:`dnrpipe.blender.passes.Worker` for one view; its fingerprint names all that decides it."""
+    data = view.model_dump(mode="json")
+    coverage = settings.passes.coverage_samples
+    colour = [engine, settings.passes.raster_samples] if raster else None
+    return {
+        "view": data,
+        "output": str(output or workspace.passes(split, view.name)),
+        "raster": raster,
+        "fingerprint": digest([PASSES_VERSION, scene_print, data, coverage, colour]),
+    }
+
+
+def pass_common(workspace: Workspace, settings: Settings, engine: str) -> dict[str, Any]:
+    """What all pass workers share."""
+    return {
+        "scene_dir": str(workspace.scene),
+        "raster_engine": engine,
+        "raster_samples": settings.passes.raster_samples,
+        "coverage_samples": settings.passes.coverage_samples,
+    }
+
+
+def _convert(workspace: Workspace, console: Console, run_id: str, scene_print: str) -> dict[str, Any]:
+    """Open the scene in a worker and write ``scene/``; the marker file is written last."""
+    marker = workspace.scene / "prepared.json"
+    if marker.exists() and json.loads(marker.read_text())["fingerprint"] == scene_print:
+        return read_summary(workspace)
+    source = Path(workspace.manifest.source.path)
+    if not source.is_file():
+        raise UserError(f"{source}: the scene file is gone; run `dnrpipe prepare SCENE` with its new place")
+    marker.unlink(missing_ok=True)
+    console.say(f"converting {source.name}")
+    started = time.monotonic()
+    task = {"source": str(source), "scene_dir": str(workspace.scene)}
+    with console.bar("scene", 1) as bar:
+        for outcome in run_tasks("dnrpipe.blender.prepare", {}, [task], workers=1, log=workspace.log("prepare")):
+            if isinstance(outcome, Retry):
+                continue
+            if outcome.result is None:
+                if "worker" in (outcome.error or ""):
+                    raise UserError(
+                        f"{source}: Blender could not open it ({outcome.error}): damaged or truncated?"
+                        f" See {workspace.log('prepare')}"
+                    )
+                raise UserError(str(outcome.error))
+            bar.advance()
+    summary = read_summary(workspace)
+    for warning in summary["warnings"]:
+        console.warn(warning)
+    _show_findings(workspace, console)
+    workspace.ledger.append(
+        CostRecord(
+            time=time.time(),
+            run=run_id,
+            stage="prepare",
+            purpose="training",
+            unit="scene",
+            name="convert",
+            seconds=time.monotonic() - started,
+        )
+    )
+    write_json(marker, {"fingerprint": scene_print})
+    return summary
+
+
+def _show_findings(workspace: Workspace, console: Console) -> None:
+    """Whatever was not converted exactly is said by name, once, in the terminal; all of it is in census.json."""
+    census = json.loads((workspace.scene / "census.json").read_text(encoding="utf-8"))
+    for finding in census["findings"]:
+        if finding["kind"] in ("approximated", "ignored", "missing"):
+            names = [f"object '{finding['object']}'"] if finding["object"] else []
+            names += [f"material '{finding['material']}'"] if finding["material"] else []
+            where = ", ".join(names)
+            console.say(f"  {finding['kind']}: {finding['feature']}{f' ({where})' if where else ''}: {finding['note']}")
+
+
+def _place_cameras(workspace: Workspace, settings: Settings, summary: dict[str, Any]) -> dict[str, list[View]]:
+    views = make_cameras(summary, settings.cameras)
+    if not views["train"]:
+        raise UserError("no candidate views: give more cameras or set cameras.train")
+    near, far = depth_range([v for split in SPLITS for v in views[split]], summary)
+    frame_path = workspace.scene / "frame.json"
+    frame = SceneFrame.model_validate_json(frame_path.read_text(encoding="utf-8"))
+    write_json(frame_path, frame.model_copy(update={"near": near, "far": far}).model_dump(mode="json"))
+    for split in SPLITS:
+        write_cameras(workspace.cameras(split), views[split], split)
+        wanted = {view.name for view in views[split]}
+        for path in (workspace.root / "passes" / split).glob("[!.]*.exr"):
+            if path.stem not in wanted:  # left by a larger or other set of cameras
+                path.unlink()
+    return views
+
+
+def _raster_engine(settings: Settings, console: Console) -> tuple[str, str]:
+    from .blender.choice import choose_raster
+
+    engine, reason = choose_raster(settings.passes.raster)
+    console.say(f"raster colour by {engine}: {reason}")
+    return engine, reason

@@ -1,0 +1,222 @@
+"""The pipeline as data: what each stage reads, writes and depends on, and how to run what is due.
+
+fingerprint(stage) = hash of its version, its settings, the source (prepare) and the outputs of the
+                     stages it needs
+state              = missing | partial | stale | done
+"""
+
+from __future__ import annotations
+
+import importlib
+import platform
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+from . import __version__
+from .console import Console, clock
+from .errors import UserError
+from .settings import Settings
+from .workspace import Workspace, digest
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a stage's run returns: a hash of what it made, and facts for the manifest and ``--json``."""
+
+    output: str
+    detail: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage. ``run`` and ``progress`` are "module:function", imported when called.
+
+    run(workspace, settings, console, run_id) -> Outcome
+    progress(workspace, settings) -> (units present, units wanted)
+    """
+
+    name: str
+    command: str
+    does: str
+    needs: tuple[str, ...]
+    reads: tuple[str, ...]
+    writes: tuple[str, ...]
+    settings: Callable[[Settings], Any]
+    run: str
+    progress: str
+    version: int = 1
+
+
+STAGES: dict[str, Stage] = {
+    stage.name: stage
+    for stage in (
+        Stage(
+            name="prepare",
+            command="prepare",
+            does="census, Mitsuba bundle, cameras, raster passes and G-buffers",
+            needs=(),
+            reads=("the scene file",),
+            writes=("scene", "cameras", "passes"),
+            settings=lambda s: [s.cameras.model_dump(), s.passes.model_dump(exclude={"workers"})],
+            run="dnrpipe.prepare:run",
+            progress="dnrpipe.prepare:progress",
+        ),
+        Stage(
+            name="select",
+            command="select",
+            does="step 1: coarse DNR and view selector on rasterised images",
+            needs=("prepare",),
+            reads=("passes", "cameras"),
+            writes=("selection.json", "checkpoints/step1"),
+            settings=lambda s: [s.model.model_dump(), s.select.model_dump()],
+            run="dnrpipe.training:run_select",
+            progress="dnrpipe.training:select_progress",
+        ),
+        Stage(
+            name="raytrace",
+            command="raytrace-selected",
+            does="path tracing of the selected views",
+            needs=("prepare", "select"),
+            reads=("scene", "selection.json"),
+            writes=("raytraced/train",),
+            settings=lambda s: s.raytrace.model_dump(exclude={"workers", "evaluation_spp", "variant"}),
+            run="dnrpipe.trace:run",
+            progress="dnrpipe.trace:progress",
+        ),
+        Stage(
+            name="finetune",
+            command="finetune",
+            does="step 2: six losses on the selected ray-traced views",
+            needs=("select", "raytrace"),
+            reads=("passes", "raytraced/train", "checkpoints/step1"),
+            writes=("checkpoints/step2",),
+            settings=lambda s: [s.model.model_dump(), s.finetune.model_dump()],
+            run="dnrpipe.training:run_finetune",
+            progress="dnrpipe.training:finetune_progress",
+        ),
+        Stage(
+            name="evaluate",
+            command="evaluate",
+            does="held-out test views, ray-traced on demand",
+            needs=("finetune",),
+            reads=("passes/test", "checkpoints/step2"),
+            writes=("raytraced/test", "evaluation"),
+            settings=lambda s: s.raytrace.model_dump(exclude={"workers", "spp", "variant"}),
+            run="dnrpipe.evaluate:run",
+            progress="dnrpipe.evaluate:progress",
+        ),
+    )
+}
+
+
+def fingerprint(stage: Stage, workspace: Workspace, settings: Settings) -> str | None:
+    """Hash of all that the stage computes from; None while a stage it needs has never run."""
+    records = workspace.manifest.stages
+    if any(need not in records for need in stage.needs):
+        return None
+    return digest(
+        {
+            "stage": stage.name,
+            "version": stage.version,
+            "settings": stage.settings(settings),
+            "source": workspace.manifest.source.sha256 if not stage.needs else None,
+            "inputs": {need: records[need].output for need in stage.needs},
+        }
+    )
+
+
+def state(stage: Stage, workspace: Workspace, settings: Settings) -> str:
+    """missing: never finished; partial: files are absent; stale: inputs or settings changed; done."""
+    record = workspace.manifest.stages.get(stage.name)
+    present, wanted = _call(stage.progress, workspace, settings)
+    if record is None:
+        return "partial" if present else "missing"
+    if record.fingerprint != fingerprint(stage, workspace, settings):
+        return "stale"
+    if any(state(STAGES[need], workspace, settings) == "stale" for need in stage.needs):
+        return "stale"
+    return "done" if present >= wanted else "partial"
+
+
+def run_stage(
+    name: str, workspace: Workspace, settings: Settings, console: Console, *, force: bool = False
+) -> dict[str, Any]:
+    """Run one stage if it is due. Returns its facts; ``"ran"`` says whether it did anything.
+
+    Raises UserError: a stage that it needs has not run or is out of date.
+    """
+    stage = STAGES[name]
+    require_inputs(stage, workspace, settings)
+    if not force and state(stage, workspace, settings) == "done":
+        console.say(f"{stage.command}: up to date")
+        return {"stage": name, "ran": False, **workspace.manifest.stages[name].detail}
+    if force:
+        clear(stage, workspace)
+    started = time.monotonic()
+    run_id = f"{name}-{int(time.time()):x}"
+    workspace.manifest.versions = {"dnrpipe": __version__, "python": platform.python_version()}
+    workspace.manifest.settings = settings.model_dump(mode="json")
+    workspace.save()
+    outcome: Outcome = _call(stage.run, workspace, settings, console, run_id)
+    seconds = time.monotonic() - started
+    done = fingerprint(stage, workspace, settings)
+    assert done is not None  # its inputs were required above
+    workspace.finish_stage(name, fingerprint=done, output=outcome.output, seconds=seconds, detail=outcome.detail)
+    console.say(f"{stage.command}: done in {clock(seconds)}")
+    return {"stage": name, "ran": True, "seconds": seconds, **outcome.detail}
+
+
+def require_inputs(stage: Stage, workspace: Workspace, settings: Settings) -> None:
+    """Raise UserError naming the first command that must run before this stage can."""
+    for need in stage.needs:
+        upstream = STAGES[need]
+        require_inputs(upstream, workspace, settings)
+        found = state(upstream, workspace, settings)
+        if found != "done":
+            why = {"missing": "has not run", "partial": "is not complete", "stale": "is out of date"}[found]
+            raise UserError(
+                f"{stage.command}: {upstream.command} {why} for {workspace.root};"
+                f" run `dnrpipe {upstream.command}` first"
+            )
+
+
+def clear(stage: Stage, workspace: Workspace) -> None:
+    """``--force``: remove what the stage wrote, so that nothing is reused."""
+    workspace.manifest.stages.pop(stage.name, None)
+    workspace.save()
+    for relative in stage.writes:
+        path = workspace.root / relative
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def status(workspace: Workspace, settings: Settings) -> list[dict[str, Any]]:
+    """One row per stage: name, command, state, units present and wanted, seconds of its last run."""
+    rows = []
+    for stage in STAGES.values():
+        present, wanted = _call(stage.progress, workspace, settings)
+        record = workspace.manifest.stages.get(stage.name)
+        rows.append(
+            {
+                "stage": stage.name,
+                "command": stage.command,
+                "does": stage.does,
+                "state": state(stage, workspace, settings),
+                "present": present,
+                "wanted": wanted,
+                "seconds": record.seconds if record else None,
+                "reads": list(stage.reads),
+                "writes": list(stage.writes),
+            }
+        )
+    return rows
+
+
+def _call(target: str, *arguments: Any) -> Any:
+    module, _, function = target.partition(":")
+    return getattr(importlib.import_module(module), function)(*arguments)

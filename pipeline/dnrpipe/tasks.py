@@ -1,0 +1,117 @@
+"""Run a list of per-view tasks on workers: skip what is on disk, book what was done, show progress."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from dnrtrain.exr import read_metadata
+
+from .console import Console
+from .costs import CostRecord
+from .executors import Retry, run_tasks
+from .workspace import Workspace
+
+
+class TasksFailed(RuntimeError):
+    """Some views could not be made; the others are on disk. The message names them and the log."""
+
+
+def worker_count(setting: int) -> int:
+    """The setting, or one worker per core that this process may use when it is 0."""
+    return setting or len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1))
+
+
+def is_made(task: dict[str, Any]) -> bool:
+    """True when the task's file is there and was made from the same inputs."""
+    metadata = read_metadata(Path(task["output"]))
+    return metadata is not None and metadata.get("fingerprint") == task["fingerprint"]
+
+
+def run_view_tasks(
+    label: str,
+    module: str,
+    common: dict[str, Any],
+    tasks: Sequence[dict[str, Any]],
+    *,
+    workspace: Workspace,
+    console: Console,
+    stage: str,
+    workers: int,
+    book: Callable[[dict[str, Any], dict[str, Any], int], CostRecord],
+    environment: dict[str, str] | None = None,
+) -> int:
+    """Run the tasks whose files are missing or out of date; returns how many were run.
+
+    ``book(task, result, workers)`` gives the ledger record of a finished task. Raises TasksFailed after all
+    other tasks are done when some failed twice.
+    """
+    due = [task for task in tasks if not is_made(task)]
+    if not due:
+        return 0
+    count = max(1, min(workers, len(due)))
+    failed: list[str] = []
+    log = workspace.log(stage)
+    with console.bar(label, len(tasks), len(tasks) - len(due)) as bar:
+        outcomes = run_tasks(module, common, due, workers=count, log=log, environment=environment)
+        try:
+            for outcome in outcomes:
+                name = task_name(outcome.task)
+                if isinstance(outcome, Retry):
+                    console.warn(f"{label}: {name}: {outcome.reason}; trying once more")
+                elif outcome.result is None:
+                    console.warn(f"{label}: {name} failed twice: {outcome.error}")
+                    failed.append(name)
+                    bar.advance()
+                else:
+                    workspace.ledger.append(book(outcome.task, outcome.result, count))
+                    bar.advance(note=name)
+        finally:
+            outcomes.close()  # type: ignore[attr-defined]
+    if failed:
+        raise TasksFailed(
+            f"{label}: {len(failed)} of {len(tasks)} failed ({', '.join(failed[:5])}{'…' if len(failed) > 5 else ''});"
+            f" the others are done. See {log}; run the same command to try again"
+        )
+    return len(due)
+
+
+def task_name(task: dict[str, Any]) -> str:
+    """``train/0007`` for a view's task, else the output's name."""
+    output = Path(task.get("output", "scene"))
+    return f"{output.parent.name}/{output.stem}" if "view" in task else output.name
+
+
+def view_record(
+    *,
+    run: str,
+    stage: Any,
+    purpose: Any,
+    task: dict[str, Any],
+    result: dict[str, Any],
+    workers: int,
+    device: str,
+) -> CostRecord:
+    """The ledger record of one view."""
+    known = {"seconds", "cpu_seconds", "peak_mb", "spp", "noise"}
+    return CostRecord(
+        time=time.time(),
+        run=run,
+        stage=stage,
+        purpose=purpose,
+        unit="view",
+        name=task_name(task),
+        seconds=result["seconds"],
+        cpu_seconds=result.get("cpu_seconds", 0.0),
+        device=device,
+        workers=workers,
+        width=task["view"]["width"],
+        height=task["view"]["height"],
+        spp=result.get("spp"),
+        peak_mb=result.get("peak_mb"),
+        noise=result.get("noise"),
+        detail={k: v for k, v in result.items() if k not in known},
+    )

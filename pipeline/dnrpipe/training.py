@@ -1,0 +1,240 @@
+"""Stages `select` (step 1) and `finetune` (step 2): feed workspace files to the trainer, book its epochs."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from dnrtrain.atomic import write_json
+from dnrtrain.contract import SceneFrame, View
+from dnrtrain.events import EpochEnd, Event, Note, Selected
+
+from .console import Bar, Console
+from .costs import CostRecord
+from .errors import UserError
+from .prepare import split_views
+from .settings import Settings
+from .stages import STAGES, Outcome, fingerprint
+from .workspace import Workspace, digest, file_sha256
+
+if TYPE_CHECKING:
+    from dnrtrain.dataset import ViewSet
+
+
+def run_select(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
+    """Step 1: train the coarse DNR and choose ``budget`` views."""
+    import numpy as np
+    from dnrtrain.step1 import run_step1
+
+    views = split_views(workspace)
+    check_budget(settings.select.budget, len(views["train"]))
+    dataset = load(workspace, views["train"], "train")
+    val = load(workspace, views["val"], "val") if views["val"] else None
+    stamp = fingerprint(STAGES["select"], workspace, settings)
+    assert stamp is not None
+    folder = workspace.checkpoints("step1")
+    chosen: Selected | None = None
+    events = run_step1(
+        dataset,
+        val,
+        np.stack([view.position for view in views["train"]]),
+        settings.model,
+        settings.select.step1,
+        policy=settings.select.policy,
+        budget=settings.select.budget,
+        seed=settings.select.seed,
+        device=torch_device(settings),
+        checkpoints=folder,
+        fingerprint=stamp,
+    )
+    for event in _follow(events, "select", settings.select.step1.epochs, workspace, console, run_id):
+        if isinstance(event, Selected):
+            chosen = event
+    assert chosen is not None  # run_step1 ends with Selected
+    write_json(
+        workspace.selection,
+        {
+            "policy": chosen.policy,
+            "budget": settings.select.budget,
+            "seed": settings.select.seed,
+            "views": chosen.views,
+            "details": chosen.details,
+        },
+    )
+    return Outcome(
+        digest([chosen.views, file_sha256(folder / "model.safetensors")]),
+        {"policy": chosen.policy, "views": chosen.views},
+    )
+
+
+def run_finetune(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
+    """Step 2: fine-tune the coarse DNR on the selected ray-traced views."""
+    from dnrtrain.step2 import run_step2
+
+    by_name = {view.name: view for view in split_views(workspace)["train"]}
+    names = read_selection(workspace)["views"]
+    dataset = load(workspace, [by_name[name] for name in names], "train", raytraced=True)
+    stamp = fingerprint(STAGES["finetune"], workspace, settings)
+    assert stamp is not None
+    folder = workspace.checkpoints("step2")
+    weights = perceptual_weights(console)
+    events = run_step2(
+        dataset,
+        None,
+        workspace.checkpoints("step1"),
+        settings.model,
+        settings.finetune.step2,
+        seed=settings.finetune.seed,
+        device=torch_device(settings),
+        checkpoints=folder,
+        fingerprint=digest([stamp, weights is not None]),
+        weights=weights,
+    )
+    for _ in _follow(events, "finetune", settings.finetune.step2.epochs, workspace, console, run_id):
+        pass
+    return Outcome(file_sha256(folder / "model.safetensors"), {"perceptual": weights is not None, "views": len(names)})
+
+
+def select_progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
+    """(epochs trained, epochs wanted)."""
+    return _epochs(workspace.checkpoints("step1"), settings.select.step1.epochs, workspace.selection.exists())
+
+
+def finetune_progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
+    """(epochs trained, epochs wanted)."""
+    return _epochs(workspace.checkpoints("step2"), settings.finetune.step2.epochs, True)
+
+
+def read_selection(workspace: Workspace) -> dict[str, Any]:
+    """``selection.json``. Raises UserError when there is none or it is damaged."""
+    try:
+        return json.loads(workspace.selection.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UserError(f"{workspace.root}: no views selected yet; run `dnrpipe select` first") from None
+    except (json.JSONDecodeError, UnicodeDecodeError):
+        raise UserError(f"{workspace.selection}: damaged; run `dnrpipe select --force`") from None
+
+
+def check_budget(budget: int, candidates: int) -> None:
+    """Raises UserError when more views are wanted than there are."""
+    if budget > candidates:
+        raise UserError(
+            f"--budget {budget}: only {candidates} candidate views exist; lower the budget or prepare more"
+            f" (`dnrpipe prepare --views {budget}`)"
+        )
+
+
+def load(workspace: Workspace, views: list[View], split: str, *, raytraced: bool = False) -> ViewSet:
+    """G-buffers of the views, with rasterised (train, val) or ray-traced targets, or none (test)."""
+    from dnrtrain.dataset import load_views
+
+    frame = SceneFrame.model_validate_json((workspace.scene / "frame.json").read_text(encoding="utf-8"))
+    return load_views(
+        [workspace.passes(split, view.name) for view in views],
+        [workspace.raytraced(split, view.name) for view in views] if raytraced else None,
+        frame,
+        cameras=views,
+        folder=workspace.scene,
+        target=split != "test" or raytraced,
+    )
+
+
+def torch_device(settings: Settings) -> str:
+    """The device the setting names; auto is CUDA where torch has it, else the CPU."""
+    import torch
+
+    if settings.device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if settings.device.startswith("cuda") and not torch.cuda.is_available():
+        raise UserError(f"device {settings.device}: torch sees no CUDA device here; use --set device=cpu")
+    return settings.device
+
+
+def perceptual_weights(console: Console) -> Any:
+    """VGG16, AlexNet and LPIPS weights from the cache, or None after saying what that means."""
+    from dnrtrain.weights import WeightsMissing, load_weights
+
+    try:
+        return load_weights()
+    except WeightsMissing:
+        console.warn(
+            "no VGG16/LPIPS weights on this machine: training drops the perceptual loss and no LPIPS is"
+            " measured; fetch them with `dnrpipe weights`"
+        )
+        return None
+
+
+def _epochs(folder: Path, wanted: int, finished: bool) -> tuple[int, int]:
+    if finished and (folder / "model.safetensors").exists():
+        return wanted, wanted
+    for name in ("checkpoint.json", "model.json"):
+        path = folder / name
+        if path.exists():
+            return min(int(json.loads(path.read_text()).get("epoch", 0)), wanted - 1), wanted
+    return 0, wanted
+
+
+def _follow(
+    events: Iterator[Event],
+    stage: Literal["select", "finetune"],
+    epochs: int,
+    workspace: Workspace,
+    console: Console,
+    run_id: str,
+) -> Iterator[Event]:
+    """Pass events through while showing a bar and booking every epoch."""
+    with console.bar("step 1" if stage == "select" else "step 2", epochs) as bar:
+        for event in events:
+            if isinstance(event, EpochEnd):
+                _book_epoch(event, stage, workspace, run_id, bar)
+                if event.skipped:
+                    console.warn(f"epoch {event.epoch}: skipped {event.skipped} non-finite steps")
+            elif isinstance(event, Note):
+                console.warn(event.text)
+            yield event
+
+
+def _book_epoch(
+    event: EpochEnd, stage: Literal["select", "finetune"], workspace: Workspace, run_id: str, bar: Bar
+) -> None:
+    workspace.ledger.append(
+        CostRecord(
+            time=time.time(),
+            run=run_id,
+            stage=stage,
+            purpose="training",
+            unit="epoch",
+            name=f"epoch {event.epoch}",
+            seconds=event.seconds,
+            cpu_seconds=event.cpu_seconds,
+            device=event.device,
+            steps=event.steps,
+        )
+    )
+    behind = event.epoch - bar.done - 1  # epochs that an earlier run did
+    if behind > 0:
+        bar.advance(behind)
+    total = event.losses.get("total", sum(event.losses.values()))
+    note = f"loss {total:.4f}"
+    if "psnr" in event.val:
+        note += f", val {event.val['psnr']:.2f} dB"
+    bar.advance(note=note)
+
+
+@contextlib.contextmanager
+def interrupt_as_keyboard() -> Iterator[None]:
+    """SIGTERM ends a run as Ctrl-C does: workers are stopped, the lock is released, exit code 130."""
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    previous = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)
