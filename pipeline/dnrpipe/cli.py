@@ -383,6 +383,13 @@ class _Session:
         self.answers: dict[str, Any] = {}
 
     def __enter__(self) -> _Session:
+        try:
+            return self._open()
+        except BaseException:
+            self.stack.close()
+            raise
+
+    def _open(self) -> _Session:
         from .console import Console
         from .settings import merge, parse_assignment
         from .workspace import Workspace, find_workspace, locked
@@ -397,7 +404,8 @@ class _Session:
             root = _root_for(self.scene, self.options["workspace"])
             # Bad settings are refused before a folder is made.
             stored = Workspace.open(root) if (root / "manifest.json").exists() else None
-            _resolve(root, preset or (stored.manifest.preset if stored else None), stored, overrides)
+            planned = _resolve(root, preset or (stored.manifest.preset if stored else None), stored, overrides)
+            self._check_budget(planned, stored)
             self.stack.enter_context(locked(root, self.command))
             self.workspace: Workspace = Workspace.create(root, source)
         else:
@@ -407,7 +415,7 @@ class _Session:
             self.workspace = Workspace.open(root)
         self.settings: Settings = _settings(self.workspace, overrides, preset)
         manifest = self.workspace.manifest
-        self._check_budget()
+        self._check_budget(self.settings, self.workspace)
         manifest.preset = preset or manifest.preset
         manifest.overrides = merge(manifest.overrides, overrides)
         return self
@@ -470,14 +478,15 @@ class _Session:
         self.console.say(f"report: {path}")
         self.console.result({"workspace": str(self.workspace.root), **self.answers, "report": str(path)})
 
-    def _check_budget(self) -> None:
+    def _check_budget(self, settings: Settings, workspace: Workspace | None) -> None:
+        """Refuse a budget above the candidates before any work is done or folder made."""
         from .training import check_budget
 
-        record = self.workspace.manifest.stages.get("prepare")
-        if self.command == "select" and record is not None:
-            check_budget(self.settings.select.budget, record.detail["views"]["train"])
-        elif self.command == "run" and self.settings.cameras.source in ("auto", "dome", "sphere"):
-            check_budget(self.settings.select.budget, self.settings.cameras.train)
+        record = workspace.manifest.stages.get("prepare") if workspace else None
+        if self.command == "run" and settings.cameras.source in ("auto", "dome", "sphere"):
+            check_budget(settings.select.budget, settings.cameras.train)
+        elif self.command == "select" and record is not None:
+            check_budget(settings.select.budget, record.detail["views"]["train"])
 
 
 def _session(
@@ -551,41 +560,58 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _main(arguments: list[str] | None) -> int:
-    from dnrtrain.contract import ContractError
-
-    from .tasks import TasksFailed
-    from .training import interrupt_as_keyboard
+    from .interrupts import interrupt_as_keyboard
 
     try:
         with interrupt_as_keyboard():
             cli.main(args=arguments, standalone_mode=False, prog_name="dnrpipe")
-    except (UserError, ContractError) as error:
-        return _fail(str(error), 2)
-    except TasksFailed as error:
-        return _fail(str(error), 1)
     except click.exceptions.Exit as error:
         return error.exit_code
-    except click.UsageError as error:
-        command = error.ctx.command_path if error.ctx else "dnrpipe"
-        return _fail(f"{error.format_message()} See `{command} --help`.", 2)
-    except click.ClickException as error:
-        return _fail(error.format_message(), 2)
     except (KeyboardInterrupt, click.Abort):
         return _fail("interrupted; run the same command to go on where it stopped", 130)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # a reader such as `head` left: no noise at exit
-        return 0
-    except OSError as error:
-        message = _explain(error)
-        if message is None:
+    except Exception as error:
+        explained = _explain(error)
+        if explained is None:
             raise
-        return _fail(message, 2)
-    except ModuleNotFoundError as error:
-        if (error.name or "").split(".")[0] not in _EXTRAS:
-            raise
-        extra = _EXTRAS[(error.name or "").split(".")[0]]
-        return _fail(f"{error.name} is not installed; run `pip install 'dnrpipe[{extra}]'`", 2)
+        return _fail(*explained)
     return 0
+
+
+def _explain(error: Exception) -> tuple[str, int] | None:
+    """(one line, exit code) for a failure that we expect; None for a bug, which keeps its traceback."""
+    from dnrtrain.contract import ContractError
+
+    from .tasks import TasksFailed
+
+    if isinstance(error, UserError | ContractError):
+        return str(error), 2
+    if isinstance(error, TasksFailed):
+        return str(error), 1
+    if isinstance(error, click.UsageError):
+        command = error.ctx.command_path if error.ctx else "dnrpipe"
+        return f"{error.format_message()} See `{command} --help`.", 2
+    if isinstance(error, click.ClickException):
+        return error.format_message(), 2
+    if isinstance(error, ModuleNotFoundError):
+        module = (error.name or "").split(".")[0]
+        if module in _EXTRAS:
+            return f"{module} is not installed; run `pip install 'dnrpipe[{_EXTRAS[module]}]'`", 2
+    if isinstance(error, OSError):
+        return _explain_os(error)
+    return None
+
+
+def _explain_os(error: OSError) -> tuple[str, int] | None:
+    where = error.filename or "the workspace"
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f"{where}: the disk is full; free some space and run the same command to go on", 2
+    if error.errno in (errno.EACCES, errno.EROFS, errno.EPERM):
+        return f"{where}: cannot be written (read-only or not yours); choose another folder with -w", 2
+    if error.errno in (errno.ENOTDIR, errno.EISDIR):
+        return f"{where}: {os.strerror(error.errno).lower()}", 2
+    return None
 
 
 _EXTRAS = {
@@ -599,17 +625,6 @@ _EXTRAS = {
     "jinja2": "render",
     "matplotlib": "render",
 }
-
-
-def _explain(error: OSError) -> str | None:
-    where = error.filename or "the workspace"
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return f"{where}: the disk is full; free some space and run the same command to go on"
-    if error.errno in (errno.EACCES, errno.EROFS, errno.EPERM):
-        return f"{where}: cannot be written (read-only or not yours); choose another folder with -w"
-    if error.errno in (errno.ENOTDIR, errno.EISDIR):
-        return f"{where}: {error.strerror.lower() if error.strerror else error}"
-    return None
 
 
 def _fail(message: str, code: int) -> int:

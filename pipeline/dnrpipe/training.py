@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -224,17 +222,3 @@ def _book_epoch(
     if "psnr" in event.val:
         note += f", val {event.val['psnr']:.2f} dB"
     bar.advance(note=note)
-
-
-@contextlib.contextmanager
-def interrupt_as_keyboard() -> Iterator[None]:
-    """SIGTERM ends a run as Ctrl-C does: workers are stopped, the lock is released, exit code 130."""
-
-    def stop(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    previous = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, previous)

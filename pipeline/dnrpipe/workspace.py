@@ -33,6 +33,7 @@ from .errors import UserError
 
 SCHEMA = 1
 SUFFIX = ".dnr"
+LOCK_FILES = (".lock", ".lock-owner")
 
 
 class StageRecord(BaseModel):
@@ -119,7 +120,7 @@ class Workspace:
         if (root / "manifest.json").exists():
             workspace = cls.open(root)
             workspace.manifest.source = source
-        elif root.exists() and any(entry.name != ".lock" for entry in root.iterdir()):
+        elif root.exists() and any(entry.name not in LOCK_FILES for entry in root.iterdir()):
             raise UserError(f"{root}: exists and is not a dnrpipe workspace; choose another with -w")
         else:
             workspace = cls(root, Manifest(source=source))  # pyright: ignore[reportCallIssue]
@@ -194,8 +195,7 @@ def locked(root: Path, purpose: str) -> Iterator[None]:
     The lock is the kernel's (flock): it goes with the process, however that ends.
     """
     root.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(root / ".lock", timeout=0)
-    owner = root / ".lock-owner"
+    lock, owner = FileLock(root / LOCK_FILES[0], timeout=0), root / LOCK_FILES[1]
     try:
         lock.acquire()
     except Timeout:

@@ -1,0 +1,168 @@
+"""View sampling, splits, scene cameras, NeRF camera files."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dnrpipe.cameras import depth_range, make_cameras, orbit_views, split_views
+from dnrpipe.errors import UserError
+from dnrpipe.settings import CameraSettings
+from dnrtrain.contract import ContractError, View, parse_transforms, read_cameras, write_cameras
+
+SUMMARY = {"bounds": {"center": [1.0, -2.0, 0.5], "radius": 1.5}, "cameras": [], "animation": []}
+
+
+def _camera(**changes) -> dict:
+    camera = {
+        "name": "Camera",
+        "type": "PERSP",
+        "c2w": np.eye(4).tolist(),
+        "lens": 35.0,
+        "sensor_width": 36.0,
+        "sensor_height": 24.0,
+        "sensor_fit": "AUTO",
+        "shift_x": 0.0,
+        "shift_y": 0.0,
+        "active": True,
+    }
+    return camera | changes
+
+
+def _project(view: View, point: np.ndarray) -> np.ndarray:
+    x, y, z = (np.linalg.inv(view.matrix) @ np.append(point, 1.0))[:3]
+    return np.array([view.cx + view.fl_x * x / -z, view.cy - view.fl_y * y / -z])
+
+
+@pytest.mark.parametrize("source", ["dome", "sphere"])
+@pytest.mark.parametrize("size", [(128, 128), (160, 90), (90, 160)])
+def test_every_view_holds_the_bounding_sphere(source: str, size: tuple[int, int]) -> None:
+    cameras = CameraSettings(source=source, train=30, val=3, test=7, width=size[0], height=size[1])
+    views = make_cameras(SUMMARY, cameras)
+    assert [len(views[s]) for s in ("train", "val", "test")] == [30, 3, 7]
+    center = np.array(SUMMARY["bounds"]["center"])
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(200, 3))
+    points = center + 1.5 * points / np.linalg.norm(points, axis=1, keepdims=True)
+    below = 0
+    for view in views["train"]:
+        below += view.position[2] < center[2]
+        pixels = np.array([_project(view, p) for p in points])
+        assert (pixels > -1e-6).all()
+        assert (pixels < np.array(size) + 1e-6).all()
+    assert (below > 0) == (source == "sphere")
+
+
+def test_splits_share_no_view_and_do_not_move_each_other() -> None:
+    few = make_cameras(SUMMARY, CameraSettings(train=10, val=5, test=5, width=64, height=64))
+    more = make_cameras(SUMMARY, CameraSettings(train=10, val=5, test=50, width=64, height=64))
+    assert few["train"] == more["train"]
+    positions = np.array([v.position for views in few.values() for v in views])
+    distances = np.linalg.norm(positions[:, None] - positions[None], axis=-1) + np.eye(len(positions))
+    assert distances.min() > 1e-3
+    other = make_cameras(SUMMARY, CameraSettings(train=10, val=5, test=5, width=64, height=64, seed=1))
+    assert other["train"] != few["train"]
+
+
+def test_scene_camera_shift_and_fit_follow_blender() -> None:
+    camera = _camera(shift_x=0.1, shift_y=-0.2)
+    landscape = CameraSettings(source="scene", width=200, height=100, test=0, val=0)
+    view = make_cameras(SUMMARY | {"cameras": [camera]}, landscape)["train"][0]
+    assert view.fl_x == pytest.approx(35 / 36 * 200)
+    assert (view.cx, view.cy) == pytest.approx((100 - 20, 50 - 40))
+    portrait = landscape.model_copy(update={"width": 100, "height": 200})
+    assert make_cameras(SUMMARY | {"cameras": [camera]}, portrait)["train"][0].fl_x == pytest.approx(35 / 36 * 200)
+    vertical = _camera(sensor_fit="VERTICAL")
+    view = make_cameras(SUMMARY | {"cameras": [vertical]}, landscape)["train"][0]
+    assert view.fl_x == pytest.approx(35 / 24 * 100)
+
+
+def test_missing_sources_are_refused(tmp_path: Path) -> None:
+    for source, word in (("scene", "no perspective camera"), ("animation", "does not move")):
+        with pytest.raises(UserError, match=word):
+            make_cameras(SUMMARY, CameraSettings(source=source))
+    with pytest.raises(UserError, match="no such camera file"):
+        make_cameras(SUMMARY, CameraSettings(source=str(tmp_path / "none.json")))
+
+
+@given(st.integers(1, 60), st.integers(0, 30), st.integers(0, 30))
+@settings(max_examples=50)
+def test_dealing_out_given_views_loses_and_doubles_none(count: int, val: int, test: int) -> None:
+    views = orbit_views(SUMMARY, CameraSettings(width=16, height=16), count)
+    dealt = split_views(views, CameraSettings(val=val, test=test))
+    names = [v.name for split in ("train", "val", "test") for v in dealt[split]]
+    assert sorted(names) == sorted(v.name for v in views)
+    assert len(dealt["train"]) >= math.ceil(count * 0.6)
+
+
+def test_depth_range_holds_the_scene() -> None:
+    views = make_cameras(SUMMARY, CameraSettings(train=20, width=64, height=64))["train"]
+    near, far = depth_range(views, SUMMARY)
+    for view in views:
+        distance = np.linalg.norm(view.position - np.array(SUMMARY["bounds"]["center"]))
+        assert near <= distance - 1.5 + 1e-9
+        assert far >= distance + 1.5 - 1e-9
+
+
+def test_camera_files_survive_a_round_trip(tmp_path: Path) -> None:
+    views = make_cameras(SUMMARY, CameraSettings(train=5, width=64, height=48))["train"]
+    write_cameras(tmp_path / "train.json", views, "train")
+    assert read_cameras(tmp_path / "train.json") == views
+
+
+def _transforms(tmp_path: Path, frames: list[dict], **shared) -> Path:
+    path = tmp_path / "transforms.json"
+    path.write_text(json.dumps({**shared, "frames": frames}))
+    return path
+
+
+def test_nerf_synthetic_files_are_read(tmp_path: Path) -> None:
+    frames = [{"file_path": "./train/r_0", "transform_matrix": np.eye(4).tolist()}]
+    path = _transforms(tmp_path, frames, camera_angle_x=0.6911112070083618)
+    (view,) = parse_transforms(path, (800, 800))
+    assert view.name == "r_0"
+    assert view.fl_x == pytest.approx(1111.1110311937682)
+    assert (view.cx, view.cy) == (400, 400)
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"transform_matrix": [[float("nan")] * 4] * 4}, "NaN"),
+        ({"transform_matrix": (2 * np.eye(4)).tolist()}, "not a rotation"),
+        ({"transform_matrix": np.eye(3).tolist()}, "4x4"),
+        ({"fl_x": float("inf")}, "finite"),
+        ({"w": 0}, "greater than"),
+        ({"k1": 0.1}, "distortion"),
+    ],
+)
+def test_broken_frames_are_refused_in_one_line(tmp_path: Path, change: dict, word: str) -> None:
+    frame = {"file_path": "a", "transform_matrix": np.eye(4).tolist(), "fl_x": 50.0, "w": 64, "h": 64}
+    path = _transforms(tmp_path, [frame, frame | change])
+    with pytest.raises(ContractError) as caught:
+        parse_transforms(path)
+    assert word in str(caught.value)
+    assert "frame 1" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"frames": []}', '{"frames": 3}', "\x00\xff"])
+def test_files_that_are_no_camera_files(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "transforms.json"
+    path.write_text(text)
+    with pytest.raises(ContractError):
+        parse_transforms(path)
+
+
+def test_ray_directions_point_at_their_pixels() -> None:
+    view = make_cameras(SUMMARY, CameraSettings(train=1, width=20, height=10))["train"][0]
+    rays = view.ray_directions()
+    for row, column in ((0, 0), (9, 19), (4, 7)):
+        pixel = _project(view, view.position + 3 * rays[row, column])
+        assert pixel == pytest.approx([column + 0.5, row + 0.5], abs=1e-3)

@@ -1,0 +1,171 @@
+"""Bad input gets one clear line, exit code 2, and nothing is lost. Commands run as users run them."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dnrpipe.workspace import SCHEMA, Manifest, Source, Workspace, locked
+
+
+def _run(*arguments: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "dnrpipe.cli", *arguments],
+        cwd=folder,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+
+
+def _refused(done: subprocess.CompletedProcess[str], *words: str) -> None:
+    lines = [line for line in done.stderr.splitlines() if line.startswith("dnrpipe: error:")]
+    assert done.returncode == 2, done.stderr
+    assert len(lines) == 1, done.stderr
+    assert "Traceback" not in done.stderr
+    for word in words:
+        assert word in lines[0]
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Workspace:
+    (tmp_path / "scene.blend").write_bytes(b"BLENDER-v300")
+    source = Source(path=str(tmp_path / "scene.blend"), sha256="0")
+    return Workspace.create(tmp_path / "scene.dnr", source)
+
+
+def test_no_such_scene_and_folders(tmp_path: Path) -> None:
+    _refused(_run("prepare", "none.blend", folder=tmp_path), "none.blend", "no such file")
+    _refused(_run("prepare", str(tmp_path), folder=tmp_path), "is a folder")
+    assert not list(tmp_path.glob("*.dnr"))
+
+
+def test_bad_numbers(tmp_path: Path) -> None:
+    for budget in ("0", "-3"):
+        _refused(_run("select", "--budget", budget, folder=tmp_path), "--budget", "at least 1")
+    _refused(_run("select", "--budget", "many", folder=tmp_path), "--budget", "--help")
+    _refused(_run("prepare", "--set", "cameras.trian=3", folder=tmp_path), "no workspace")
+
+
+def test_unknown_command_and_option(tmp_path: Path) -> None:
+    _refused(_run("prepair", folder=tmp_path), "prepair", "--help")
+    _refused(_run("select", "--bugdet", "3", folder=tmp_path), "--bugdet")
+
+
+def test_unknown_setting_leaves_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "a.blend").write_bytes(b"BLENDER-v300")
+    done = _run("prepare", "a.blend", "--set", "cameras.trian=3", folder=tmp_path)
+    _refused(done, "cameras.trian", "cameras.train")
+    assert not (tmp_path / "a.dnr").exists()
+
+
+def test_budget_above_the_candidates_is_refused_before_work(tmp_path: Path) -> None:
+    (tmp_path / "a.blend").write_bytes(b"BLENDER-v300")
+    done = _run("run", "a.blend", "--budget", "41", "--views", "40", folder=tmp_path)
+    _refused(done, "--budget 41", "40 candidate")
+
+
+def test_no_workspace_or_several(tmp_path: Path) -> None:
+    _refused(_run("select", folder=tmp_path), "no workspace", "dnrpipe prepare")
+    for name in ("a", "b"):
+        Workspace.create(tmp_path / f"{name}.dnr", Source(path="x", sha256="0"))
+    _refused(_run("select", folder=tmp_path), "several", "a.dnr, b.dnr", "-w")
+
+
+@pytest.mark.parametrize("command", ["select", "raytrace-selected", "finetune", "evaluate", "render"])
+def test_a_stage_before_its_input_names_the_command_to_run(workspace: Workspace, command: str) -> None:
+    _refused(_run(command, folder=workspace.root.parent), "dnrpipe prepare")
+
+
+def test_a_newer_workspace_is_refused(workspace: Workspace) -> None:
+    path = workspace.root / "manifest.json"
+    data = json.loads(path.read_text()) | {"schema": SCHEMA + 1}
+    path.write_text(json.dumps(data))
+    _refused(_run("status", folder=workspace.root.parent), "newer", "upgrade")
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"schema": 1}', '{"schema": "one"}'])
+def test_a_damaged_manifest_is_refused(workspace: Workspace, text: str) -> None:
+    (workspace.root / "manifest.json").write_text(text)
+    _refused(_run("status", folder=workspace.root.parent), "damaged")
+
+
+def test_two_processes_on_one_workspace(workspace: Workspace) -> None:
+    with locked(workspace.root, "select"):
+        done = _run("prepare", folder=workspace.root.parent)
+        _refused(done, "dnrpipe select", str(os.getpid()))
+    assert not (workspace.root / ".lock-owner").exists()
+
+
+def test_a_folder_that_is_no_workspace_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "a.blend").write_bytes(b"BLENDER-v300")
+    (tmp_path / "a.dnr").mkdir()
+    (tmp_path / "a.dnr" / "precious.txt").write_text("keep me")
+    _refused(_run("prepare", "a.blend", folder=tmp_path), "not a dnrpipe workspace", "-w")
+    assert (tmp_path / "a.dnr" / "precious.txt").read_text() == "keep me"
+
+
+def test_broken_camera_file(tmp_path: Path) -> None:
+    (tmp_path / "a.blend").write_bytes(b"BLENDER-v300")
+    _refused(_run("prepare", "a.blend", "--cameras", "none.json", folder=tmp_path), "none.json")
+
+
+def test_status_of_a_fresh_workspace(workspace: Workspace) -> None:
+    done = _run("status", "--json", folder=workspace.root)
+    assert done.returncode == 0, done.stderr
+    stages = json.loads(done.stdout)["stages"]
+    assert [row["state"] for row in stages] == ["missing"] * 5
+    assert "next: dnrpipe prepare" in _run("status", folder=workspace.root).stdout
+
+
+def test_help_is_cheap_and_has_examples(tmp_path: Path) -> None:
+    code = (
+        "import sys; from dnrpipe.cli import _main; code = _main(['prepare', '--help']);"
+        "heavy = {'torch', 'bpy', 'mitsuba', 'numpy', 'OpenEXR', 'matplotlib'} & set(sys.modules);"
+        "print(sorted(heavy)); sys.exit(code)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert "Examples:" in done.stdout
+    assert done.stdout.strip().endswith("[]"), done.stdout
+
+
+def test_manifest_round_trip(workspace: Workspace) -> None:
+    workspace.finish_stage("prepare", fingerprint="f", output="o", seconds=1.5, detail={"views": {"train": 3}})
+    again = Workspace.open(workspace.root)
+    assert again.manifest == workspace.manifest
+    assert isinstance(again.manifest, Manifest)
+
+
+@pytest.fixture
+def tiny_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 64 KiB."""
+    folder = tmp_path / "tiny"
+    folder.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(folder)], capture_output=True, check=False
+    )
+    if mounted.returncode != 0:
+        pytest.skip("mounting a small tmpfs needs root")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+
+
+def test_a_full_disk_is_one_line(tiny_disk: Path) -> None:
+    (tiny_disk / "a.blend").write_bytes(b"BLENDER-v300")
+    (tiny_disk / "ballast").write_bytes(b"0" * 61440)
+    _refused(_run("prepare", "a.blend", folder=tiny_disk), "disk is full")
+    assert not list((tiny_disk / "a.dnr").glob("manifest*"))
+
+
+def test_a_read_only_workspace_is_one_line(tiny_disk: Path) -> None:
+    (tiny_disk / "a.blend").write_bytes(b"BLENDER-v300")
+    subprocess.run(["mount", "-o", "remount,ro", str(tiny_disk)], check=True)
+    _refused(_run("prepare", "a.blend", folder=tiny_disk), "cannot be written", "-w")

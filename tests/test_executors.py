@@ -1,0 +1,138 @@
+"""Worker processes: results, retries, deaths, hangs, noise on standard output."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from dnrpipe.executors import Retry, TaskResult, run_tasks
+
+WORKER = """
+import os, pathlib, signal, sys, time
+print("noise on import")
+
+class Worker:
+    def __init__(self, common):
+        self.common = common
+    def __call__(self, task):
+        print("noise in task")
+        os.write(1, b"noise below Python\\n")
+        kind = task["kind"]
+        if kind == "crash-once":
+            mark = pathlib.Path(self.common["folder"]) / f"crashed-{task['n']}"
+            if not mark.exists():
+                mark.touch()
+                os.kill(os.getpid(), signal.SIGSEGV)
+        elif kind == "crash":
+            os._exit(134)
+        elif kind == "hang":
+            time.sleep(60)
+        elif kind == "refuse":
+            raise ValueError("bad input,\\nsaid on two lines")
+        elif kind == "sleep":
+            time.sleep(0.4)
+        return {"n": task["n"], "pid": os.getpid()}
+"""
+
+
+@pytest.fixture
+def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    (tmp_path / "fragile_worker.py").write_text(WORKER)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    return "fragile_worker"
+
+
+def _run(module: str, folder: Path, kinds: list[str], **options) -> tuple[list[TaskResult], list[Retry]]:
+    tasks = [{"kind": kind, "n": n} for n, kind in enumerate(kinds)]
+    options = {"workers": 2, "log": folder / "log.txt", **options}
+    outcomes = list(run_tasks(module, {"folder": str(folder)}, tasks, **options))
+    results = sorted((o for o in outcomes if isinstance(o, TaskResult)), key=lambda o: o.task["n"])
+    return results, [o for o in outcomes if isinstance(o, Retry)]
+
+
+def test_all_tasks_are_done_on_several_processes(module: str, tmp_path: Path) -> None:
+    results, retries = _run(module, tmp_path, ["sleep"] * 4)
+    assert [r.result["n"] for r in results if r.result] == [0, 1, 2, 3]
+    assert len({r.result["pid"] for r in results if r.result}) == 2
+    assert not retries
+    assert "noise below Python" in (tmp_path / "log.txt").read_text()
+
+
+def test_a_crashed_worker_is_replaced_and_its_task_retried_once(module: str, tmp_path: Path) -> None:
+    results, retries = _run(module, tmp_path, ["ok", "crash-once", "ok", "crash", "ok"])
+    assert [r.error is None for r in results] == [True, True, True, False, True]
+    assert results[1].attempts == 2
+    assert results[3].attempts == 2
+    assert "exit code 134" in (results[3].error or "")
+    assert sorted(r.task["n"] for r in retries) == [1, 3]
+    assert any("SIGSEGV" in r.reason for r in retries)
+
+
+def test_bad_input_is_not_retried_and_is_one_line(module: str, tmp_path: Path) -> None:
+    results, retries = _run(module, tmp_path, ["refuse", "ok"])
+    assert results[0].error == "bad input, said on two lines"
+    assert results[0].attempts == 1
+    assert results[1].result is not None
+    assert not retries
+
+
+def test_a_hung_worker_is_killed(module: str, tmp_path: Path) -> None:
+    started = time.monotonic()
+    results, _ = _run(module, tmp_path, ["hang", "ok"], timeout=1.0)
+    assert time.monotonic() - started < 20
+    assert "hung" in (results[0].error or "")
+    assert results[1].result is not None
+
+
+def test_a_module_that_cannot_be_imported_fails_every_task(tmp_path: Path) -> None:
+    results, _ = _run("no_such_module_here", tmp_path, ["ok"])
+    assert results[0].error is not None
+    assert "No module named" in (tmp_path / "log.txt").read_text()
+
+
+def test_closing_the_iterator_kills_the_workers(module: str, tmp_path: Path) -> None:
+    tasks = [{"kind": "ok", "n": 0}, {"kind": "hang", "n": 1}]
+    outcomes = run_tasks(module, {"folder": str(tmp_path)}, tasks, workers=2, log=tmp_path / "log.txt")
+    first = next(outcomes)
+    assert isinstance(first, TaskResult)
+    started = time.monotonic()
+    outcomes.close()  # type: ignore[attr-defined]
+    assert time.monotonic() - started < 10
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="PR_SET_PDEATHSIG is Linux's")
+def test_workers_die_with_their_parent(module: str, tmp_path: Path) -> None:
+    import os
+    import signal
+    import subprocess
+
+    script = (
+        "from dnrpipe.executors import run_tasks; from pathlib import Path;"
+        f"list(run_tasks('{module}', {{'folder': '.'}}, [{{'kind': 'hang', 'n': 0}}], workers=1,"
+        f" log=Path('{tmp_path}/log.txt')))"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", script])
+    children: list[int] = []
+    for _ in range(100):
+        time.sleep(0.1)
+        lists = Path(f"/proc/{parent.pid}/task").glob("*/children")
+        children = [int(pid) for found in lists for pid in found.read_text().split()]
+        if children and "noise in task" in (tmp_path / "log.txt").read_text():
+            break
+    assert children
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    for _ in range(50):
+        time.sleep(0.1)
+        if not any(Path(f"/proc/{pid}").exists() and _running(pid) for pid in children):
+            return
+    for pid in children:
+        os.kill(pid, signal.SIGKILL)
+    raise AssertionError("a worker outlived its parent")
+
+
+def _running(pid: int) -> bool:
+    return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"

@@ -1,0 +1,104 @@
+"""Layers, presets and refusals of the settings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dnrpipe.errors import UserError
+from dnrpipe.settings import PRESETS, merge, parse_assignment, resolve
+
+
+def test_layers_win_in_order(tmp_path: Path) -> None:
+    toml = tmp_path / "dnrpipe.toml"
+    toml.write_text("[cameras]\ntrain = 50\nval = 6\ntest = 7\n")
+    environment = {"DNRPIPE_CAMERAS__VAL": "8", "DNRPIPE_CAMERAS__TEST": "9"}
+    settings = resolve(None, {"cameras": {"test": 10}}, toml_files=[toml], environment=environment)
+    assert settings.preset == "draft"
+    assert settings.cameras.width == PRESETS["draft"]["cameras"]["width"]
+    assert (settings.cameras.train, settings.cameras.val, settings.cameras.test) == (50, 8, 10)
+
+
+def test_paper_preset_has_the_papers_numbers() -> None:
+    s = resolve("paper", {}, environment={})
+    assert (s.cameras.train, s.cameras.val, s.cameras.test) == (100, 100, 200)
+    assert (s.cameras.width, s.cameras.height) == (800, 800)
+    assert (s.select.step1.epochs, s.finetune.step2.epochs) == (50, 100)
+    assert (s.select.step1.weight_rl, s.select.step1.weight_dnr) == (0.1, 1.0)
+    w = s.finetune.step2.loss
+    assert (w.photometric, w.ssim, w.perceptual, w.frequency, w.total_variation, w.regularisation) == (
+        1.0,
+        0.1,
+        0.1,
+        0.01,
+        0.001,
+        0.1,
+    )
+    for step in (s.select.step1, s.finetune.step2):
+        assert (step.learning_rate, step.learning_rate_end) == (1e-3, 1e-4)
+    assert s.model.aggregator == "concat"
+    assert s.finetune.step2.augment
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_preset_validates(preset: str) -> None:
+    assert resolve(preset, {}, environment={}).preset == preset
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ({"camera": {}}, ["unknown setting 'camera'", "cameras"]),
+        ({"cameras": {"trian": 3}}, ["cameras.trian", "cameras.train"]),
+        ({"select": {"budget": 0}}, ["select.budget", "0"]),
+        ({"cameras": {"train": "many"}}, ["cameras.train", "many"]),
+        ({"cameras": 3}, ["cameras"]),
+        ({"device": "tpu"}, ["device"]),
+    ],
+)
+def test_bad_settings_are_named(overrides: dict, words: list[str]) -> None:
+    with pytest.raises(UserError) as caught:
+        resolve(None, overrides, environment={})
+    assert "\n" not in str(caught.value)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_unknown_environment_and_preset_and_broken_toml(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="environment: unknown setting"):
+        resolve(None, {}, environment={"DNRPIPE_CAMERAS__TRIAN": "3"})
+    with pytest.raises(UserError, match="unknown preset 'fast'"):
+        resolve("fast", {}, environment={})
+    toml = tmp_path / "dnrpipe.toml"
+    toml.write_text("[cameras\n")
+    with pytest.raises(UserError, match="not valid TOML"):
+        resolve(None, {}, toml_files=[toml], environment={})
+
+
+def test_assignments() -> None:
+    assert parse_assignment("a.b=3") == {"a": {"b": 3}}
+    assert parse_assignment("a=true") == {"a": True}
+    assert parse_assignment("a=hello") == {"a": "hello"}
+    with pytest.raises(UserError, match="KEY=VALUE"):
+        parse_assignment("a.b")
+
+
+_nested = st.recursive(
+    st.integers(), lambda children: st.dictionaries(st.sampled_from("abc"), children, max_size=3), max_leaves=6
+)
+
+
+@given(st.dictionaries(st.sampled_from("abc"), _nested), st.dictionaries(st.sampled_from("abc"), _nested))
+def test_merge_leaves_its_arguments_alone_and_the_later_wins(base: dict, extra: dict) -> None:
+    import copy
+
+    before = copy.deepcopy((base, extra))
+    merged = merge(base, extra)
+    assert (base, extra) == before
+    for key, value in extra.items():
+        if not isinstance(value, dict):
+            assert merged[key] == value
+    assert merge(merged, extra) == merged
