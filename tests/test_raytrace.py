@@ -1,0 +1,133 @@
+"""The Mitsuba worker: rays, alpha, noise estimate, determinism, variant probing."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dnrpipe.cameras import make_cameras
+from dnrpipe.errors import UserError
+from dnrpipe.executors import TaskResult, run_tasks
+from dnrpipe.raytrace.tracer import estimate_noise
+from dnrpipe.raytrace.variants import choose_variant, llvm_libraries
+from dnrpipe.settings import CameraSettings
+from dnrtrain.exr import read_exr
+
+SUMMARY = {"bounds": {"center": [0.0, 0.0, 0.0], "radius": 1.2}, "cameras": [], "animation": []}
+BUNDLE = """<scene version="3.0.0">
+  <integrator type="path"/>
+  <emitter type="constant"/>
+  <shape type="sphere"><bsdf type="diffuse"><rgb name="reflectance" value="0.5"/></bsdf></shape>
+</scene>"""
+
+
+def _view(**changes):
+    settings = CameraSettings(train=1, val=0, test=0, width=48, height=32)
+    return make_cameras(SUMMARY, settings)["train"][0].model_copy(update=changes)
+
+
+def _trace(folder: Path, tasks: list[dict], workers: int = 1) -> list[dict]:
+    (folder / "scene.xml").write_text(BUNDLE)
+    choice = choose_variant()
+    common = {"bundle": str(folder / "scene.xml"), "variant": choice.variant, "threads": 1}
+    outcomes = run_tasks(
+        "dnrpipe.raytrace.tracer",
+        common,
+        tasks,
+        workers=workers,
+        log=folder / "log.txt",
+        environment=choice.environment,
+    )
+    results = [o for o in outcomes if isinstance(o, TaskResult)]
+    assert all(o.result for o in results), [o.error for o in results]
+    return [o.result for o in results if o.result]
+
+
+def _task(folder: Path, name: str, **changes) -> dict:
+    task = {
+        "view": _view().model_dump(mode="json"),
+        "output": str(folder / f"{name}.exr"),
+        "spp": 64,
+        "max_depth": 4,
+        "seed": 3,
+        "fingerprint": "f",
+    }
+    return task | changes
+
+
+def test_mitsuba_looks_where_the_view_says() -> None:
+    """Rays of the perspective sensor at pixel centres equal View.ray_directions, off-centre lens included."""
+    code = """
+import json, sys, numpy as np
+from dnrtrain.contract import View
+from dnrpipe.raytrace.tracer import sensor_dict
+import mitsuba as mi
+mi.set_variant("scalar_rgb")
+view = View.model_validate(json.loads(sys.argv[1]))
+sensor = mi.load_dict(sensor_dict(mi, view))
+directions = view.ray_directions()
+worst = 0.0
+for row in range(0, view.height, 5):
+    for column in range(0, view.width, 5):
+        at = [(column + 0.5) / view.width, (row + 0.5) / view.height]
+        ray, _ = sensor.sample_ray(0, 0, at, [0.5, 0.5])
+        worst = max(worst, float(np.abs(np.array(ray.d) - directions[row, column]).max()))
+print(worst)
+"""
+    for changes in ({}, {"cx": 10.0, "cy": 25.5}):
+        data = json.dumps(_view(**changes).model_dump(mode="json"))
+        done = subprocess.run([sys.executable, "-c", code, data], capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        assert float(done.stdout) < 1e-5
+
+
+def test_a_grey_sphere_in_white_light(tmp_path: Path) -> None:
+    """In uniform unit light a diffuse convex body shows its albedo; the background is transparent."""
+    (result,) = _trace(tmp_path, [_task(tmp_path, "a", spp=256)])
+    channels, metadata = read_exr(tmp_path / "a.exr")
+    inside = channels["A"] > 0.999
+    assert inside.sum() > 200
+    assert channels["A"][0, 0] == 0
+    assert channels["R"][0, 0] == 0
+    assert channels["G"][inside].mean() == pytest.approx(0.5, rel=0.01)
+    assert metadata["fingerprint"] == "f"
+    assert metadata["spp"] == result["spp"] == 256
+
+
+def test_same_seed_same_bits_other_seed_other_bits(tmp_path: Path) -> None:
+    tasks = [_task(tmp_path, "a"), _task(tmp_path, "b"), _task(tmp_path, "c", seed=4), _task(tmp_path, "d")]
+    _trace(tmp_path, tasks, workers=2)
+    a, b, c, d = (read_exr(tmp_path / f"{n}.exr")[0]["R"] for n in "abcd")
+    assert np.array_equal(a, b)
+    assert np.array_equal(a, d)
+    assert not np.array_equal(a, c)
+
+
+def test_odd_and_single_sample_counts(tmp_path: Path) -> None:
+    results = _trace(tmp_path, [_task(tmp_path, "a", spp=1), _task(tmp_path, "b", spp=7)])
+    assert results[0]["spp"] == 1
+    assert results[0]["noise"] is None
+    assert results[1]["spp"] == 7
+
+
+def test_the_noise_estimate_is_the_error_of_the_mean() -> None:
+    """Against the known truth, for two independent halves with Gaussian noise well inside the display range."""
+    rng = np.random.default_rng(0)
+    truth = np.ones((400, 400, 4)) * [0.3, 0.3, 0.3, 1.0]
+    halves = [truth + rng.normal(0, 0.02, truth.shape) * [1, 1, 1, 0] for _ in range(2)]
+    _, estimated = estimate_noise(*halves)
+    slope = 1.055 / 2.4 * 0.3 ** (1 / 2.4 - 1)
+    assert estimated == pytest.approx(slope * 0.02 / np.sqrt(2), rel=0.03)
+
+
+def test_an_unusable_variant_is_refused_and_llvm_15_is_not_tried() -> None:
+    with pytest.raises(UserError, match="cuda_ad_rgb") as caught:
+        choose_variant("cuda_ad_rgb")
+        pytest.skip("this machine has CUDA")
+    assert "\n" not in str(caught.value)
+    assert not [p for p in llvm_libraries() if "LLVM-15" in p.name or "LLVM-16" in p.name]
