@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
+
 from dnrpipe.costs import CostRecord, Ledger
 from dnrtrain.contract import SceneFrame, View, write_cameras
 from dnrtrain.exr import write_exr
-from PIL import Image
 
 CENTER = (0.2, -0.1, 0.5)
 CHOSEN = ["0004", "0011", "0001", "0007"]
@@ -224,6 +225,7 @@ def _history(step: int, epochs: int) -> list[dict[str, Any]]:
         wobble = 1 + 0.06 * math.sin(epoch * 2.1)
         if step == 1:
             losses = {"dnr": 0.03 * fall * wobble + 0.002, "rl": 0.4 * fall + 0.05 * wobble}
+            losses |= {"reward": -0.03 * fall * wobble - 0.002, "q": -0.3 * fall - 0.02}
             val = {"psnr": 24.5 - 8 * fall * wobble}
         else:
             scales = {
@@ -235,8 +237,8 @@ def _history(step: int, epochs: int) -> list[dict[str, Any]]:
                 "regularisation": 0.011,
             }
             losses = {name: scale * (fall * wobble + 0.2) for name, scale in scales.items()}
+            losses["total"] = sum(losses.values())
             val = {}
-        losses["total"] = sum(losses.values())
         skipped = 1 if step == 2 and epoch == 4 else 0
         history.append({"epoch": epoch, "losses": losses, "val": val, "seconds": 2.0 * wobble, "skipped": skipped})
     return history
@@ -265,7 +267,7 @@ def _ledger(root: Path, views: dict[str, list[View]], chosen: list[str], size: i
     for split, members in views.items():
         for view in members:
             purpose = "evaluation" if split == "test" else "training"
-            book("prepare", purpose, "view", f"{split}/{view.name}", 0.3, workers=2, peak_mb=412.0)
+            book("prepare", purpose, "view", f"{split}/{view.name}", 0.06, workers=2, peak_mb=412.0)
     for epoch in range(1, 13):
         book("select", "training", "epoch", f"epoch {epoch}", 2.0, steps=16)
     mitsuba = {"device": "mitsuba llvm_ad_rgb", "workers": 2, "peak_mb": 655.0}

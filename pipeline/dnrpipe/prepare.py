@@ -31,7 +31,7 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
     scene_print = scene_fingerprint(workspace)
     summary = _convert(workspace, console, run_id, scene_print)
     views = _place_cameras(workspace, settings, summary)
-    engine, reason = _raster_engine(settings, console)
+    engine, reason = _raster_engine(workspace, settings, console)
     tasks = [
         pass_task(workspace, settings, view, split, scene_print, engine, raster=split in RASTERISED)
         for split in SPLITS
@@ -202,9 +202,16 @@ def _place_cameras(workspace: Workspace, settings: Settings, summary: dict[str, 
     return views
 
 
-def _raster_engine(settings: Settings, console: Console) -> tuple[str, str]:
+def _raster_engine(workspace: Workspace, settings: Settings, console: Console) -> tuple[str, str]:
+    """The engine for rasterised colour, probed once per workspace: a busy machine must not change it midway."""
     from .blender.choice import choose_raster
 
+    record = workspace.root / "passes" / "raster.json"
+    if record.exists():
+        chosen = json.loads(record.read_text(encoding="utf-8"))
+        if chosen["requested"] == settings.passes.raster:
+            return chosen["engine"], chosen["reason"]
     engine, reason = choose_raster(settings.passes.raster)
     console.say(f"raster colour by {engine}: {reason}")
+    write_json(record, {"requested": settings.passes.raster, "engine": engine, "reason": reason})
     return engine, reason

@@ -63,8 +63,10 @@ def read_metadata(path: Path) -> dict[str, Any] | None:
     """The JSON metadata of an EXR, or None when the file is missing or damaged (reads the header only)."""
     import OpenEXR
 
+    if not Path(path).is_file():  # asked first: the library writes a line to standard error otherwise
+        return None
     try:
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
             return json.loads(file.header().get(METADATA_KEY, "{}"))
-    except Exception:  # missing, torn or foreign: the caller makes the file again
+    except Exception:  # torn or foreign: the caller makes the file again
         return None

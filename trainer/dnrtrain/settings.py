@@ -44,6 +44,10 @@ class Step1Settings(Strict):
     epsilon_end: float = Field(default=0.05, ge=0, le=1)
     reward: Literal["neg-loss", "pos-loss", "improvement"] = "neg-loss"
     embedding: int = Field(default=64, ge=4, description="width of camera embedding and hidden vector")
+    precision: Literal["auto", "float32", "bfloat16"] = Field(
+        default="auto", description="auto: bfloat16 where it is fast"
+    )
+    validation_views: int = Field(default=8, ge=0, description="validation views rendered after each epoch")
 
 
 class LossWeights(Strict):
@@ -68,5 +72,9 @@ class Step2Settings(Strict):
     augment: bool = Field(default=True, description="random flips and quarter turns")
     precision: Literal["auto", "float32", "bfloat16"] = Field(
         default="auto", description="auto: bfloat16 where it is fast"
+    )
+    validation_views: int = Field(default=8, ge=0, description="validation views rendered after each epoch")
+    perceptual_crop: int = Field(
+        default=0, ge=0, description="side of the random square that L_p looks at in each step; 0 = whole image"
     )
     loss: LossWeights = LossWeights()

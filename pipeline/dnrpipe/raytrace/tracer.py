@@ -37,14 +37,15 @@ class Worker:
 
         mi.set_variant(common["variant"])
         mi.set_log_level(mi.LogLevel.Warn)
-        # One thread per worker: sums over samples are then in a fixed order, so the same seed gives the
-        # same bits. Views run side by side in several workers instead.
-        dr.set_thread_count(max(0, int(common["threads"]) - 1))
         self.mi = mi
         self.variant = common["variant"]
         started = time.monotonic()
         self.scene = mi.load_file(common["bundle"])
         self.load_seconds = time.monotonic() - started
+        # One thread per worker: sums over samples are then in a fixed order, so the same seed gives the
+        # same bits. Views run side by side in several workers instead. Only after loading: the parallel
+        # scene loader waits for ever on an empty pool.
+        dr.set_thread_count(max(0, int(common["threads"]) - 1))
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
         mi = self.mi

@@ -1,0 +1,246 @@
+"""Blender's colour and converter nodes as functions on arrays [..., 3] of linear colour (scalars repeat).
+
+Sources: Blender manual (Color, Converter nodes) and Cycles' svm_mix / svm_math.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+Arrays = list[np.ndarray]
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
+
+
+def _first_input(node: Any) -> int:
+    return 0
+
+
+@dataclass(frozen=True)
+class Operation:
+    """inputs: socket identifiers or names, in the order of the arrays; evaluate: result, None if unsupported."""
+
+    inputs: Callable[[Any], list[tuple[str, ...]]]
+    evaluate: Callable[[Any, Any, Arrays], np.ndarray | None]
+    fallback: Callable[[Any], int] = _first_input
+
+
+def _grey(x: np.ndarray) -> np.ndarray:
+    return np.broadcast_to((x @ LUMINANCE)[..., None], x.shape)
+
+
+def _invert(node: Any, socket: Any, a: Arrays) -> np.ndarray:
+    """Invert Color: mix of c and 1 - c by the factor."""
+    return a[1] + (1 - 2 * a[1]) * _grey(a[0])
+
+
+def _gamma(node: Any, socket: Any, a: Arrays) -> np.ndarray:
+    """Gamma: c ** gamma where c > 0."""
+    return np.where(a[0] > 0, np.power(np.maximum(a[0], 1e-20), _grey(a[1])), a[0])
+
+
+def _bright_contrast(node: Any, socket: Any, a: Arrays) -> np.ndarray:
+    """Brightness/Contrast: max(c (1 + contrast) + brightness - contrast / 2, 0)."""
+    contrast = _grey(a[2])
+    return np.maximum(a[0] * (1 + contrast) + _grey(a[1]) - contrast * 0.5, 0)
+
+
+def _to_grey(node: Any, socket: Any, a: Arrays) -> np.ndarray:
+    return _grey(a[0])
+
+
+def _blend(kind: str, t: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray | None:
+    """Blend modes of Mix Color (Cycles svm_mix)."""
+    if kind == "MIX":
+        return x + (y - x) * t
+    if kind == "MULTIPLY":
+        return x * (1 - t + t * y)
+    if kind == "ADD":
+        return x + t * y
+    if kind == "SUBTRACT":
+        return x - t * y
+    if kind == "SCREEN":
+        return 1 - (1 - t + t * (1 - y)) * (1 - x)
+    if kind == "DIFFERENCE":
+        return x + (np.abs(x - y) - x) * t
+    if kind == "DARKEN":
+        return x + (np.minimum(x, y) - x) * t
+    if kind == "LIGHTEN":
+        return x + (np.maximum(x, y) - x) * t
+    if kind == "DIVIDE":
+        return np.where(np.abs(y) > 0, (1 - t) * x + t * x / np.where(y == 0, 1, y), x)
+    if kind == "OVERLAY":
+        low = x * (1 - t + 2 * t * y)
+        return np.where(x < 0.5, low, 1 - (1 - t + 2 * t * (1 - y)) * (1 - x))
+    if kind == "LINEAR_LIGHT":
+        return x + t * (2 * y - 1)
+    return None
+
+
+def _mix_inputs(node: Any) -> list[tuple[str, ...]]:
+    if node.type == "MIX_RGB":
+        return [("Fac",), ("Color1",), ("Color2",)]
+    kind = {"FLOAT": "Float", "VECTOR": "Vector", "RGBA": "Color"}.get(node.data_type, "Float")
+    return [("Factor_Float",), (f"A_{kind}",), (f"B_{kind}",)]
+
+
+def _mix(node: Any, socket: Any, a: Arrays) -> np.ndarray | None:
+    """Mix (Color, Float, Vector) and the older MixRGB."""
+    modern = node.type == "MIX"
+    if modern and node.data_type == "ROTATION":
+        return None
+    clamp_factor = node.clamp_factor if modern else True
+    t = _grey(a[0])
+    t = np.clip(t, 0, 1) if clamp_factor else t
+    kind = node.blend_type if not modern or node.data_type == "RGBA" else "MIX"
+    result = _blend(kind, t, a[1], a[2])
+    clamp_result = node.clamp_result if modern else node.use_clamp
+    return np.clip(result, 0, 1) if result is not None and clamp_result else result
+
+
+MATH: dict[str, Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]] = {
+    "ADD": lambda x, y, z: x + y,
+    "SUBTRACT": lambda x, y, z: x - y,
+    "MULTIPLY": lambda x, y, z: x * y,
+    "DIVIDE": lambda x, y, z: np.where(y != 0, x / np.where(y == 0, 1, y), 0),
+    "MULTIPLY_ADD": lambda x, y, z: x * y + z,
+    "POWER": lambda x, y, z: np.power(np.maximum(x, 0), y),
+    "SQRT": lambda x, y, z: np.sqrt(np.maximum(x, 0)),
+    "ABSOLUTE": lambda x, y, z: np.abs(x),
+    "MINIMUM": lambda x, y, z: np.minimum(x, y),
+    "MAXIMUM": lambda x, y, z: np.maximum(x, y),
+    "LESS_THAN": lambda x, y, z: (x < y).astype(np.float32),
+    "GREATER_THAN": lambda x, y, z: (x > y).astype(np.float32),
+    "ROUND": lambda x, y, z: np.floor(x + 0.5),
+    "FLOOR": lambda x, y, z: np.floor(x),
+    "CEIL": lambda x, y, z: np.ceil(x),
+    "FRACT": lambda x, y, z: x - np.floor(x),
+    "SINE": lambda x, y, z: np.sin(x),
+    "COSINE": lambda x, y, z: np.cos(x),
+}
+
+
+def _math_inputs(node: Any) -> list[tuple[str, ...]]:
+    return [("Value",), ("Value_001",), ("Value_002",)]
+
+
+def _math(node: Any, socket: Any, a: Arrays) -> np.ndarray | None:
+    """Math."""
+    function = MATH.get(node.operation)
+    if function is None:
+        return None
+    result = np.asarray(function(_grey(a[0]), _grey(a[1]), _grey(a[2])))
+    return np.clip(result, 0, 1) if node.use_clamp else result
+
+
+def _clamp(node: Any, socket: Any, a: Arrays) -> np.ndarray:
+    """Clamp (Min Max, or Range with swapped limits)."""
+    low, high = _grey(a[1]), _grey(a[2])
+    if node.clamp_type == "RANGE":
+        low, high = np.minimum(low, high), np.maximum(low, high)
+    return np.minimum(np.maximum(_grey(a[0]), low), high)
+
+
+def _map_range(node: Any, socket: Any, a: Arrays) -> np.ndarray | None:
+    """Map Range, float, linear."""
+    if node.data_type != "FLOAT" or node.interpolation_type != "LINEAR":
+        return None
+    value, low, high, to_low, to_high = (_grey(x) for x in a[:5])
+    span = high - low
+    t = np.where(span != 0, (value - low) / np.where(span == 0, 1, span), 0)
+    result = to_low + t * (to_high - to_low)
+    if node.clamp:
+        result = np.clip(result, np.minimum(to_low, to_high), np.maximum(to_low, to_high))
+    return result
+
+
+def _ramp(node: Any, socket: Any, a: Arrays) -> np.ndarray:
+    """Color Ramp, sampled at 1025 places as dense as 8-bit input can tell apart."""
+    samples = np.array([node.color_ramp.evaluate(t) for t in np.linspace(0, 1, 1025)], dtype=np.float32)
+    position = np.clip(_grey(a[0])[..., 0], 0, 1) * 1024
+    low = np.floor(position).astype(int)
+    high = np.minimum(low + 1, 1024)
+    t = (position - low)[..., None]
+    mixed = samples[low] * (1 - t) + samples[high] * t
+    if socket.name == "Alpha":
+        return np.repeat(mixed[..., 3:], 3, axis=-1)
+    return mixed[..., :3]
+
+
+def _separate(node: Any, socket: Any, a: Arrays) -> np.ndarray | None:
+    """Separate Color (RGB) / Separate XYZ: one channel, repeated."""
+    if getattr(node, "mode", "RGB") != "RGB":
+        return None
+    order = {"Red": 0, "Green": 1, "Blue": 2, "R": 0, "G": 1, "B": 2, "X": 0, "Y": 1, "Z": 2}
+    channel = order[socket.name]
+    return np.repeat(a[0][..., channel : channel + 1], 3, axis=-1)
+
+
+def _combine(node: Any, socket: Any, a: Arrays) -> np.ndarray | None:
+    """Combine Color (RGB) / Combine XYZ."""
+    if getattr(node, "mode", "RGB") != "RGB":
+        return None
+    grey = np.broadcast_arrays(*(_grey(x)[..., 0] for x in a[:3]))
+    return np.stack(grey, axis=-1)
+
+
+def _hue_saturation(node: Any, socket: Any, a: Arrays) -> np.ndarray:
+    """Hue/Saturation/Value: hue shifted by hue - 0.5, saturation and value scaled, mixed by the factor."""
+    hue, saturation, value, factor, colour = _grey(a[0]), _grey(a[1]), _grey(a[2]), _grey(a[3]), a[4]
+    hsv = _rgb_to_hsv(colour)
+    h = np.mod(hsv[..., 0] + hue[..., 0] + 0.5, 1.0)
+    s = np.clip(hsv[..., 1] * saturation[..., 0], 0, 1)
+    v = hsv[..., 2] * value[..., 0]
+    changed = np.maximum(_hsv_to_rgb(*np.broadcast_arrays(h, s, v)), 0)
+    return colour + (changed - colour) * factor
+
+
+def _rgb_to_hsv(rgb: np.ndarray) -> np.ndarray:
+    high, low = rgb.max(-1), rgb.min(-1)
+    span = high - low
+    safe = np.where(span == 0, 1, span)
+    r, g, b = rgb[..., 0], rgb[..., 1], rgb[..., 2]
+    h = np.where(high == r, (g - b) / safe, np.where(high == g, 2 + (b - r) / safe, 4 + (r - g) / safe))
+    return np.stack([np.where(span == 0, 0, np.mod(h / 6, 1)), span / np.where(high == 0, 1, high), high], -1)
+
+
+def _hsv_to_rgb(h: np.ndarray, s: np.ndarray, v: np.ndarray) -> np.ndarray:
+    k = np.mod(np.stack([5 + h * 6, 3 + h * 6, 1 + h * 6], -1), 6)
+    fall = np.clip(np.minimum(k, 4 - k), 0, 1)
+    return v[..., None] * (1 - s[..., None] * fall)
+
+
+def _sockets(*names: str) -> Callable[[Any], list[tuple[str, ...]]]:
+    return lambda node: [(name,) for name in names]
+
+
+def _combine_inputs(node: Any) -> list[tuple[str, ...]]:
+    return [("Red", "R", "X"), ("Green", "G", "Y"), ("Blue", "B", "Z")]
+
+
+def _separate_inputs(node: Any) -> list[tuple[str, ...]]:
+    return [("Color", "Image", "Vector")]
+
+
+OPERATIONS: dict[str, Operation] = {
+    "INVERT": Operation(_sockets("Fac", "Color"), _invert, lambda node: 1),
+    "GAMMA": Operation(_sockets("Color", "Gamma"), _gamma),
+    "BRIGHTCONTRAST": Operation(lambda node: [("Color",), ("Bright", "Brightness"), ("Contrast",)], _bright_contrast),
+    "RGBTOBW": Operation(_sockets("Color"), _to_grey),
+    "MIX": Operation(_mix_inputs, _mix, lambda node: 1),
+    "MIX_RGB": Operation(_mix_inputs, _mix, lambda node: 1),
+    "MATH": Operation(_math_inputs, _math),
+    "CLAMP": Operation(_sockets("Value", "Min", "Max"), _clamp),
+    "MAP_RANGE": Operation(_sockets("Value", "From Min", "From Max", "To Min", "To Max"), _map_range),
+    "VALTORGB": Operation(_sockets("Fac"), _ramp),
+    "SEPARATE_COLOR": Operation(_separate_inputs, _separate),
+    "SEPRGB": Operation(_separate_inputs, _separate),
+    "SEPXYZ": Operation(_separate_inputs, _separate),
+    "COMBINE_COLOR": Operation(_combine_inputs, _combine),
+    "COMBRGB": Operation(_combine_inputs, _combine),
+    "COMBXYZ": Operation(_combine_inputs, _combine),
+    "HUE_SAT": Operation(_sockets("Hue", "Saturation", "Value", "Fac", "Color"), _hue_saturation),
+}

@@ -1,0 +1,284 @@
+"""Blender lamps -> Mitsuba emitters. Radiometry: shared/FACTS.md, checked by tests/test_export.py.
+
+Blender's power P of a lamp in watts is the radiant flux of an isotropic source of radiance P / (4 pi^2 r^2);
+colours are scene-linear; a lamp shines along its local -Z.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from typing import Any
+
+import bpy
+import numpy as np
+
+from . import xmltree
+from .findings import Findings
+from .sockets import resolve
+from .textures import TextureStore
+
+FAR_DISC = 100.0
+"""Distance of a soft sun's disc, in radii of the scene."""
+SPOT_TEXELS = 513
+"""Side of the image that carries a spot's cross-section."""
+
+
+def visible_lights(scene: bpy.types.Scene) -> Iterator[tuple[Any, np.ndarray]]:
+    """Lamp objects that renders see, instances included, with their world matrices (float64 [4, 4])."""
+    layer = next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
+    hidden = _hidden_objects(layer.layer_collection)
+    depsgraph = layer.depsgraph if layer.depsgraph is not None else bpy.context.evaluated_depsgraph_get()
+    for obj in sorted(layer.objects, key=lambda o: o.name):
+        if obj.type == "LIGHT" and not obj.hide_render and obj.name not in hidden:
+            evaluated = obj.evaluated_get(depsgraph)
+            yield evaluated, np.array(evaluated.matrix_world, dtype=np.float64)
+    for instance in depsgraph.object_instances:
+        if instance.is_instance and instance.object.type == "LIGHT" and instance.show_self:
+            parent = instance.parent
+            if parent is not None and (parent.hide_render or parent.name in hidden):
+                continue
+            yield instance.object, np.array(instance.matrix_world, dtype=np.float64)
+
+
+def _hidden_objects(collection: bpy.types.LayerCollection, hidden: bool = False) -> set[str]:
+    """Names of objects that only lie in excluded or render-hidden collections."""
+    shown: set[str] = set()
+    masked: set[str] = set()
+
+    def visit(layer: bpy.types.LayerCollection, above: bool) -> None:
+        off = above or layer.collection.hide_render
+        target = masked if off or layer.exclude else shown
+        target.update(obj.name for obj in layer.collection.objects)
+        for child in layer.children:
+            visit(child, off)
+
+    visit(collection, hidden)
+    return masked - shown
+
+
+def export_lights(
+    scene: bpy.types.Scene,
+    root: ET.Element,
+    store: TextureStore,
+    findings: Findings,
+    center: np.ndarray,
+    radius: float,
+) -> int:
+    """Append all lamps to ``root``; return their number. center, radius: bounds of the geometry."""
+    ids = xmltree.Ids()
+    count = 0
+    for obj, matrix in visible_lights(scene):
+        light = obj.data
+        strength = _strength(light, obj.name, findings)
+        if not np.any(strength > 0):
+            continue
+        _note_ignored(obj, light, findings)
+        identity = ids.take("light", obj.name)
+        if light.type == "POINT":
+            element = _point(light, matrix, strength, identity)
+        elif light.type == "SUN":
+            element = _sun(light, matrix, strength, identity, center, radius)
+        elif light.type == "SPOT":
+            element = _spot(light, matrix, strength, identity, obj.name, store, findings)
+        else:
+            element = _area(light, matrix, strength, identity, obj.name, findings)
+        root.append(element)
+        count += 1
+    return count
+
+
+def _strength(light: Any, name: str, findings: Findings) -> np.ndarray:
+    """Power (W; W/m2 for a sun) per channel: energy x 2^exposure x colour x temperature x node tree."""
+    colour = np.array(light.color, dtype=np.float64)
+    if light.use_temperature:
+        colour = colour * np.array(light.temperature_color, dtype=np.float64)
+    power = float(light.energy) * 2.0 ** float(light.exposure) * colour
+    if light.use_nodes and light.node_tree is not None:
+        power = power * _node_colour(light.node_tree, name, findings)
+    return np.maximum(power, 0.0)
+
+
+def _node_colour(tree: bpy.types.NodeTree, name: str, findings: Findings) -> np.ndarray:
+    """Constant Emission colour x strength of a lamp's node tree; other nodes are a finding."""
+    output = tree.get_output_node("CYCLES")
+    source = resolve(output.inputs["Surface"]) if output else None
+    if source is None or not source.linked:
+        return np.zeros(3)
+    if source.node.type != "EMISSION":
+        findings.add("approximated", "lamp nodes", "only an Emission node is understood", object=name)
+        return np.ones(3)
+    total = np.ones(3)
+    for socket_name in ("Color", "Strength"):
+        value = resolve(source.node.inputs[socket_name], source.scope)
+        constant = value.linked and value.node.type in {"RGB", "VALUE"}
+        default = value.node.outputs[0].default_value if constant else value.default
+        if value.linked and not constant:
+            findings.add(
+                "approximated",
+                f"lamp node {value.node.bl_label}",
+                f"not converted: 1 stands for the textured {socket_name.lower()}",
+                object=name,
+            )
+            continue
+        total = total * (np.array(default[:3]) if socket_name == "Color" else float(default))
+    return total
+
+
+def _note_ignored(obj: Any, light: Any, findings: Findings) -> None:
+    """Lamp features without equivalent."""
+    if not light.use_shadow:
+        findings.add("ignored", "lamp without shadow", "casts shadows", object=obj.name)
+    hidden = [ray for ray in ("diffuse", "glossy", "transmission") if not getattr(obj, f"visible_{ray}")]
+    if hidden:
+        findings.add("ignored", "lamp's ray visibility", f"{', '.join(hidden)} rays see it", object=obj.name)
+    linking = getattr(obj, "light_linking", None)
+    if linking is not None and (linking.receiver_collection or linking.blocker_collection):
+        findings.add("ignored", "light linking", "the lamp lights everything", object=obj.name)
+    if light.type != "SUN" and not light.normalize:
+        findings.add("approximated", "lamp power not normalised", "converted through its area", object=obj.name)
+
+
+def _point(light: Any, matrix: np.ndarray, power: np.ndarray, identity: str) -> ET.Element:
+    """Point lamp -> ``point``, I = P / (4 pi), or, with a radius, an emitting ``sphere``, L = P / (4 pi^2 r^2).
+
+    The sphere's intensity is L pi r^2, the same.
+    """
+    radius = float(light.shadow_soft_size)
+    position = matrix[:3, 3]
+    if radius <= 1e-5:
+        element = xmltree.plugin("emitter", "point", id=identity)
+        _position(element, "position", position)
+        xmltree.rgb(element, "intensity", power / (4 * math.pi))
+        return element
+    element = xmltree.plugin("shape", "sphere", id=identity)
+    _position(element, "center", position)
+    xmltree.number(element, "radius", radius)
+    area = 4 * math.pi * radius**2 if light.normalize else 4.0
+    _emit(element, power / (math.pi * area))
+    return element
+
+
+def _sun(
+    light: Any, matrix: np.ndarray, irradiance: np.ndarray, identity: str, center: np.ndarray, radius: float
+) -> ET.Element:
+    """Sun -> ``directional`` (angle 0) or a far emitting ``disk`` that subtends the sun's angle.
+
+    irradiance: W/m2 on a surface facing the sun; the disc's radiance is E / (pi sin^2(angle / 2)).
+    """
+    towards = -_unit(matrix[:3, 2])  # the way light travels: local -Z
+    half = 0.5 * min(float(light.angle), math.pi * 0.98)
+    if half < 1e-5:
+        element = xmltree.plugin("emitter", "directional", id=identity)
+        xmltree.vector(element, "direction", towards)
+        xmltree.rgb(element, "irradiance", irradiance)
+        return element
+    distance = FAR_DISC * max(radius, 1e-3)
+    placed = np.eye(4)
+    placed[:3, :3] = _frame(towards) * (distance * math.tan(half))
+    placed[:3, 3] = center - towards * distance
+    element = xmltree.plugin("shape", "disk", id=identity)
+    xmltree.matrix(element, "to_world", placed)
+    _emit(element, irradiance / (math.pi * math.sin(half) ** 2))
+    return element
+
+
+def _spot(
+    light: Any,
+    matrix: np.ndarray,
+    power: np.ndarray,
+    identity: str,
+    name: str,
+    store: TextureStore,
+    findings: Findings,
+) -> ET.Element:
+    """Spot -> ``spot`` whose cross-section image carries Cycles' falloff (Mitsuba's own is 0.117 off).
+
+    Cycles: smoothstep((cos t - cos h) / ((1 - cos h) blend)), h half the cone. On axis I = P / (4 pi).
+    """
+    if light.shadow_soft_size > 1e-5:
+        findings.add("approximated", "spot radius", "a point: its shadows are sharp", object=name)
+    if light.use_square:
+        findings.add("ignored", "square spot", "its cone is round, as in Cycles", object=name)
+    half = 0.5 * float(light.spot_size)
+    if half > math.radians(85):
+        findings.add("approximated", "spot wider than 170 degrees", "cut at 170 degrees", object=name)
+        half = math.radians(85)
+    direction = -_unit(matrix[:3, 2])
+    placed = np.eye(4)
+    placed[:3, :3] = _frame(direction)
+    placed[:3, 3] = matrix[:3, 3]
+    element = xmltree.plugin("emitter", "spot", id=identity)
+    xmltree.matrix(element, "to_world", placed)
+    xmltree.rgb(element, "intensity", power / (4 * math.pi))
+    xmltree.number(element, "cutoff_angle", math.degrees(half))
+    # No falloff of Mitsuba's own: full strength up to the edge.
+    xmltree.number(element, "beam_width", math.degrees(half) * 0.9999)
+    texture = xmltree.plugin("texture", "bitmap", name="texture")
+    section = spot_section(half, float(light.spot_blend))
+    xmltree.text(texture, "filename", store.save(section, False, f"{name}-spot"))
+    xmltree.flag(texture, "raw", True)
+    xmltree.text(texture, "wrap_mode", "clamp")
+    element.append(texture)
+    return element
+
+
+def spot_section(half: float, blend: float) -> np.ndarray:
+    """Falloff over the plane z = 1 inside the square around a cone of half angle ``half``, float32 [N, N, 3]."""
+    axis = ((np.arange(SPOT_TEXELS) + 0.5) / SPOT_TEXELS * 2 - 1) * math.tan(half)
+    x, y = np.meshgrid(axis, axis)
+    cosine = 1 / np.sqrt(1 + x * x + y * y)
+    span = max((1 - math.cos(half)) * blend, 1e-4)
+    t = np.clip((cosine - math.cos(half)) / span, 0, 1)
+    return np.repeat((t * t * (3 - 2 * t))[..., None], 3, axis=2).astype(np.float32)
+
+
+def _area(
+    light: Any, matrix: np.ndarray, power: np.ndarray, identity: str, name: str, findings: Findings
+) -> ET.Element:
+    """Area lamp -> emitting ``rectangle`` or ``disk``; radiance P / (pi A), A with the object's scale."""
+    if light.spread < math.pi - 1e-3:
+        findings.add(
+            "approximated",
+            f"area lamp spread {math.degrees(light.spread):.0f} degrees",
+            "emits over the whole half space: wider and, on axis, darker",
+            object=name,
+        )
+    round_ = light.shape in {"DISK", "ELLIPSE"}
+    size_x = float(light.size)
+    size_y = float(light.size_y) if light.shape in {"RECTANGLE", "ELLIPSE"} else size_x
+    # Mitsuba's shapes span [-1, 1] and face +Z: turn about X so that they face Blender's -Z.
+    local = np.diag([size_x / 2, size_y / 2, 1.0, 1.0]) @ np.diag([1.0, -1.0, -1.0, 1.0])
+    placed = matrix @ local
+    placed[:3, 2] = _unit(np.cross(placed[:3, 0], placed[:3, 1]))
+    if np.dot(placed[:3, 2], -matrix[:3, 2]) < 0:  # a mirrored object: keep facing -Z
+        placed[:3, 0] *= -1
+        placed[:3, 2] *= -1
+    area = float(np.linalg.norm(np.cross(placed[:3, 0], placed[:3, 1]))) * (math.pi if round_ else 4.0)
+    element = xmltree.plugin("shape", "disk" if round_ else "rectangle", id=identity)
+    xmltree.matrix(element, "to_world", placed)
+    _emit(element, power / (math.pi * (area if light.normalize else 1.0)))
+    return element
+
+
+def _emit(shape: ET.Element, radiance: np.ndarray) -> None:
+    emitter = xmltree.plugin("emitter", "area")
+    xmltree.rgb(emitter, "radiance", radiance)
+    shape.append(emitter)
+
+
+def _position(element: ET.Element, name: str, value: np.ndarray) -> None:
+    x, y, z = (f"{v:.9g}" for v in value)
+    ET.SubElement(element, "point", {"name": name, "x": x, "y": y, "z": z})
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / max(float(np.linalg.norm(vector)), 1e-20)
+
+
+def _frame(axis: np.ndarray) -> np.ndarray:
+    """Right-handed rotation whose third column is ``axis``."""
+    helper = np.array([1.0, 0.0, 0.0]) if abs(axis[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    x = _unit(np.cross(helper, axis))
+    return np.stack([x, np.cross(axis, x), axis], axis=1)

@@ -1,0 +1,109 @@
+"""Following links of Blender's node trees: through groups, reroutes and muted nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import bpy
+
+Scope = tuple[Any, ...]
+"""The group nodes entered on the way to a node, outermost first."""
+
+MAX_HOPS = 1000  # a tree that links in circles is invalid; Blender may still load one
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where a socket's value comes from.
+
+    socket: an output socket of ``node`` when ``linked``, else the input socket whose default value counts.
+    """
+
+    socket: Any
+    node: Any
+    scope: Scope
+    linked: bool
+
+    @property
+    def default(self) -> Any:
+        """The unlinked input's own value."""
+        return getattr(self.socket, "default_value", None)
+
+
+def find_input(node: Any, *names: str) -> Any | None:
+    """The input socket with one of these identifiers or names (sockets were renamed between versions)."""
+    for name in names:
+        for socket in node.inputs:
+            if socket.identifier == name:
+                return socket
+    for name in names:
+        for socket in node.inputs:
+            if socket.name == name and socket.enabled:
+                return socket
+    return None
+
+
+def resolve(socket: Any, scope: Scope = ()) -> Source:
+    """Follow an input socket to the node that computes its value, or to the default that stands for it."""
+    for _ in range(MAX_HOPS):
+        link = next((link for link in socket.links if link.is_valid and not link.is_muted), None)
+        if link is None:
+            return Source(socket, socket.node, scope, False)
+        node, output = link.from_node, link.from_socket
+        if node.mute:
+            passed = next((inner for inner in node.internal_links if inner.to_socket == output), None)
+            if passed is None:
+                return Source(socket, socket.node, scope, False)
+            socket = passed.from_socket
+        elif node.type == "REROUTE":
+            socket = node.inputs[0]
+        elif node.type == "GROUP" and node.node_tree is not None:
+            inside = _group_output(node.node_tree, output.identifier)
+            if inside is None:
+                return Source(socket, socket.node, scope, False)
+            socket, scope = inside, (*scope, node)
+        elif node.type == "GROUP_INPUT" and scope:
+            group = scope[-1]
+            outside = next((s for s in group.inputs if s.identifier == output.identifier), None)
+            if outside is None:
+                return Source(socket, socket.node, scope, False)
+            socket, scope = outside, scope[:-1]
+        else:
+            return Source(output, node, scope, True)
+    return Source(socket, socket.node, scope, False)
+
+
+def _group_output(tree: bpy.types.NodeTree, identifier: str) -> Any | None:
+    outputs = [node for node in tree.nodes if node.type == "GROUP_OUTPUT"]
+    active = next((node for node in outputs if getattr(node, "is_active_output", False)), None)
+    node = active or (outputs[0] if outputs else None)
+    if node is None:
+        return None
+    return next((socket for socket in node.inputs if socket.identifier == identifier), None)
+
+
+def surface_source(tree: bpy.types.NodeTree | None, socket_name: str = "Surface") -> Source | None:
+    """What is linked to the active output node (Cycles' choice), or None."""
+    if tree is None:
+        return None
+    output = tree.get_output_node("CYCLES")
+    if output is None:
+        return None
+    source = resolve(output.inputs[socket_name])
+    return source if source.linked else None
+
+
+def walk(tree: bpy.types.NodeTree | None, seen: set[str] | None = None) -> Iterator[Any]:
+    """All nodes of a tree and of the groups in it, each tree once."""
+    if tree is None:
+        return
+    seen = set() if seen is None else seen
+    if tree.name_full + str(tree.as_pointer()) in seen:
+        return
+    seen.add(tree.name_full + str(tree.as_pointer()))
+    for node in tree.nodes:
+        yield node
+        if node.type == "GROUP":
+            yield from walk(node.node_tree, seen)

@@ -1,0 +1,86 @@
+"""What is not made yet, and what to know before trusting the figures."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from dnrtrain.contract import View
+
+from .data import Missing, Quality, Selection, Training
+from .quality import perceptual_note
+from .words import duration
+
+
+def missing(
+    root: Path,
+    cameras: dict[str, list[View]],
+    selection: Selection | None,
+    training: Sequence[Training],
+    quality: Quality | None,
+) -> list[Missing]:
+    """Parts of the report that cannot be shown yet, in the order in which to make them."""
+    steps = {t.step for t in training}
+    due = [
+        (not cameras["train"], "cameras and passes", "prepare SCENE"),
+        (selection is None, "the choice of views", "select"),
+        (selection is None or selection.traced < len(selection.views), "ground truth of the chosen views",
+         "raytrace-selected"),
+        (2 not in steps, "the fine-tuned renderer", "finetune"),
+        (quality is None, "held-out quality and pictures", "evaluate"),
+    ]  # fmt: skip
+    where = f" -w {shlex.quote(root.name)}"
+    return [Missing(what=what, command=f"dnrpipe {command}{where}") for absent, what, command in due if absent]
+
+
+def notes(
+    quality: Quality | None,
+    selection: Selection | None,
+    training: Sequence[Training],
+    summary: dict[str, Any],
+    manifest: dict[str, Any],
+    upfront: float | None,
+    break_even: int | None,
+) -> list[str]:
+    """What a reader should know before trusting the figures, one sentence or two each."""
+    found = []
+    if quality and (text := perceptual_note(quality, manifest.get("settings", {}))):
+        found.append(text)
+    if quality and (broken := sum(view.psnr is None for view in quality.views)):
+        found.append(
+            f"PSNR is not finite in {broken} of {len(quality.views)} views (a picture that is exactly right, or a "
+            "broken one); they are left out of its mean."
+        )
+    if quality and quality.noise_share_mean is not None and quality.noise_share_mean >= 0.1:
+        spp = f" ({', '.join(map(str, quality.spp))} samples per pixel)" if quality.spp else ""
+        found.append(
+            f"The reference images are noisy themselves{spp}: a perfect renderer would measure about "
+            f"{quality.ceiling_mean:.1f} dB against them. That noise makes up "
+            f"{100 * quality.noise_share_mean:.0f} % of the measured squared error"
+            + (
+                f", and at least half of it in {quality.noise_limited} of {len(quality.views)} views."
+                if quality.noise_limited
+                else "."
+            )
+            + " Raise raytrace.evaluation_spp before reading more into small differences."
+        )
+    tracing = summary.get("tracing_all")
+    if tracing and tracing["net_saved_seconds"] < 0:
+        found.append(
+            f"Step 1 took {duration(tracing['selection_seconds'])}, more than the "
+            f"{duration(tracing['saved_seconds'])} of ray tracing that it saved: at this resolution and sample "
+            "count, tracing every candidate costs less than choosing. (Step 1 also pre-trains the renderer.)"
+        )
+    if quality and upfront and quality.traced_seconds and quality.frame_seconds and break_even is None:
+        found.append("A neural frame is not cheaper than a ray-traced one here, so the renderer never pays for itself.")
+    skipped = sum(t.skipped for t in training)
+    if skipped:
+        steps = "1 optimiser step was" if skipped == 1 else f"{skipped} optimiser steps were"
+        found.append(f"{steps} skipped because a gradient was not finite.")
+    if selection and 0 < selection.traced < len(selection.views):
+        found.append(f"Only {selection.traced} of the {len(selection.views)} chosen views are ray-traced so far.")
+    if summary["torn_lines"]:
+        found.append(f"{summary['torn_lines']} ledger lines were cut short by a crash; their seconds are not counted.")
+    return found

@@ -1,0 +1,307 @@
+"""Workspace -> :class:`ReportData`: reads what the stages left, computes statistics, notes what is missing."""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from dnrtrain.contract import ContractError, SceneFrame, View, read_cameras
+
+from .. import costs
+from ..errors import UserError
+from .advice import missing, notes
+from .data import (
+    ChosenView,
+    FindingGroup,
+    ReportData,
+    Selection,
+    Sphere,
+    SphereView,
+    Training,
+)
+from .pictures import ExrPictures
+from .quality import Metrics, build_quality
+from .words import verdict
+
+KINDS: dict[str, tuple[str, bool]] = {
+    "missing": ("The file refers to something that is not there.", True),
+    "ignored": ("No counterpart in the ray tracer; left out of the ground truth.", True),
+    "approximated": ("Converted to the nearest thing; the ground truth differs a little from Blender.", True),
+    "baked": ("Evaluated once into a texture.", False),
+    "exact": ("Converted without loss.", False),
+}
+STEP_TITLES = {
+    1: "Step 1: rasterised images, all candidates",
+    2: "Step 2: ray-traced images, chosen views",
+}
+AGENT_TERMS = ("reward", "q")  # booked beside the losses of step 1, but signed and no losses
+Model = TypeVar("Model", bound=BaseModel)
+
+
+class _Selection(BaseModel):
+    """``selection.json``."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    policy: str
+    budget: int
+    seed: int | None = None
+    views: list[str]
+
+
+class _Epoch(BaseModel):
+    """One entry of a checkpoint's history."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    epoch: int
+    losses: dict[str, float | None] = Field(default_factory=dict)
+    val: dict[str, float | None] = Field(default_factory=dict)
+    seconds: float = 0.0
+    skipped: int = 0
+
+
+class _Checkpoint(BaseModel):
+    """``model.json``; the weights themselves are not read."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    history: list[_Epoch] = Field(default_factory=list)
+
+
+def collect(root: Path, *, made_at: datetime | None = None) -> ReportData:
+    """Read a workspace. Parts whose stage has not run are None and listed in ``missing``.
+
+    Raises:
+        UserError: not a workspace, or one of its files is damaged; names the file and the remedy.
+    """
+    root = Path(root).resolve()
+    manifest = _read_json(root / "manifest.json", "prepare")
+    if manifest is None:
+        raise UserError(f"{root}: not a dnrpipe workspace; make one with `dnrpipe prepare SCENE`")
+    cameras = {split: _read_views(root, split) for split in ("train", "val", "test")}
+    metrics = _read_model(root / "evaluation" / "metrics.json", Metrics, "evaluate")
+    chosen = _read_model(root / "selection.json", _Selection, "select")
+    ledger = costs.Ledger(root / "costs.jsonl")
+    records, torn = ledger.read(), ledger.torn_lines()
+
+    selected = {f"train/{name}" for name in chosen.views} if chosen else None
+    summary = costs.summarise(records, n_candidates=len(cameras["train"]) or None, only=selected, torn_lines=torn)
+    quality = build_quality(root, metrics, records) if metrics else None
+    selection = _selection(root, chosen, records, len(cameras["train"])) if chosen else None
+    training = [t for t in (_training(root, step) for step in (1, 2)) if t]
+    upfront = costs.upfront_seconds(records, selected) if records else None
+    break_even = None
+    if quality and upfront and quality.traced_seconds and quality.frame_seconds:
+        break_even = costs.break_even_frames(upfront, quality.traced_seconds, quality.frame_seconds)
+    sizes = {(v.width, v.height) for views in cameras.values() for v in views}
+    source = manifest.get("source", {})
+    source_name = Path(str(source.get("path", ""))).name or root.stem
+    return ReportData(
+        title=Path(source_name).stem or root.stem,
+        workspace=root.name,
+        source_name=source_name,
+        source_sha256=str(source.get("sha256", "")),
+        preset=str(manifest.get("preset") or manifest.get("settings", {}).get("preset") or "draft"),
+        resolution=" and ".join(f"{w} × {h}" for w, h in sorted(sizes)) or None,
+        made_at=(made_at or datetime.now(UTC)).strftime("%Y-%m-%d %H:%M UTC"),
+        verdict=verdict(quality, selection),
+        notes=notes(quality, selection, training, summary, manifest, upfront, break_even),
+        missing=missing(root, cameras, selection, training, quality),
+        quality=quality,
+        selection=selection,
+        sphere=_sphere(root, cameras, chosen, metrics),
+        training=training,
+        costs=summary if records else None,
+        break_even=break_even,
+        upfront_seconds=upfront,
+        findings=_findings(root),
+        summary=_summary(root),
+        settings=_flatten(manifest.get("settings", {}), manifest.get("overrides", {})),
+        versions=sorted((str(k), str(v)) for k, v in manifest.get("versions", {}).items()),
+    )
+
+
+def _read_json(path: Path, command: str) -> dict[str, Any] | None:
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return None
+    except ValueError as error:
+        raise UserError(f"{path}: damaged JSON ({error}); run `dnrpipe {command}` again") from None
+    if not isinstance(value, dict):
+        raise UserError(f"{path}: not a JSON object; run `dnrpipe {command}` again")
+    return value
+
+
+def _read_model(path: Path, model: type[Model], command: str) -> Model | None:
+    value = _read_json(path, command)
+    if value is None:
+        return None
+    try:
+        return model.model_validate(value)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise UserError(f"{path}: {where}: {first['msg'].lower()}; run `dnrpipe {command}` again") from None
+
+
+def _read_views(root: Path, split: str) -> list[View]:
+    path = root / "cameras" / f"{split}.json"
+    if not path.exists():
+        return []
+    if (_read_json(path, "prepare") or {}).get("frames") == []:  # a split may be empty (no validation views)
+        return []
+    try:
+        return read_cameras(path)
+    except ContractError as error:
+        raise UserError(str(error)) from None
+
+
+def _selection(root: Path, chosen: _Selection, records: Sequence[costs.CostRecord], candidates: int) -> Selection:
+    frame = _read_model(root / "scene" / "frame.json", SceneFrame, "prepare")
+    try:
+        exr = ExrPictures(root, frame) if frame else None
+    except ContractError as error:
+        raise UserError(str(error)) from None
+    booked = {r.name: r for r in costs.traced_views(records, "training")}
+    views = []
+    for order, name in enumerate(chosen.views, start=1):
+        record = booked.get(f"train/{name}")
+        views.append(
+            ChosenView(
+                order=order,
+                name=name,
+                seconds=record.seconds if record else None,
+                spp=record.spp if record else None,
+                noise=record.noise if record else None,
+                raster=exr.load(f"passes/train/{name}.exr") if exr else None,
+                traced=exr.load(f"raytraced/train/{name}.exr") if exr else None,
+            )
+        )
+    return Selection(
+        policy=chosen.policy,
+        seed=chosen.seed,
+        budget=chosen.budget,
+        views=views,
+        traced=sum((root / "raytraced" / "train" / f"{name}.exr").is_file() for name in chosen.views),
+        candidates=candidates,
+    )
+
+
+def _training(root: Path, step: int) -> Training | None:
+    checkpoint = _read_model(
+        root / "checkpoints" / f"step{step}" / "model.json", _Checkpoint, ("select", "finetune")[step - 1]
+    )
+    if checkpoint is None or not checkpoint.history:
+        return None
+    history = checkpoint.history
+    first = min(entry.epoch for entry in history)
+    curves: dict[str, list[tuple[int, float]]] = {}
+    psnr: list[tuple[int, float]] = []
+    for entry in history:
+        number = entry.epoch - first + 1
+        for term, value in entry.losses.items():
+            if value is not None:
+                curves.setdefault(term, []).append((number, value))
+        if (quality := entry.val.get("psnr")) is not None:
+            psnr.append((number, quality))
+    return Training(
+        step=step,
+        title=STEP_TITLES[step],
+        epochs=len(history),
+        seconds=math.fsum(entry.seconds for entry in history),
+        skipped=sum(entry.skipped for entry in history),
+        losses={term: points for term, points in curves.items() if term not in AGENT_TERMS},
+        agent={term: points for term, points in curves.items() if term in AGENT_TERMS},
+        psnr=psnr,
+    )
+
+
+def _sphere(
+    root: Path, cameras: dict[str, list[View]], chosen: _Selection | None, metrics: Metrics | None
+) -> Sphere | None:
+    shown = [("candidate", view) for view in cameras["train"]] + [("test", view) for view in cameras["test"]]
+    if not shown:
+        return None
+    bounds = (_read_json(root / "scene" / "summary.json", "prepare") or {}).get("bounds", {})
+    frame = _read_json(root / "scene" / "frame.json", "prepare") or {}
+    center = bounds.get("center") or frame.get("center")
+    if center is None:
+        axes = list(zip(*(view.position for _, view in shown), strict=True))
+        center = [statistics.fmean(float(value) for value in axis) for axis in axes]
+    radius = float(bounds.get("radius") or frame.get("radius") or 0.0)
+    offsets = [tuple(float(p - c) for p, c in zip(view.position, center, strict=True)) for _, view in shown]
+    scale = max(max(math.hypot(*offset) for offset in offsets), 1e-9)
+    order = {name: i for i, name in enumerate(chosen.views, start=1)} if chosen else {}
+    psnr = {view.name: view.psnr for view in metrics.views} if metrics else {}
+    views = []
+    for (role, view), offset in zip(shown, offsets, strict=True):
+        number = order.get(view.name) if role == "candidate" else None
+        x, y, z = (value / scale for value in offset)
+        views.append(
+            SphereView(
+                name=view.name,
+                role="chosen" if number else "test" if role == "test" else "candidate",
+                order=number,
+                position=(x, y, z),
+                psnr=psnr.get(view.name) if role == "test" else None,
+            )
+        )
+    return Sphere(views=views, scale=scale, radius=min(1.0, radius / scale))
+
+
+def _findings(root: Path) -> list[FindingGroup]:
+    census = _read_json(root / "scene" / "census.json", "prepare") or {}
+    by_kind: dict[str, list[dict[str, str]]] = {kind: [] for kind in KINDS}
+    for finding in census.get("findings", []):
+        row = {key: str(finding.get(key) or "") for key in ("object", "material", "feature", "note")}
+        by_kind.setdefault(str(finding.get("kind", "other")), []).append(row)
+    return [
+        FindingGroup(
+            kind=kind,
+            meaning=KINDS.get(kind, ("", True))[0],
+            serious=KINDS.get(kind, ("", True))[1],
+            findings=rows,
+        )
+        for kind, rows in by_kind.items()
+        if rows
+    ]
+
+
+def _summary(root: Path) -> list[tuple[str, str]]:
+    summary = _read_json(root / "scene" / "summary.json", "prepare") or {}
+    rows = []
+    for key in ("triangles", "objects"):
+        if isinstance(summary.get(key), int):
+            rows.append((key, f"{summary[key]:,}".replace(",", " ")))
+    if "blender_version" in summary:
+        rows.append(("blender", str(summary["blender_version"])))
+    for part in ("atlas", "repairs"):
+        if isinstance(summary.get(part), dict):
+            rows += [(f"{part} {k}".replace("_", " "), _plain(v)) for k, v in sorted(summary[part].items())]
+    rows += [("warning", str(text)) for text in summary.get("warnings", [])]
+    return rows
+
+
+def _plain(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _flatten(settings: dict[str, Any], overrides: dict[str, Any], prefix: str = "") -> list[tuple[str, str, bool]]:
+    """Nested settings as (dotted key, value, given by the user?) rows in their own order."""
+    rows: list[tuple[str, str, bool]] = []
+    for key, value in settings.items():
+        given = overrides.get(key) if isinstance(overrides, dict) else None
+        if isinstance(value, dict):
+            rows += _flatten(value, given if isinstance(given, dict) else {}, f"{prefix}{key}.")
+        else:
+            rows.append((prefix + key, str(value), given is not None))
+    return rows

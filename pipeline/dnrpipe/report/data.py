@@ -1,0 +1,205 @@
+"""What the report shows, as plain data: collected once, drawn by :mod:`.render`, dumped for machines.
+
+Lengths are in scene units, times in seconds (wall unless said), image metrics in display space.
+``None`` means "not made yet" or "not measured", never zero.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Picture(_Frozen):
+    """An image as a data URI. ``file``: where the full-size original lies, relative to the workspace."""
+
+    uri: str = Field(repr=False)
+    width: int
+    height: int
+    file: str
+
+
+class TestView(_Frozen):
+    """Metrics and pictures of one held-out view.
+
+    noise_share: part of the measured squared error that is noise of the reference itself, in [0, 1]
+    (10^((psnr − ceiling) / 10)); None where the ceiling was not measured.
+    """
+
+    __test__ = False  # not a pytest class
+
+    name: str
+    psnr: float | None
+    ssim: float | None
+    lpips_alex: float | None
+    lpips_vgg: float | None
+    flip: float | None
+    psnr_mask: float | None
+    ssim_mask: float | None
+    ceiling_psnr: float | None
+    noise_share: float | None
+    seconds_traced: float | None
+    seconds_neural: float | None
+    spp: int | None
+    truth: Picture | None
+    prediction: Picture | None
+    flip_map: Picture | None
+
+
+class MetricRow(_Frozen):
+    """Statistics of one metric over the held-out views that have it."""
+
+    key: str
+    label: str
+    unit: str
+    digits: int
+    higher_is_better: bool
+    count: int
+    mean: float
+    median: float
+    worst: float
+    worst_view: str
+    best: float
+    best_view: str
+
+
+class Quality(_Frozen):
+    """Held-out quality. ``views`` are sorted from the worst PSNR to the best.
+
+    neural_seconds: the network alone; gbuffer_seconds: Blender's passes of such a view (None where the
+    ledger has none); frame_seconds: both; traced_seconds: path tracing. All per frame, on the wall clock.
+    perceptual: LPIPS weights were there for measuring; trained_with_perceptual: L_p was among the losses.
+    """
+
+    views: list[TestView]
+    rows: list[MetricRow]
+    median_view: str
+    perceptual: bool
+    trained_with_perceptual: bool
+    device: str
+    neural_seconds: float | None
+    gbuffer_seconds: float | None
+    frame_seconds: float | None
+    traced_seconds: float | None
+    spp: list[int]
+    ceiling_mean: float | None
+    noise_share_mean: float | None
+    noise_limited: int
+
+
+class SphereView(_Frozen):
+    """A camera centre. ``position`` is relative to the scene's centre, divided by ``Sphere.scale``."""
+
+    name: str
+    role: Literal["candidate", "chosen", "test"]
+    order: int | None
+    position: tuple[float, float, float]
+    psnr: float | None = None
+
+
+class Sphere(_Frozen):
+    """All cameras. scale: distance of the farthest one; radius: the scene's, in units of ``scale``."""
+
+    views: list[SphereView]
+    scale: float
+    radius: float
+
+
+class ChosenView(_Frozen):
+    """One selected view, in the order of selection (from 1)."""
+
+    order: int
+    name: str
+    seconds: float | None
+    spp: int | None
+    noise: float | None
+    raster: Picture | None
+    traced: Picture | None
+
+
+class Selection(_Frozen):
+    """``selection.json`` and how far its tracing has come."""
+
+    policy: str
+    seed: int | None
+    budget: int
+    views: list[ChosenView]
+    traced: int
+    candidates: int
+
+
+class Training(_Frozen):
+    """History of one training step. Points are (epoch from 1, value).
+
+    losses: means of each loss term, before weighting. agent: reward and action value of the selector.
+    """
+
+    step: int
+    title: str
+    epochs: int
+    seconds: float
+    skipped: int
+    losses: dict[str, list[tuple[int, float]]]
+    agent: dict[str, list[tuple[int, float]]]
+    psnr: list[tuple[int, float]]
+
+
+class FindingGroup(_Frozen):
+    """Findings of the same kind, most serious kinds first."""
+
+    kind: str
+    meaning: str
+    serious: bool
+    findings: list[dict[str, str]]
+
+
+class Missing(_Frozen):
+    """A part of the report whose stage has not run, and the command that makes it."""
+
+    what: str
+    command: str
+
+
+class ReportData(BaseModel):
+    """Everything on the page."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    title: str
+    workspace: str
+    source_name: str
+    source_sha256: str
+    preset: str
+    resolution: str | None
+    made_at: str
+    verdict: str
+    notes: list[str]
+    missing: list[Missing]
+    quality: Quality | None
+    selection: Selection | None
+    sphere: Sphere | None
+    training: list[Training]
+    costs: dict[str, Any] | None
+    break_even: int | None
+    upfront_seconds: float | None
+    findings: list[FindingGroup]
+    summary: list[tuple[str, str]]
+    settings: list[tuple[str, str, bool]]
+    versions: list[tuple[str, str]]
+
+    def figures(self) -> dict[str, Any]:
+        """The data as JSON-able values, without the bytes of the pictures."""
+        return _without_uris(self.model_dump(mode="json"))
+
+
+def _without_uris(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_uris(item) for key, item in value.items() if key != "uri"}
+    if isinstance(value, list):
+        return [_without_uris(item) for item in value]
+    return value

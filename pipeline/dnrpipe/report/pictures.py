@@ -1,0 +1,101 @@
+"""Images of the workspace as data URIs: 8-bit files as they are, EXR files through the display transform."""
+
+from __future__ import annotations
+
+import base64
+import io
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+from dnrtrain.contract import RASTER_CHANNELS, ContractError, SceneFrame
+from dnrtrain.exr import read_exr
+
+from ..errors import UserError
+from .data import Picture
+
+FEATURED_SIDE = 800  # the paper's resolution, pixel for pixel
+THUMBNAIL_SIDE = 192
+
+
+def load_png(root: Path, file: str, *, side: int, heat: bool = False) -> Picture | None:
+    """An image file of the workspace, reduced to ``side`` pixels if larger; None when there is no such file.
+
+    ``heat``: a one-channel error map is coloured with matplotlib's magma (perceptually uniform, readable in
+    grey); an image that is in colour already stays as it is.
+
+    Raises:
+        UserError: the file is damaged.
+    """
+    path = root / file
+    try:
+        with Image.open(path) as opened:
+            image = opened.copy()
+    except FileNotFoundError:
+        return None
+    except (OSError, UnidentifiedImageError) as error:
+        raise UserError(f"{path}: damaged image ({error}); run `dnrpipe evaluate` again") from None
+    if heat and image.mode in ("L", "I;16", "I", "F"):
+        image = _magma(image)
+    return encode(image.convert("RGBA" if "A" in image.getbands() else "RGB"), file, side)
+
+
+def encode(image: Image.Image, file: str, side: int) -> Picture:
+    """PNG data URI (lossless) at full size; a reduced image becomes WebP, eight times smaller."""
+    buffer = io.BytesIO()
+    if max(image.size) > side:
+        scale = side / max(image.size)
+        size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
+        image.resize(size, Image.Resampling.LANCZOS).save(buffer, "WEBP", quality=90, method=4)
+        kind = "webp"
+    else:
+        size = image.size
+        image.save(buffer, "PNG", optimize=True)
+        kind = "png"
+    data = base64.b64encode(buffer.getvalue()).decode("ascii")
+    return Picture(uri=f"data:image/{kind};base64,{data}", width=size[0], height=size[1], file=file)
+
+
+class ExrPictures:
+    """EXR files in display space over white, through the scene's one display transform.
+
+    Made from ``scene/frame.json``; torch is imported only when the first picture is asked for.
+    """
+
+    def __init__(self, root: Path, frame: SceneFrame) -> None:
+        from dnrtrain.display import DisplayTransform
+
+        self.root = root
+        self.transform = DisplayTransform(frame, root / "scene")
+
+    def load(self, file: str, *, side: int = THUMBNAIL_SIDE) -> Picture | None:
+        """R G B A of an EXR (linear, premultiplied) as a picture; None when the file or its colour is missing.
+
+        Raises:
+            UserError: the file is damaged.
+        """
+        import torch
+
+        path = self.root / file
+        if not path.is_file():
+            return None
+        try:
+            channels, _ = read_exr(path)
+        except ContractError as error:
+            raise UserError(str(error)) from None
+        if not set(RASTER_CHANNELS) <= set(channels):
+            return None
+        linear = torch.from_numpy(np.stack([channels[c] for c in "RGB"]))[None]
+        alpha = torch.from_numpy(channels["A"])[None, None]
+        display = self.transform.over_white(linear, alpha)[0].clamp(0, 1)
+        pixels = np.rint(display.permute(1, 2, 0).numpy() * 255).astype(np.uint8)
+        return encode(Image.fromarray(pixels), file, side)
+
+
+def _magma(image: Image.Image) -> Image.Image:
+    from matplotlib import colormaps
+
+    values = np.asarray(image, dtype=np.float32)
+    full = 255.0 if image.mode == "L" else 65535.0 if image.mode != "F" else 1.0
+    return Image.fromarray(np.rint(colormaps["magma"](values / full)[..., :3] * 255).astype(np.uint8))

@@ -1,0 +1,182 @@
+"""ReportData -> one HTML file that needs nothing else: no network, no fonts, no scripts from elsewhere."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from importlib import resources
+
+from jinja2 import DictLoader, Environment, StrictUndefined
+from markupsafe import Markup
+
+from . import charts, words
+from .data import MetricRow, Quality, ReportData, Selection, Training
+from .quality import METRICS
+from .sphere import AZIMUTH, ELEVATION, sphere_svg
+
+TEMPLATE = "template.html.j2"
+TOTAL_STYLE = 6  # the sum of all terms is drawn in ink, whatever its place in the list
+LOSS_NAMES = {
+    "rl": "L_RL",
+    "dnr": "L_DNRc",
+    "photometric": "photometric",
+    "ssim": "1 − SSIM",
+    "perceptual": "L_p (VGG)",
+    "frequency": "L_FR (FFT)",
+    "total_variation": "L_TV",
+    "regularisation": "L_reg(T)",
+    "total": "weighted sum",
+}
+PURPOSE_NAMES = {"training": "training", "evaluation": "evaluation", "inference": "inference"}
+
+
+def render_html(data: ReportData) -> str:
+    """The page. Every string from the scene is escaped; scripts other than ours are barred by a policy.
+
+    Same data, same bytes.
+    """
+    files = resources.files("dnrpipe.report")
+    environment = Environment(
+        loader=DictLoader({TEMPLATE: (files / TEMPLATE).read_text(encoding="utf-8")}),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(duration=words.duration, count=words.count)
+    script = (files / "report.js").read_text(encoding="utf-8")
+    script_hash = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    quality, selection = data.quality, data.selection
+    return environment.get_template(TEMPLATE).render(
+        d=data,
+        css=Markup((files / "report.css").read_text(encoding="utf-8")),
+        script=Markup(script),
+        script_hash=script_hash,
+        eye=f"{AZIMUTH:.6f} {ELEVATION:.6f}",
+        rows=_headline_rows(quality),
+        featured=_featured(quality) if quality else [],
+        median=next(v for v in quality.views if v.name == quality.median_view) if quality else None,
+        projections=[(name, sphere_svg(data.sphere, name)) for name in ("top", "front", "oblique")]
+        if data.sphere
+        else [],
+        quality_chart=_quality_chart(quality) if quality else "",
+        loss_charts=[(t, [_loss_chart(t), _psnr_chart(t), _agent_chart(t)]) for t in data.training],
+        stage_chart=_stage_chart(data),
+        tracing_chart=_tracing_chart(data),
+        views_chart=_views_chart(selection) if selection else "",
+    )
+
+
+def _headline_rows(quality: Quality | None) -> dict[str, MetricRow | None]:
+    rows: dict[str, MetricRow | None] = dict.fromkeys(metric[0] for metric in METRICS)
+    return rows | {row.key: row for row in quality.rows} if quality else rows
+
+
+def _featured(quality: Quality) -> list[tuple[str, int]]:
+    """(role, index into quality.views) of worst, median and best; one view may play several roles."""
+    last = len(quality.views) - 1
+    roles: dict[int, list[str]] = {}
+    for role, index in (("worst", 0), ("median", last // 2), ("best", last)):
+        roles.setdefault(index, []).append(role)
+    return [(" and ".join(names), index) for index, names in roles.items()]
+
+
+def _quality_chart(quality: Quality) -> Markup:
+    dots = [
+        charts.Dot(
+            label=view.name,
+            value=view.psnr,
+            mark=view.ceiling_psnr,
+            title=f"{view.name}: {view.psnr:.2f} dB"
+            + (f", ceiling {view.ceiling_psnr:.2f} dB" if view.ceiling_psnr is not None else ""),
+        )
+        for view in quality.views
+        if view.psnr is not None
+    ]
+    return charts.dot_chart(dots, "PSNR of each test view", "test views, worst first", "PSNR, dB")
+
+
+def _loss_chart(training: Training) -> Markup:
+    series = [
+        charts.Series(LOSS_NAMES.get(name, name.replace("_", " ")), points, TOTAL_STYLE if name == "total" else None)
+        for name, points in training.losses.items()
+    ]
+    return charts.line_chart(
+        series, f"Loss terms of step {training.step}", "epoch", "loss terms before weighting, log scale", log=True
+    )
+
+
+def _agent_chart(training: Training) -> Markup:
+    names = {"reward": "reward", "q": "Q"}
+    series = [charts.Series(names[name], points) for name, points in training.agent.items()]
+    title = "Reward and action value of the view selector"
+    return charts.line_chart(series, title, "epoch", "selector: mean reward and action value Q")
+
+
+def _psnr_chart(training: Training) -> Markup:
+    series = [charts.Series("validation", training.psnr)] if training.psnr else []
+    target = "rasterised" if training.step == 1 else "ray-traced"
+    title = f"Validation PSNR of step {training.step}"
+    return charts.line_chart(series, title, "epoch", f"PSNR against {target} images, dB")
+
+
+def _stage_chart(data: ReportData) -> Markup:
+    if not data.costs:
+        return Markup("")
+    bars = []
+    for stage, purposes in data.costs["by_stage_and_purpose"].items():
+        segments = [
+            charts.Segment(
+                f"bar-{purpose}",
+                value["wall_seconds"],
+                f"{stage}, {PURPOSE_NAMES[purpose]}: {words.duration(value['wall_seconds'])}",
+            )
+            for purpose, value in purposes.items()
+        ]
+        whole = sum(segment.value for segment in segments)
+        bars.append(charts.Bar(stage, segments, words.duration(whole)))
+    return charts.bar_chart(bars, "Wall seconds per stage")
+
+
+def _tracing_chart(data: ReportData) -> Markup:
+    tracing = data.costs["tracing_all"] if data.costs else None
+    if not tracing:
+        return Markup("")
+    chosen = [
+        charts.Segment(
+            "bar-training", tracing["actual_seconds"], f"ray tracing: {words.duration(tracing['actual_seconds'])}"
+        ),
+        charts.Segment(
+            "bar-choosing",
+            tracing["selection_seconds"],
+            f"choosing (step 1): {words.duration(tracing['selection_seconds'])}",
+        ),
+    ]
+    everything = charts.Segment(
+        "bar-training", tracing["all_seconds"], f"ray tracing: {words.duration(tracing['all_seconds'])}"
+    )
+    spent = tracing["actual_seconds"] + tracing["selection_seconds"]
+    return charts.bar_chart(
+        [
+            charts.Bar(f"{tracing['views']} chosen", chosen, words.duration(spent)),
+            charts.Bar(f"all {tracing['candidates']}", [everything], words.duration(tracing["all_seconds"])),
+        ],
+        "Ray tracing the chosen views against ray tracing all candidates",
+    )
+
+
+def _views_chart(selection: Selection) -> Markup:
+    dots = [
+        charts.Dot(
+            label=str(view.order),
+            value=view.seconds,
+            title=f"{view.name}: {words.duration(view.seconds)}"
+            + (f" at {view.spp} spp" if view.spp else "")
+            + (f", relative error {100 * view.noise:.1f} %" if view.noise is not None else ""),
+        )
+        for view in selection.views
+        if view.seconds is not None
+    ]
+    return charts.dot_chart(
+        dots, "Seconds per ray-traced view", "chosen views, in order", "seconds on one worker", from_zero=True
+    )

@@ -1,0 +1,26 @@
+"""One tiny finished workspace that the end-to-end tests share (they never change it)."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import pytest
+
+# importlib mode puts no test folder on sys.path; the harness is loaded by path, once.
+_spec = importlib.util.spec_from_file_location("e2e_harness", Path(__file__).with_name("harness.py"))
+assert _spec and _spec.loader
+harness = importlib.util.module_from_spec(_spec)
+sys.modules["e2e_harness"] = harness
+_spec.loader.exec_module(harness)
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory: pytest.TempPathFactory, demo_blend: Path) -> Path:
+    """The demo scene through all stages at 64², one command after the other."""
+    folder = tmp_path_factory.mktemp("tiny")
+    harness.run("prepare", str(demo_blend), folder=folder)
+    for stage in harness.STAGES[1:]:
+        harness.run(stage, folder=folder)
+    return folder / "demo.dnr"

@@ -1,0 +1,71 @@
+"""Run dnrpipe as a user does, small enough for a test."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+# 64², 6 candidates, a few epochs: everything runs, nothing takes long.
+TINY = {
+    "DNRPIPE_CAMERAS__TRAIN": "6",
+    "DNRPIPE_CAMERAS__VAL": "1",
+    "DNRPIPE_CAMERAS__TEST": "2",
+    "DNRPIPE_CAMERAS__WIDTH": "64",
+    "DNRPIPE_CAMERAS__HEIGHT": "64",
+    "DNRPIPE_SELECT__BUDGET": "3",
+    "DNRPIPE_SELECT__STEP1__EPOCHS": "6",
+    "DNRPIPE_FINETUNE__STEP2__EPOCHS": "6",
+    "DNRPIPE_RAYTRACE__SPP": "32",
+    "DNRPIPE_RAYTRACE__EVALUATION_SPP": "32",
+    "DNRPIPE_PASSES__RASTER": "cycles-direct",
+}
+STAGES = ("prepare", "select", "raytrace-selected", "finetune", "evaluate")
+
+
+def command(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "dnrpipe.cli", *arguments]
+
+
+def environment(**extra: str) -> dict[str, str]:
+    return {**os.environ, **TINY, **extra}
+
+
+def run(*arguments: str, folder: Path, check: bool = True, **extra: str) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(
+        command(*arguments), cwd=folder, env=environment(**extra), capture_output=True, text=True, check=False
+    )
+    if check and done.returncode != 0:
+        raise AssertionError(f"dnrpipe {' '.join(arguments)} ended with {done.returncode}:\n{done.stderr}")
+    return done
+
+
+def contents(workspace: Path) -> dict[str, object]:
+    """What a run made, without times: pixels of every EXR, the selection, metrics, bytes of the weights."""
+    from dnrtrain.exr import read_exr
+
+    found: dict[str, object] = {}
+    for path in sorted(workspace.rglob("[!.]*.exr")):
+        if path.is_relative_to(workspace / "scene"):
+            continue
+        channels, _ = read_exr(path)
+        found[str(path.relative_to(workspace))] = {k: v.tobytes() for k, v in channels.items()}
+    found["selection"] = json.loads((workspace / "selection.json").read_text())
+    for path in sorted(workspace.rglob("model.safetensors")):
+        found[str(path.relative_to(workspace))] = path.read_bytes()
+    metrics = json.loads((workspace / "evaluation" / "metrics.json").read_text())
+    found["metrics"] = [
+        [round(v, 6) for k, v in sorted(row.items()) if isinstance(v, float) and not k.startswith("seconds")]
+        for row in metrics["views"]
+    ]
+    return found
+
+
+def image(path: Path) -> np.ndarray:
+    from PIL import Image
+
+    return np.asarray(Image.open(path), dtype=np.float32) / 255

@@ -1,0 +1,123 @@
+"""The six losses: values, finite gradients on flat and tiny images, switches."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from dnrtrain import losses
+from dnrtrain.model import Output
+from dnrtrain.perceptual import LAYOUT, LOSS_WEIGHTS, TAPS, Features, PerceptualLoss
+from dnrtrain.settings import LossWeights, Step2Settings
+
+TERMS = {"photometric", "ssim", "perceptual", "frequency", "total_variation", "regularisation"}
+
+
+def random_weights(network: str) -> dict[str, torch.Tensor]:
+    """Weights of the right shapes: the mechanics need no trained network."""
+    generator = torch.Generator().manual_seed(0)
+    weights: dict[str, torch.Tensor] = {}
+    inputs, outputs = 3, []
+    for item in LAYOUT[network]:
+        if isinstance(item, str):
+            continue
+        scale = (2.0 / (inputs * item[1] ** 2)) ** 0.5
+        shape = (item[0], inputs, item[1], item[1])
+        weights[f"conv.{len(outputs)}.weight"] = scale * torch.randn(shape, generator=generator)
+        weights[f"conv.{len(outputs)}.bias"] = torch.zeros(item[0])
+        outputs.append(item[0])
+        inputs = item[0]
+    for j, tap in enumerate(TAPS[network]):
+        weights[f"head.{j}"] = torch.rand(1, outputs[tap], 1, 1, generator=generator)
+    return weights
+
+
+@pytest.fixture(scope="module")
+def perceptual() -> PerceptualLoss:
+    return PerceptualLoss(random_weights("vgg"))
+
+
+def images(side: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(1, 3, side, side, generator=generator), torch.rand(1, 3, side, side, generator=generator)
+
+
+@pytest.mark.parametrize("side", [1, 2, 7, 16, 33])
+@pytest.mark.parametrize("content", ["equal", "black and white", "random"])
+def test_everything_is_finite(perceptual: PerceptualLoss, side: int, content: str) -> None:
+    prediction, target = images(side)
+    if content == "equal":
+        prediction = target = torch.full((1, 3, side, side), 0.5)
+    elif content == "black and white":
+        prediction, target = torch.zeros(1, 3, side, side), torch.ones(1, 3, side, side)
+    prediction = prediction.clone().requires_grad_()
+    texture = torch.zeros(1, 16, side, side, requires_grad=True)
+    loss = losses.Step2Loss(Step2Settings(), perceptual)
+    total, terms = loss(Output(prediction, texture), target, np.random.default_rng(0), bfloat16=False)
+    total.backward()
+    assert set(terms) == TERMS
+    assert torch.isfinite(torch.stack(list(terms.values()))).all()
+    assert prediction.grad is not None and torch.isfinite(prediction.grad).all()
+    if content == "equal":
+        assert abs(float(total.detach())) < 1e-6
+
+
+def test_the_total_is_the_weighted_sum(perceptual: PerceptualLoss) -> None:
+    prediction, target = images(16)
+    texture = torch.ones(1, 16, 16, 16)
+    settings = Step2Settings()
+    total, terms = losses.Step2Loss(settings, perceptual)(
+        Output(prediction, texture), target, np.random.default_rng(0), bfloat16=False
+    )
+    expected = {"photometric": 1, "ssim": 0.1, "perceptual": 0.1, "frequency": 0.01,
+                "total_variation": 0.001, "regularisation": 0.1}  # fmt: skip
+    assert float(total) == pytest.approx(sum(w * float(terms[k]) for k, w in expected.items()), rel=1e-5)
+
+
+def test_zero_weights_and_missing_network_drop_terms() -> None:
+    prediction, target = images(16)
+    output = Output(prediction, torch.zeros(1, 16, 16, 16))
+    off = Step2Settings(loss=LossWeights(ssim=0, total_variation=0))
+    _, terms = losses.Step2Loss(off, None)(output, target, np.random.default_rng(0), bfloat16=False)
+    assert set(terms) == TERMS - {"ssim", "total_variation", "perceptual"}
+
+
+def test_frequency_against_numpy() -> None:
+    prediction, target = images(8)
+    spectrum = np.fft.rfft2((prediction - target).numpy().astype(np.float64), norm="ortho")
+    expected = (np.abs(spectrum.real) + np.abs(spectrum.imag)).mean()
+    assert float(losses.frequency(prediction, target)) == pytest.approx(expected, rel=1e-5)
+    assert losses.frequency(prediction.bfloat16(), target.bfloat16()).dtype == torch.float32
+
+
+def test_total_variation_by_hand() -> None:
+    image = torch.tensor([[0.0, 1.0], [0.0, 3.0]]).expand(1, 3, 2, 2)
+    assert float(losses.total_variation(image)) == pytest.approx((0 + 2) / 2 + (1 + 3) / 2)
+
+
+def test_photometric_kinds() -> None:
+    a, b = torch.zeros(1, 3, 2, 2), torch.full((1, 3, 2, 2), 0.5)
+    assert float(losses.photometric(a, b, "l1")) == 0.5 and float(losses.photometric(a, b, "mse")) == 0.25
+
+
+def test_perceptual_is_the_weighted_feature_distance(perceptual: PerceptualLoss) -> None:
+    prediction, target = images(32)
+    network = Features("vgg", random_weights("vgg"), taps=4)
+    expected = sum(
+        w * float((a - b).abs().mean())
+        for w, a, b in zip(LOSS_WEIGHTS, network(prediction), network(target), strict=True)
+    )
+    assert float(perceptual(prediction, target)) == pytest.approx(expected, rel=1e-5)
+
+
+def test_crop_is_the_same_window_of_both() -> None:
+    prediction, target = images(32)
+    random = np.random.default_rng(1)
+    a, b = losses.random_crop(prediction, target, 8, random)
+    assert a.shape == (1, 3, 8, 8)
+    found = (prediction[0, 0].unfold(0, 8, 1).unfold(1, 8, 1) == a[0, 0]).all(-1).all(-1).nonzero()[0]
+    top, left = int(found[0]), int(found[1])
+    assert torch.equal(b, target[..., top : top + 8, left : left + 8])
+    assert losses.random_crop(prediction, target, 0, random)[0] is prediction
+    assert losses.random_crop(prediction, target, 99, random)[0].shape == prediction.shape

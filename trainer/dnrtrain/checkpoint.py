@@ -1,0 +1,138 @@
+"""Checkpoints and final models: safetensors + JSON, written atomically.
+
+state.safetensors   after every epoch: weights, Adam's moments; JSON in its header (one file, so that
+                    tensors and counters can never disagree); deleted when the stage is done
+model.safetensors   final weights; the fingerprint in its header
+model.json          settings, fingerprint, history; written last, so its presence means "complete"
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from pydantic import ValidationError
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from .atomic import atomic_path, write_json
+from .contract import ContractError
+from .model import DNR
+from .settings import ModelSettings
+
+HEADER = "dnrtrain"
+STATE = "state.safetensors"
+PROGRESS = "checkpoint.json"
+
+
+@dataclass(frozen=True)
+class Saved:
+    """Tensors by name (on the CPU) and the JSON that was stored with them."""
+
+    tensors: dict[str, Tensor]
+    info: dict[str, Any]
+
+
+def save(path: Path, tensors: Mapping[str, Tensor], info: Mapping[str, Any]) -> None:
+    """Write tensors and JSON into one safetensors file, atomically. NaN in ``info`` is refused."""
+    plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    header = {HEADER: json.dumps(dict(info), allow_nan=False)}
+    with atomic_path(path) as temporary:
+        save_file(plain, temporary, metadata=header)
+
+
+def load(path: Path) -> Saved | None:
+    """Read what :func:`save` wrote; None when the file is missing or damaged."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            info = json.loads((file.metadata() or {})[HEADER])
+            return Saved({name: file.get_tensor(name) for name in file.keys()}, info)  # noqa: SIM118
+    except (OSError, SafetensorError, KeyError, ValueError):
+        return None
+
+
+def optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """Adam's state as flat named tensors: ``{parameter index}.{step|exp_avg|exp_avg_sq}``."""
+    state = optimiser.state_dict()["state"]
+    return {f"{index}.{name}": value for index, entry in state.items() for name, value in entry.items()}
+
+
+def restore_optimiser(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
+    """Inverse of :func:`optimiser_tensors`; the parameter groups stay as they are."""
+    state: dict[int, dict[str, Tensor]] = {}
+    for key, value in tensors.items():
+        index, name = key.split(".", 1)
+        state.setdefault(int(index), {})[name] = value
+    optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
+
+
+def prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {f"{prefix}/{name}": tensor for name, tensor in tensors.items()}
+
+
+def unprefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    start = f"{prefix}/"
+    return {name.removeprefix(start): t for name, t in tensors.items() if name.startswith(start)}
+
+
+def load_module(module: nn.Module, tensors: Mapping[str, Tensor]) -> None:
+    """Copy weights into a module of the same layout."""
+    module.load_state_dict(dict(tensors))
+
+
+def save_state(folder: Path, tensors: Mapping[str, Tensor], info: Mapping[str, Any]) -> None:
+    """Write an epoch's state in place of the last one's. ``info`` holds at least run, epoch and history."""
+    save(folder / STATE, tensors, info)
+    write_json(folder / PROGRESS, dict(info))
+
+
+def load_state(folder: Path) -> Saved | None:
+    """The state of the last whole epoch, or None when there is none or it is damaged."""
+    return load(folder / STATE)
+
+
+def save_model(folder: Path, model: DNR, info: Mapping[str, Any]) -> None:
+    """Write ``model.safetensors``, then ``model.json``; drop the epoch state.
+
+    ``info`` holds at least fingerprint and history.
+    """
+    record = {"model": model.settings.model_dump(mode="json"), **info}
+    save(folder / "model.safetensors", model.state_dict(), {"fingerprint": info["fingerprint"]})
+    write_json(folder / "model.json", record)
+    (folder / STATE).unlink(missing_ok=True)
+    (folder / PROGRESS).unlink(missing_ok=True)
+
+
+def read_record(folder: Path) -> dict[str, Any] | None:
+    """``model.json`` of a finished stage, or None when it is missing, damaged or of other weights."""
+    try:
+        record = json.loads((folder / "model.json").read_text(encoding="utf-8"))
+        with safe_open(folder / "model.safetensors", framework="pt") as file:
+            header = json.loads((file.metadata() or {})[HEADER])
+        return record if record["fingerprint"] == header["fingerprint"] else None
+    except (OSError, SafetensorError, KeyError, ValueError, TypeError):
+        return None
+
+
+def load_model(folder: Path, device: str | torch.device = "cpu") -> DNR:
+    """A finished stage's renderer, ready for inference.
+
+    Raises:
+        ContractError: nothing there, damaged, or weights and model.json are of different runs.
+    """
+    record, saved = read_record(folder), load(Path(folder) / "model.safetensors")
+    if record is None or saved is None:
+        raise ContractError(f"{folder}: holds no finished model; run `dnrpipe finetune` (again)")
+    try:
+        model = DNR(ModelSettings.model_validate(record["model"]), seed=0)
+        load_module(model, saved.tensors)
+    except (ValidationError, RuntimeError, KeyError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ContractError(f"{folder}: model does not fit this version ({reason}); train it again") from None
+    model.bfloat16 = bool(record.get("bfloat16", False))
+    return model.to(device).eval()

@@ -1,0 +1,222 @@
+"""Pass and image files -> tensors in memory, batches and augmentation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .contract import RASTER_CHANNELS, ContractError, SceneFrame, View, require_channels
+from .display import DisplayTransform
+
+INPUT_CHANNELS = ("depth.Z", "normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "mask", "coverage")
+DIHEDRAL_ORDER = 8  # four quarter turns, each mirrored or not
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Some views, all of one size. Tensors are float32.
+
+    uv        [N, 2, H, W] atlas coordinates mapped to grid_sample's [-1, 1]; x = U, y = V (row 0 is V = 0)
+    depth     [N, 1, H, W] (planar depth − near) / (far − near), clamped to [0, 1]
+    normal    [N, 3, H, W] world-space unit shading normal, 0 outside the mask
+    mask      [N, 1, H, W] 1 where the pixel's centre hits a surface
+    coverage  [N, 1, H, W] fraction of the pixel's area that surfaces cover
+    view_dir  [N, 3, H, W] world-space unit vector from the surface towards the camera
+    target    [N, 3, H, W] display RGB over white, or None
+    """
+
+    uv: Tensor
+    depth: Tensor
+    normal: Tensor
+    mask: Tensor
+    coverage: Tensor
+    view_dir: Tensor
+    target: Tensor | None
+
+    def to(self, device: torch.device | str) -> Batch:
+        return self._map(lambda tensor: tensor.to(device))
+
+    def augment(self, element: int) -> Batch:
+        """Apply one of the eight symmetries of the square, inputs and target alike.
+
+        ``element % 4`` quarter turns, mirrored when ``element >= 4``; 0 changes nothing. UVs, normals and
+        view directions are *moved*, never rotated in value: they are atlas and world coordinates, which
+        do not depend on how the picture lies on the screen. The renderer learns screen-space filters, and
+        those must not depend on it either; that is what this augmentation teaches.
+        """
+
+        def turn(tensor: Tensor) -> Tensor:
+            turned = torch.rot90(tensor, element % 4, dims=(-2, -1))
+            return (turned.flip(-1) if element >= 4 else turned).contiguous()
+
+        return self if element == 0 else self._map(turn)
+
+    def _map(self, function) -> Batch:  # type: ignore[no-untyped-def]
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return Batch(**{k: None if v is None else function(v) for k, v in values.items()})
+
+
+@dataclass(frozen=True)
+class ViewSet:
+    """Views of one size in memory: their names, camera-to-world matrices and tensors (see Batch)."""
+
+    names: tuple[str, ...]
+    c2w: np.ndarray
+    """float64 [N, 4, 4]"""
+    tensors: Batch
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def uv(self) -> Tensor:
+        return self.tensors.uv
+
+    @property
+    def depth(self) -> Tensor:
+        return self.tensors.depth
+
+    @property
+    def normal(self) -> Tensor:
+        return self.tensors.normal
+
+    @property
+    def mask(self) -> Tensor:
+        return self.tensors.mask
+
+    @property
+    def coverage(self) -> Tensor:
+        return self.tensors.coverage
+
+    @property
+    def view_dir(self) -> Tensor:
+        return self.tensors.view_dir
+
+    @property
+    def target(self) -> Tensor | None:
+        return self.tensors.target
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) in pixels."""
+        height, width = self.tensors.mask.shape[-2:]
+        return int(height), int(width)
+
+    @property
+    def camera_positions(self) -> np.ndarray:
+        """Camera centres, world space, float64 [N, 3]."""
+        return self.c2w[:, :3, 3]
+
+    @property
+    def camera_directions(self) -> np.ndarray:
+        """Unit viewing directions (camera −Z), world space, float64 [N, 3]."""
+        return -self.c2w[:, :3, 2]
+
+    def index(self, name: str) -> int:
+        """Index of a view by name. Raises ContractError for an unknown one."""
+        try:
+            return self.names.index(name)
+        except ValueError:
+            raise ContractError(f"view '{name}' is not loaded; known: {', '.join(self.names[:8])} …") from None
+
+    def batch(self, indices: Sequence[int]) -> Batch:
+        """The views at ``indices`` as one batch (a copy, or a view of memory for a single index)."""
+        if len(indices) == 1:
+            start = indices[0]
+            return self.tensors._map(lambda tensor: tensor[start : start + 1])
+        chosen = torch.as_tensor(list(indices), device=self.tensors.mask.device)
+        return self.tensors._map(lambda tensor: tensor.index_select(0, chosen))
+
+    def subset(self, indices: Sequence[int]) -> ViewSet:
+        """A ViewSet of the views at ``indices``, in that order."""
+        return ViewSet(tuple(self.names[i] for i in indices), self.c2w[list(indices)], self.batch(indices))
+
+    def to(self, device: torch.device | str) -> ViewSet:
+        return replace(self, tensors=self.tensors.to(device))
+
+
+def load_views(
+    pass_files: Sequence[Path],
+    image_files: Sequence[Path] | None,
+    frame: SceneFrame,
+    *,
+    cameras: Sequence[View],
+    folder: Path,
+    target: bool = True,
+) -> ViewSet:
+    """Read views from EXR files in the contract's format.
+
+    Args:
+        pass_files: one file per view (G-buffer, coverage, perhaps raster colour).
+        image_files: ray-traced files that serve as targets, or None: the raster colour of the pass files.
+        frame: near/far and display transform; ``folder`` is where its LUT lies.
+        cameras: the views, same order as the files; they give names and view directions.
+        target: False leaves the target None (inference on novel views).
+
+    Raises:
+        ContractError: counts differ, files missing or damaged, channels missing, mixed resolutions,
+            not finite, near >= far, no views.
+    """
+    from .exr import read_exr
+
+    if not pass_files:
+        raise ContractError("no views to load; run `dnrpipe prepare` first")
+    if len(pass_files) != len(cameras) or (image_files is not None and len(image_files) != len(pass_files)):
+        count = "none" if image_files is None else len(image_files)
+        raise ContractError(f"{len(cameras)} cameras, {len(pass_files)} pass files, {count} images: must agree")
+    if frame.near >= frame.far:
+        raise ContractError(f"frame.json: near {frame.near} is not below far {frame.far}; run `dnrpipe prepare` again")
+    display = DisplayTransform(frame, folder)
+    size = (cameras[0].height, cameras[0].width)
+    stacks: dict[str, list[Tensor]] = {f.name: [] for f in fields(Batch)}
+    for index, (pass_file, camera) in enumerate(zip(pass_files, cameras, strict=True)):
+        channels, _ = read_exr(pass_file)
+        raster = target and image_files is None
+        require_channels(pass_file, channels, (*INPUT_CHANNELS, *(RASTER_CHANNELS if raster else ())))
+        _check_size(pass_file, channels, size, camera)
+        inputs = _stack(pass_file, channels, INPUT_CHANNELS)
+        mask = (inputs[6:7] > 0.5).float()
+        depth = ((inputs[0:1] - frame.near) / (frame.far - frame.near)).clamp(0.0, 1.0)
+        stacks["depth"].append(depth * mask)
+        stacks["normal"].append(inputs[1:4] * mask)
+        stacks["uv"].append((2.0 * inputs[4:6] - 1.0) * mask)
+        stacks["mask"].append(mask)
+        stacks["coverage"].append(inputs[7:8].clamp(0.0, 1.0))
+        stacks["view_dir"].append(torch.from_numpy(-camera.ray_directions()).permute(2, 0, 1).contiguous())
+        if not target:
+            continue
+        image_file = pass_file
+        if image_files is not None:
+            image_file = image_files[index]
+            channels, _ = read_exr(image_file)
+            require_channels(image_file, channels, RASTER_CHANNELS)
+            _check_size(image_file, channels, size, camera)
+        colour = _stack(image_file, channels, RASTER_CHANNELS)
+        stacks["target"].append(display.over_white(colour[:3], colour[3:]))
+    tensors = Batch(**{k: torch.stack(v) if v else None for k, v in stacks.items()})  # type: ignore[arg-type]
+    return ViewSet(tuple(c.name for c in cameras), np.stack([c.matrix for c in cameras]), tensors)
+
+
+def _stack(path: Path, channels: dict[str, np.ndarray], names: Sequence[str]) -> Tensor:
+    values = np.stack([channels[name] for name in names]).astype(np.float32, copy=False)
+    if not np.isfinite(values).all():
+        raise ContractError(f"{path}: has non-finite values; delete it and run the stage again")
+    return torch.from_numpy(values)
+
+
+def _check_size(path: Path, channels: dict[str, np.ndarray], size: tuple[int, int], camera: View) -> None:
+    found = next(iter(channels.values())).shape
+    wanted = (camera.height, camera.width)
+    if found != wanted:
+        raise ContractError(
+            f"{path}: is {found[1]}x{found[0]}, its camera {wanted[1]}x{wanted[0]}; delete it and run the stage again"
+        )
+    if wanted != size:
+        raise ContractError(
+            f"{path}: is {found[1]}x{found[0]}, the first view {size[1]}x{size[0]}; all views need one resolution"
+        )

@@ -1,0 +1,88 @@
+"""Scene-linear radiance -> display RGB, in one place.
+
+The transform is the scene's own: exposure in stops, then its baked view transform (a 3-D LUT) or the
+sRGB opto-electronic transfer function (IEC 61966-2-1), then Blender's extra gamma. Losses, metrics and
+8-bit files all live on its output.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from .contract import ContractError, SceneFrame
+
+ALPHA_FLOOR = 1e-6
+
+
+def srgb_oetf(linear: Tensor) -> Tensor:
+    """Linear Rec.709 -> sRGB code values in [0, 1]; negatives become 0, values above 1 become 1."""
+    x = linear.clamp(0.0, 1.0)
+    # The power's argument is kept above the linear segment: its slope at 0 is infinite.
+    return torch.where(x <= 0.0031308, 12.92 * x, 1.055 * x.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
+
+
+class DisplayTransform:
+    """The scene's display transform.
+
+    Args:
+        frame: exposure, gamma and the name of the LUT file.
+        folder: where ``frame.display_lut`` lies (the workspace's ``scene`` folder).
+
+    Raises:
+        ContractError: the LUT is missing, has another shape than [N, N, N, 3] or is not finite.
+    """
+
+    def __init__(self, frame: SceneFrame, folder: Path) -> None:
+        self.scale = 2.0**frame.exposure
+        self.inverse_gamma = 1.0 / frame.gamma
+        self.lut: Tensor | None = None
+        self.maximum = self.k = 1.0
+        if frame.display_lut is not None:
+            self._read(Path(folder) / frame.display_lut)
+
+    def _read(self, path: Path) -> None:
+        remedy = "run `dnrpipe prepare` again"
+        if not path.is_file():
+            raise ContractError(f"{path}: the display transform is missing; {remedy}")
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                lut = np.asarray(data["lut"], dtype=np.float32)
+                self.maximum, self.k = float(data["max"]), float(data["k"])
+        except (OSError, ValueError, KeyError) as error:
+            raise ContractError(f"{path}: not a display transform ({error}); {remedy}") from None
+        if lut.ndim != 4 or lut.shape[3] != 3 or len(set(lut.shape[:3])) != 1 or lut.shape[0] < 2:
+            raise ContractError(f"{path}: lut has shape {lut.shape}, expected [N, N, N, 3]; {remedy}")
+        if not np.isfinite(lut).all() or not (self.maximum > 0 and self.k > 0):
+            raise ContractError(f"{path}: lut, max or k is not finite and positive; {remedy}")
+        # [1, 3, r, g, b] for grid_sample, whose coordinates run (x, y, z) = (b, g, r).
+        self.lut = torch.from_numpy(np.ascontiguousarray(lut.transpose(3, 0, 1, 2)))[None]
+
+    def __call__(self, radiance: Tensor) -> Tensor:
+        """Linear Rec.709 radiance [..., 3, H, W] -> display RGB in [0, 1], same shape, float32."""
+        x = radiance.float() * self.scale
+        shown = srgb_oetf(x) if self.lut is None else self._look_up(x)
+        return shown if self.inverse_gamma == 1.0 else shown.clamp_min(0.0) ** self.inverse_gamma
+
+    def _look_up(self, x: Tensor) -> Tensor:
+        """Trilinear look-up; node coordinate t = log2(1 + k x) / log2(1 + k max) per channel."""
+        assert self.lut is not None
+        t = torch.log2(1 + self.k * x.clamp(0.0, self.maximum)) / float(np.log2(1 + self.k * self.maximum))
+        flat = t.reshape(-1, 3, t.shape[-2] * t.shape[-1])
+        grid = (2 * flat - 1).flip(1).permute(0, 2, 1).reshape(1, 1, 1, -1, 3)
+        sampled = F.grid_sample(self.lut.to(x.device), grid, align_corners=True, padding_mode="border")
+        return sampled.reshape(3, flat.shape[0], -1).transpose(0, 1).reshape(x.shape).clamp(0.0, 1.0)
+
+    def over_white(self, premultiplied: Tensor, alpha: Tensor) -> Tensor:
+        """Premultiplied linear RGB [..., 3, H, W] and alpha [..., 1, H, W] -> display RGB over white.
+
+        c = display(rgb / alpha) · alpha + (1 − alpha): un-premultiply, display transform, then composite
+        in display space. NeRF-Synthetic's PNGs are composed so (8-bit straight RGBA over white).
+        """
+        cover = alpha.float().clamp(0.0, 1.0)
+        straight = premultiplied.float() / cover.clamp_min(ALPHA_FLOOR)
+        return self(straight) * cover + (1.0 - cover)

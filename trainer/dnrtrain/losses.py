@@ -1,0 +1,108 @@
+"""The six losses of step 2 (paper, training section and implementation details).
+
+    L = λ_DNRf·photometric + λ_SSIM·(1 − SSIM) + λ_p·L_p + λ_FR·L_FR + λ_TV·L_TV + λ_reg·L_reg
+
+All act on display RGB over white, float32. Each is finite, with finite gradients, on flat and tiny images.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from .metrics import ssim
+from .model import Output
+from .perceptual import PerceptualLoss
+from .settings import Step2Settings
+
+
+def photometric(prediction: Tensor, target: Tensor, kind: str) -> Tensor:
+    """Mean absolute ("l1") or mean squared ("mse") difference."""
+    return F.l1_loss(prediction, target) if kind == "l1" else F.mse_loss(prediction, target)
+
+
+def structural(prediction: Tensor, target: Tensor) -> Tensor:
+    """1 − SSIM, mean over the batch."""
+    return 1.0 - ssim(prediction, target).mean()
+
+
+def frequency(prediction: Tensor, target: Tensor) -> Tensor:
+    """L_FR: mean |Re ΔF| + |Im ΔF| over the half spectrum of the orthonormal real FFT.
+
+    The FFT is linear, so F(Î) − F(I) = F(Î − I). The L1 norm is taken of real and imaginary parts, not of
+    the complex modulus: the modulus has no gradient at 0, where a good prediction lives. Always float32:
+    half-precision transforms give NaN and want powers of two.
+    """
+    spectrum = torch.fft.rfft2((prediction - target).float(), norm="ortho")
+    return torch.view_as_real(spectrum).abs().sum(dim=-1).mean()
+
+
+def total_variation(prediction: Tensor) -> Tensor:
+    """L_TV: mean absolute difference of neighbours, horizontally plus vertically (anisotropic)."""
+    total = prediction.sum() * 0.0
+    for axis in (-2, -1):
+        if prediction.shape[axis] > 1:
+            total = total + prediction.diff(dim=axis).abs().mean()
+    return total
+
+
+def texture_regularisation(texture: Tensor) -> Tensor:
+    """L_reg(T) = mean T²: keeps the spatial neural texture small."""
+    return texture.square().mean()
+
+
+def random_crop(prediction: Tensor, target: Tensor, side: int, random: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """The same random ``side``×``side`` window of both images; 0, or larger than the image: all of it.
+
+    VGG is the dearest part of a step and its features are local: a window per step is an estimate of L_p
+    at a fraction of the cost.
+    """
+    height, width = prediction.shape[-2:]
+    if side == 0:
+        return prediction, target
+    top = int(random.integers(max(1, height - side + 1)))
+    left = int(random.integers(max(1, width - side + 1)))
+    window = (..., slice(top, top + side), slice(left, left + side))
+    return prediction[window], target[window]
+
+
+class Step2Loss:
+    """Weighted sum of the six terms; a term of weight 0 is not computed.
+
+    Args:
+        perceptual: None drops L_p (weights missing).
+    """
+
+    def __init__(self, settings: Step2Settings, perceptual: PerceptualLoss | None) -> None:
+        self.settings = settings
+        self.perceptual = perceptual
+
+    def __call__(
+        self, output: Output, target: Tensor, random: np.random.Generator, *, bfloat16: bool
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """-> (total, unweighted terms by name).
+
+        ``random`` places the crop of L_p; ``bfloat16`` concerns VGG's convolutions only.
+        """
+        weights, rgb = self.settings.loss, output.rgb
+        terms: dict[str, Tensor] = {}
+        if weights.photometric:
+            terms["photometric"] = photometric(rgb, target, self.settings.photometric)
+        if weights.ssim:
+            terms["ssim"] = structural(rgb, target)
+        if weights.perceptual and self.perceptual is not None:
+            terms["perceptual"] = self.perceptual(
+                *random_crop(rgb, target, self.settings.perceptual_crop, random), bfloat16=bfloat16
+            )
+        if weights.frequency:
+            terms["frequency"] = frequency(rgb, target)
+        if weights.total_variation:
+            terms["total_variation"] = total_variation(rgb)
+        if weights.regularisation:
+            terms["regularisation"] = texture_regularisation(output.texture)
+        total = rgb.sum() * 0.0
+        for name, value in terms.items():
+            total = total + getattr(weights, name) * value
+        return total, terms

@@ -1,0 +1,153 @@
+"""VGG16 and AlexNet feature extractors: the perceptual loss L_p and LPIPS v0.1.
+
+Both networks are the convolutions of torchvision's ImageNet classifiers (Simonyan and Zisserman 2015;
+Krizhevsky 2014), defined here: torchvision is no dependency. Weights come from :mod:`dnrtrain.weights`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+Network = Literal["vgg", "alex"]
+
+# (channels, kernel, stride, padding) per convolution; "M" is the network's max-pooling.
+VGG16: tuple[tuple[int, int, int, int] | str, ...] = (
+    (64, 3, 1, 1), (64, 3, 1, 1), "M",
+    (128, 3, 1, 1), (128, 3, 1, 1), "M",
+    (256, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1), "M",
+    (512, 3, 1, 1), (512, 3, 1, 1), (512, 3, 1, 1), "M",
+    (512, 3, 1, 1), (512, 3, 1, 1), (512, 3, 1, 1),
+)  # fmt: skip
+ALEXNET: tuple[tuple[int, int, int, int] | str, ...] = (
+    (64, 11, 4, 2), "M", (192, 5, 1, 2), "M", (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1),
+)  # fmt: skip
+LAYOUT = {"vgg": VGG16, "alex": ALEXNET}
+TAPS = {"vgg": (1, 3, 6, 9, 12), "alex": (0, 1, 2, 3, 4)}
+"""Convolutions whose ReLU output LPIPS compares (VGG: relu1_2, 2_2, 3_3, 4_3, 5_3)."""
+POOL = {"vgg": 2, "alex": 3}  # window; the stride is 2 in both
+MINIMUM_SIDE = {"vgg": 16, "alex": 31}
+"""Smallest image side for which the last tap still has a pixel."""
+
+# LPIPS' scaling layer for inputs in [-1, 1]: ImageNet's mean and deviation, rounded as published.
+SHIFT = (-0.030, -0.088, -0.188)
+SCALE = (0.458, 0.448, 0.450)
+
+LOSS_TAPS = 4
+"""L_p uses relu1_2 to relu4_3."""
+LOSS_WEIGHTS = (1 / 16, 1 / 8, 1 / 4, 1.0)
+"""w_j: deeper features, which are smaller and more semantic, count more (as in Wang et al. 2018, pix2pixHD)."""
+
+
+class Features(nn.Module):
+    """Frozen convolutions of one network; ReLU outputs at the first ``taps`` tap points."""
+
+    def __init__(self, network: Network, weights: Mapping[str, Tensor], taps: int = 5) -> None:
+        super().__init__()
+        self.network = network
+        self.taps = TAPS[network][:taps]
+        self.register_buffer("shift", torch.tensor(SHIFT).view(1, 3, 1, 1))
+        self.register_buffer("scale", torch.tensor(SCALE).view(1, 3, 1, 1))
+        self.convolutions = nn.ModuleList()
+        inputs = 3
+        for item in LAYOUT[network]:
+            if isinstance(item, str):
+                continue
+            index = len(self.convolutions)
+            if index > self.taps[-1]:
+                break
+            channels, kernel, stride, padding = item
+            layer = nn.Conv2d(inputs, channels, kernel, stride, padding)
+            layer.load_state_dict({"weight": weights[f"conv.{index}.weight"], "bias": weights[f"conv.{index}.bias"]})
+            self.convolutions.append(layer)
+            inputs = channels
+        self.requires_grad_(False)
+        self.eval()
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    def forward(self, image: Tensor, *, bfloat16: bool = False) -> list[Tensor]:
+        """Display RGB in [0, 1], [N, 3, H, W] -> ReLU features per tap (float32 or bfloat16)."""
+        x = ((2.0 * image.float() - 1.0) - self.shift) / self.scale
+        x = x.contiguous(memory_format=torch.channels_last)
+        found: list[Tensor] = []
+        index = 0
+        with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=bfloat16):
+            for item in LAYOUT[self.network]:
+                if isinstance(item, str):
+                    x = F.max_pool2d(x, POOL[self.network], 2)
+                    continue
+                x = F.relu(self.convolutions[index](x))
+                if index in self.taps:
+                    found.append(x)
+                if index == self.taps[-1]:
+                    break
+                index += 1
+        return found
+
+
+class Lpips(nn.Module):
+    """LPIPS v0.1 (Zhang et al. 2018): weighted distance of unit-normalised features.
+
+    Inputs in [0, 1] (converted to [-1, 1] here). The epsilon of the norm stands inside the square root:
+    outside, its gradient at an all-zero feature is NaN.
+    """
+
+    def __init__(self, network: Network, weights: Mapping[str, Tensor]) -> None:
+        super().__init__()
+        self.minimum_side = MINIMUM_SIDE[network]
+        self.features = Features(network, weights)
+        for index in range(len(TAPS[network])):
+            self.register_buffer(f"head{index}", weights[f"head.{index}"].clone())
+
+    def forward(self, prediction: Tensor, target: Tensor) -> Tensor:
+        """[N, 3, H, W] twice -> distance [N]. Raises ValueError for images below ``minimum_side``."""
+        if min(prediction.shape[-2:]) < self.minimum_side:
+            raise ValueError(f"LPIPS needs images of at least {self.minimum_side} pixels a side")
+        total = prediction.new_zeros(prediction.shape[0])
+        pairs = zip(self.features(prediction), self.features(target), strict=True)
+        for index, (a, b) in enumerate(pairs):
+            difference = (_unit(a) - _unit(b)).square()
+            weighted = (difference * getattr(self, f"head{index}")).sum(dim=1)
+            total = total + weighted.mean(dim=(1, 2))
+        return total
+
+
+class PerceptualLoss(nn.Module):
+    """L_p(Î, I) = Σ_j w_j · mean |φ_j(Î) − φ_j(I)| with VGG16 features (paper, training section).
+
+    The norm is the mean absolute difference. Images smaller than 16 pixels a side use the taps that fit.
+    """
+
+    def __init__(self, weights: Mapping[str, Tensor]) -> None:
+        super().__init__()
+        self.features = Features("vgg", weights, taps=LOSS_TAPS)
+
+    def forward(self, prediction: Tensor, target: Tensor, *, bfloat16: bool = False) -> Tensor:
+        """[N, 3, H, W] twice -> scalar. Gradients flow to ``prediction`` only."""
+        side = min(prediction.shape[-2:])
+        if side < 8:  # relu4_3 lies behind three poolings
+            factor = -(-8 // side)
+            prediction = F.interpolate(prediction, scale_factor=factor, mode="nearest")
+            target = F.interpolate(target, scale_factor=factor, mode="nearest")
+        with torch.no_grad():
+            wanted = self.features(target, bfloat16=bfloat16)
+        found = self.features(prediction, bfloat16=bfloat16)
+        return _weighted_l1(found, wanted)
+
+
+def _weighted_l1(found: Sequence[Tensor], wanted: Sequence[Tensor]) -> Tensor:
+    terms = [weight * (a - b).abs().float().mean() for weight, a, b in zip(LOSS_WEIGHTS, found, wanted, strict=True)]
+    return torch.stack(terms).sum()
+
+
+def _unit(feature: Tensor) -> Tensor:
+    return feature / torch.sqrt(feature.square().sum(dim=1, keepdim=True) + 1e-20)
+
+
+def build_lpips(weights: Mapping[str, Mapping[str, Tensor]]) -> dict[str, Lpips]:
+    """LPIPS with both networks from what :func:`dnrtrain.weights.load_weights` returns."""
+    return {"alex": Lpips("alex", weights["alex"]), "vgg": Lpips("vgg", weights["vgg"])}

@@ -1,0 +1,1 @@
+"""View selection: the paper's Q-learning selector and the baselines, behind one protocol."""

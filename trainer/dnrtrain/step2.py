@@ -1,0 +1,177 @@
+"""Step 2: fine-tune the coarse DNR on the selected ray-traced views with six losses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from . import checkpoint
+from .contract import ContractError
+from .dataset import DIHEDRAL_ORDER, ViewSet
+from .events import EpochEnd, Event, Note
+from .losses import Step2Loss
+from .perceptual import PerceptualLoss
+from .precision import decide_bfloat16
+from .schedule import (
+    STEP2,
+    EpochBook,
+    adam,
+    guarded_step,
+    learning_rate,
+    require_target,
+    run_key,
+    step_random,
+    validate,
+)
+from .settings import ModelSettings, Step2Settings
+
+
+def run_step2(
+    views: ViewSet,
+    val: ViewSet | None,
+    coarse: Path,
+    model: ModelSettings,
+    settings: Step2Settings,
+    *,
+    seed: int,
+    device: str,
+    checkpoints: Path,
+    fingerprint: str,
+    weights: Mapping[str, Mapping[str, Tensor]] | None,
+) -> Iterator[Event]:
+    """Fine-tune; yields an event per epoch and leaves ``model.safetensors`` and ``model.json``.
+
+    Args:
+        views: the M selected views, targets = ray-traced images.
+        val: views with held-out targets, or None.
+        coarse: folder of the finished step 1.
+        checkpoints: this step's own folder; see :func:`dnrtrain.step1.run_step1` on resuming.
+        weights: from :func:`dnrtrain.weights.load_weights`; None drops L_p with a note, and the record says
+            ``"perceptual": false``.
+
+    Raises:
+        ContractError: no finished step 1, of other model settings, or views without targets.
+    """
+    run = _Step2(views, val, coarse, model, settings, seed, device, checkpoints, fingerprint, weights)
+    yield from run.events()
+
+
+class _Step2:
+    """One run's state."""
+
+    def __init__(
+        self,
+        views: ViewSet,
+        val: ViewSet | None,
+        coarse: Path,
+        model: ModelSettings,
+        settings: Step2Settings,
+        seed: int,
+        device: str,
+        folder: Path,
+        fingerprint: str,
+        weights: Mapping[str, Mapping[str, Tensor]] | None,
+    ) -> None:
+        require_target(views, "step 2")
+        self.views, self.val = views.to(device), None if val is None else val.to(device)
+        self.settings, self.seed, self.device = settings, seed, device
+        self.folder, self.fingerprint = Path(folder), fingerprint
+        self.dnr = checkpoint.load_model(coarse, device)
+        if self.dnr.settings != model:
+            raise ContractError(f"{coarse}: was trained with other model settings; run `dnrpipe select` again")
+        self.dnr.train()
+        self.wants_perceptual = settings.loss.perceptual > 0
+        perceptual = None
+        if weights is not None and self.wants_perceptual:
+            perceptual = PerceptualLoss(weights["vgg"]).to(device)
+        self.loss = Step2Loss(settings, perceptual)
+        record = checkpoint.read_record(coarse)
+        parts = [
+            model.model_dump(), settings.model_dump(), seed, device, perceptual is not None,
+            None if record is None else record.get("run"),
+        ]  # fmt: skip
+        self.key = run_key(fingerprint, views, parts)
+        self.steps_per_epoch = -(-len(views) // settings.batch)
+        self.optimiser = adam([self.dnr], settings.learning_rate, device)
+        self.history: list[dict] = []
+
+    def events(self) -> Iterator[Event]:
+        record = checkpoint.read_record(self.folder)
+        if record is not None and record.get("run") == self.key:
+            yield Note("step 2 is finished already")
+            return
+        if self.wants_perceptual and self.loss.perceptual is None:
+            yield Note("perceptual weights are missing: training goes on without the loss term L_p")
+        first = self._restore()
+        if first:
+            yield Note(f"step 2 continues after epoch {first} of {self.settings.epochs}")
+        for epoch in range(first, self.settings.epochs):
+            yield self._epoch(epoch)
+        info = {
+            "fingerprint": self.fingerprint,
+            "run": self.key,
+            "stage": "step2",
+            "settings": self.settings.model_dump(mode="json"),
+            "seed": self.seed,
+            "views": list(self.views.names),
+            "perceptual": self.loss.perceptual is not None,
+            "bfloat16": self.dnr.bfloat16,
+            "history": self.history,
+        }
+        checkpoint.save_model(self.folder, self.dnr, info)
+
+    def _epoch(self, epoch: int) -> EpochEnd:
+        s, book = self.settings, EpochBook()
+        order = step_random(self.seed, STEP2, epoch, -1).permutation(len(self.views))
+        total = s.epochs * self.steps_per_epoch
+        rate = s.learning_rate
+        for step in range(self.steps_per_epoch):
+            random = step_random(self.seed, STEP2, epoch, step)
+            chosen = order[step * s.batch : (step + 1) * s.batch]
+            batch = self.views.batch([int(i) for i in chosen])
+            if s.augment:
+                batch = batch.augment(int(random.integers(DIHEDRAL_ORDER)))
+            assert batch.target is not None
+            rate = learning_rate(epoch * self.steps_per_epoch + step, total, s.learning_rate, s.learning_rate_end)
+            loss, terms = self.loss(self.dnr(batch), batch.target, random, bfloat16=self.dnr.bfloat16)
+            book.count(guarded_step(self.optimiser, loss, rate))
+            values = torch.stack([loss, *terms.values()]).detach().tolist()
+            book.add(**dict(zip(["total", *terms], values, strict=True)))
+        scores = validate(self.dnr, self.val, s.validation_views)
+        entry = book.entry(epoch + 1, rate, scores)
+        self.history.append(entry)
+        self._save(epoch + 1)
+        return EpochEnd(
+            "step2",
+            epoch + 1,
+            s.epochs,
+            entry["losses"],
+            scores,
+            entry["seconds"],
+            entry["cpu_seconds"],
+            entry["steps"],
+            entry["skipped"],
+            self.device,
+        )
+
+    def _save(self, epoch: int) -> None:
+        tensors = checkpoint.prefixed("dnr", self.dnr.state_dict())
+        tensors |= checkpoint.prefixed("adam", checkpoint.optimiser_tensors(self.optimiser))
+        info = {"run": self.key, "epoch": epoch, "bfloat16": self.dnr.bfloat16, "history": self.history}
+        checkpoint.save_state(self.folder, tensors, info)
+
+    def _restore(self) -> int:
+        """Load the state of an interrupted run of the same key; -> epochs done. Else start afresh."""
+        saved = checkpoint.load_state(self.folder)
+        if saved is None or saved.info.get("run") != self.key:
+            if self.settings.precision != "auto":  # auto: as step 1 decided
+                self.dnr.bfloat16 = decide_bfloat16(self.settings.precision, self.device)
+            self._save(0)
+            return 0
+        self.dnr.bfloat16, self.history = saved.info["bfloat16"], saved.info["history"]
+        checkpoint.load_module(self.dnr, checkpoint.unprefixed("dnr", saved.tensors))
+        checkpoint.restore_optimiser(self.optimiser, checkpoint.unprefixed("adam", saved.tensors))
+        return int(saved.info["epoch"])
