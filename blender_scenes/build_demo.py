@@ -41,9 +41,7 @@ def lattice_noise(points: np.ndarray, frequency: float, octaves: int, seed: int)
         for dx in (0, 1):
             for dy in (0, 1):
                 for dz in (0, 1):
-                    corner = lattice[
-                        (base[..., 0] + dx) % 64, (base[..., 1] + dy) % 64, (base[..., 2] + dz) % 64
-                    ]
+                    corner = lattice[(base[..., 0] + dx) % 64, (base[..., 1] + dy) % 64, (base[..., 2] + dz) % 64]
                     share = np.ones(points.shape[:-1])
                     for axis, d in enumerate((dx, dy, dz)):
                         share = share * (t[..., axis] if d else 1 - t[..., axis])
@@ -69,9 +67,7 @@ def mix(a: np.ndarray, b: np.ndarray | Rgb, t: np.ndarray) -> np.ndarray:
     return a + (np.asarray(b) - a) * t[..., None]
 
 
-def make_image(
-    name: str, pixels: np.ndarray, *, data: bool = False, is_float: bool = False
-) -> bpy.types.Image:
+def make_image(name: str, pixels: np.ndarray, *, data: bool = False, is_float: bool = False) -> bpy.types.Image:
     """Packed image from rows bottom first, [H, W, 3]; display-encoded for colour, linear for float."""
     height, width = pixels.shape[:2]
     image = bpy.data.images.new(name, width, height, alpha=False, float_buffer=is_float, is_data=data)
@@ -128,8 +124,8 @@ def globe_maps(width: int = 1024, height: int = 512) -> tuple[np.ndarray, np.nda
     colour = mix(ocean, ground, land)
     coast = np.exp(-(((shape - 0.518) / 0.0045) ** 2))
     colour = mix(colour, (0.16, 0.20, 0.24), 0.7 * coast)
-    ice = smoothstep(1.08, 1.14, np.abs(lat) + 0.35 * (detail - 0.5))
-    colour = mix(colour, (0.93, 0.95, 0.96), ice)
+    ice = smoothstep(1.20, 1.25, np.abs(lat) + 0.35 * (detail - 0.5))
+    colour = mix(colour, (0.76, 0.83, 0.87), ice)
     grid = np.minimum(np.abs((lon * 12 / np.pi) % 2 - 1), np.abs((lat * 12 / np.pi) % 2 - 1))
     colour = mix(colour, (0.95, 0.90, 0.75), 0.22 * (1 - smoothstep(0.02, 0.06, grid)))
     roughness = 0.18 + 0.37 * np.maximum(land, ice)
@@ -154,18 +150,14 @@ def glaze_map(width: int = 768, height: int = 768) -> np.ndarray:
     ring = smoothstep(0.03, 0.0, np.abs(radius - 0.90) - 0.025)
     dots = smoothstep(0.03, -0.02, np.hypot(np.abs(x) - 1, np.abs(y) - 1) - 0.16)
     inside = ((grid_v > low) & (grid_v < high)).astype(float)
-    ink = np.maximum(
-        ink, inside * np.maximum.reduce([flower, ring, dots, smoothstep(0.05, 0, radius - 0.08)])
-    )
+    ink = np.maximum(ink, inside * np.maximum.reduce([flower, ring, dots, smoothstep(0.05, 0, radius - 0.08)]))
     wave = 0.012 * np.sin(grid_u * 2 * np.pi * 24)
     for centre, half in ((0.245, 0.008), (0.825, 0.008), (0.12, 0.010), (0.93, 0.010)):
         ink = np.maximum(ink, smoothstep(0.002, -0.002, np.abs(grid_v - centre) - half))
     for centre in (0.185, 0.877):
         ink = np.maximum(ink, 0.85 * smoothstep(0.002, -0.002, np.abs(grid_v - centre - wave) - 0.012))
     ink = np.maximum(ink, smoothstep(0.095, 0.085, grid_v))
-    tone = lattice_noise(
-        np.stack([np.cos(grid_u * 2 * np.pi), np.sin(grid_u * 2 * np.pi), grid_v * 4], -1), 3, 2, 9
-    )
+    tone = lattice_noise(np.stack([np.cos(grid_u * 2 * np.pi), np.sin(grid_u * 2 * np.pi), grid_v * 4], -1), 3, 2, 9)
     blue = mix(plain(height, width, (0.07, 0.17, 0.52)), (0.16, 0.34, 0.72), tone)
     white = plain(height, width, (0.93, 0.93, 0.89))
     return white * (1 - ink[..., None]) + blue * ink[..., None]
@@ -182,7 +174,7 @@ def terrazzo_map(size: int = 1024, chips: int = 520) -> np.ndarray:
     reach = rng.uniform(0.006, 0.022, chips)
     axis = (np.arange(size) + 0.5) / size
     grid = np.stack(np.meshgrid(axis, axis), axis=-1)
-    image = plain(size, size, (0.64, 0.60, 0.55))
+    image = plain(size, size, (0.74, 0.71, 0.66))
     angles = rng.uniform(0, np.pi, chips)
     stretch = rng.uniform(0.6, 1.0, chips)
     for centre, colour, r, angle, squeeze in zip(centres, colours, reach, angles, stretch, strict=True):
@@ -324,9 +316,7 @@ def curve_profile(knots: Sequence[tuple[float, float]], per_span: int = 10) -> l
     for i in range(1, len(k) - 2):
         for t in np.linspace(0, 1, per_span, endpoint=False):
             a, b, c, d = k[i - 1], k[i], k[i + 1], k[i + 2]
-            p = 0.5 * (
-                2 * b + (c - a) * t + (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - a - 3 * c + d) * t**3
-            )
+            p = 0.5 * (2 * b + (c - a) * t + (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - a - 3 * c + d) * t**3)
             out.append((max(float(p[0]), 0.0), float(p[1])))
     out.append((float(k[-2][0]), float(k[-2][1])))
     return out
@@ -336,9 +326,7 @@ def rounded_disc(radius: float, bottom: float, top: float, bevel: float) -> list
     """Profile of a cylinder with round edges, from the lower to the upper pole."""
     angles = np.linspace(-np.pi / 2, 0, 9)
     lower = [(radius - bevel + bevel * np.cos(a), bottom + bevel + bevel * np.sin(a)) for a in angles]
-    upper = [
-        (radius - bevel + bevel * np.cos(a), top - bevel + bevel * np.sin(a)) for a in angles + np.pi / 2
-    ]
+    upper = [(radius - bevel + bevel * np.cos(a), top - bevel + bevel * np.sin(a)) for a in angles + np.pi / 2]
     return [(0.0, bottom), *lower, *upper, (0.0, top)]
 
 
@@ -462,16 +450,8 @@ def build_objects() -> None:
     texture(glaze, make_image("glaze", glaze_map()), "Base Color")
     outer = [(0.0, 0.0), (0.17, 0.0), (0.19, 0.015), (0.185, 0.05), (0.27, 0.22), (0.385, 0.50), (0.37, 0.74)]
     outer += [(0.24, 0.94), (0.135, 1.06), (0.125, 1.14), (0.175, 1.235)]
-    lip = [
-        (0.18, 1.25),
-        (0.168, 1.256),
-        (0.155, 1.24),
-        (0.107, 1.14),
-        (0.112, 1.06),
-        (0.20, 0.94),
-        (0.33, 0.74),
-    ]
-    lip += [(0.34, 0.5), (0.2, 0.16), (0.0, 0.12)]
+    # A shallow well: deep white cavities cost many bounces and show little.
+    lip = [(0.18, 1.25), (0.168, 1.256), (0.155, 1.24), (0.115, 1.17), (0.06, 1.13), (0.0, 1.12)]
     vase = link("Vase", lathe("Vase", curve_profile(outer[1:], 8)), glaze)
     vase.location = (-0.42, 0.45, TABLE_TOP)
     well = link(
@@ -487,7 +467,7 @@ def build_objects() -> None:
     texture(planet, make_image("globe roughness", roughness, data=True), "Roughness")
     globe = link("Globe", lathe("Globe", [(r, z - 0.34) for r, z in ball_profile(0.34)], 96), planet)
     globe.location = (0.55, 0.42, TABLE_TOP + 0.56)
-    globe.rotation_euler = (np.radians(23.4), 0.0, np.radians(200))
+    globe.rotation_euler = (np.radians(23.4), 0.0, np.radians(300))
     stand = [(0.0, 0.0), (0.25, 0.0), (0.26, 0.012), (0.255, 0.03), (0.12, 0.06), (0.05, 0.10), (0.045, 0.15)]
     stand += [(0.09, 0.19), (0.165, 0.235), (0.17, 0.25), (0.155, 0.255)]
     foot = link("Globe stand", lathe("Globe stand", curve_profile(stand, 6), 72), brass)
@@ -520,8 +500,8 @@ def build_objects() -> None:
     monkey.data.polygons.foreach_set("use_smooth", np.ones(len(monkey.data.polygons), dtype=bool))
     smooth: Any = monkey.modifiers.new("Subdivision", "SUBSURF")
     smooth.levels = smooth.render_levels = 2
-    monkey.location = (-0.72, -0.34, TABLE_TOP + 0.16 + 0.30)
-    monkey.rotation_euler = (np.radians(-18), 0.0, np.radians(20))
+    monkey.location = (-0.74, -0.27, TABLE_TOP + 0.341)
+    monkey.rotation_euler = (np.radians(-36), 0.0, np.radians(20))
     cloths = [
         ("Book, ochre", (0.62, 0.34, 0.07), (0.60, 0.44, 0.09), 0.0, 14.0),
         ("Book, petrol", (0.03, 0.14, 0.17), (0.52, 0.40, 0.08), 0.09, -6.0),

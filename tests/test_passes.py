@@ -14,7 +14,7 @@ import pytest
 
 from dnrpipe.blender import choice
 from dnrpipe.errors import UserError
-from dnrpipe.executors import Retry, run_tasks
+from dnrpipe.executors import Retry, TaskResult, run_tasks
 from dnrtrain.contract import GBUFFER_CHANNELS, RASTER_CHANNELS, View
 from dnrtrain.exr import read_exr
 
@@ -252,3 +252,17 @@ def test_a_dead_trial_is_survived(monkeypatch: pytest.MonkeyPatch) -> None:
     trial = choice.try_engine.__wrapped__("workbench")
     assert not trial["ok"]
     assert json.dumps(trial["reason"])
+
+
+@pytest.mark.slow
+def test_a_renderer_that_dies_is_named(scene_dir: Path, tmp_path: Path) -> None:
+    settings = {"scene_dir": str(scene_dir), "raster_engine": "eevee", "raster_samples": 1, "coverage_samples": 1}
+    view = look_at(np.zeros(3), 6, 0, 30).model_dump(mode="json")
+    task = {"view": view, "output": str(tmp_path / "0.exr"), "raster": True, "fingerprint": "f"}
+    no_egl = {"__EGL_VENDOR_LIBRARY_DIRS": "/nonexistent", "__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent"}
+    module, log = "dnrpipe.blender.passes", tmp_path / "log.txt"
+    outcomes = list(run_tasks(module, settings, [task], workers=1, log=log, timeout=200, environment=no_egl))
+    last = outcomes[-1]
+    assert isinstance(last, TaskResult)
+    assert last.error == "the raster renderer was killed by SIGABRT"
+    assert not (tmp_path / "0.exr").exists()

@@ -29,10 +29,11 @@ NEURAL_REPEATS = 5
 def run(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
     """Trace the test views, render them with the DNR, measure, write pictures and ``metrics.json``."""
     import torch
-    from dnrtrain.checkpoint import load_model
 
-    from dnrtrain import metrics
+    from dnrtrain.checkpoint import load_model
+    from dnrtrain.metrics import image_metrics
     from dnrtrain.model import render_views
+    from dnrtrain.perceptual import Lpips
 
     views = split_views(workspace)["test"]
     if not views:
@@ -51,13 +52,14 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
     device = torch_device(settings)
     model = load_model(workspace.checkpoints("step2"), device)
     perceptual = perceptual_weights(console)
+    lpips = {name: Lpips(name, weights) for name, weights in perceptual.items()} if perceptual else None
     rows: list[dict[str, Any]] = []
     with console.bar("test views", len(views)) as bar:
         for view in views:
             data = load(workspace, [view], "test", raytraced=True).to(device)
             seconds, prediction = _timed_render(lambda data=data: render_views(model, data), device)
-            assert data.target is not None
-            row = _measure(metrics, prediction, data.target, data.mask, perceptual)
+            assert data.target is not None  # loaded with raytraced=True
+            row: dict[str, Any] = dict(image_metrics(prediction, data.target.cpu(), data.mask.cpu(), lpips))
             truth = _image(data.target)
             predicted = _image(prediction)
             error, heat = flip_error(truth, predicted)
@@ -125,22 +127,6 @@ def write_png(path: Path, image: np.ndarray) -> None:
     data = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
     with atomic_path(path) as temporary:
         Image.fromarray(data).save(temporary)
-
-
-def _measure(metrics: Any, prediction: Any, target: Any, mask: Any, perceptual: Any) -> dict[str, Any]:
-    predicted = prediction.float().clamp(0, 1)
-    row: dict[str, Any] = {
-        "psnr": float(metrics.psnr(predicted, target)),
-        "ssim": float(metrics.ssim(predicted, target)),
-        "psnr_mask": float(metrics.psnr_masked(predicted, target, mask)),
-        "ssim_mask": float(metrics.ssim_masked(predicted, target, mask)),
-        "lpips_alex": None,
-        "lpips_vgg": None,
-    }
-    if perceptual is not None:
-        for net in ("alex", "vgg"):
-            row[f"lpips_{net}"] = float(metrics.lpips(predicted, target, perceptual, net=net))
-    return {key: value if value is None or math.isfinite(value) else None for key, value in row.items()}
 
 
 def _timed_render(render: Any, device: str) -> tuple[float, Any]:

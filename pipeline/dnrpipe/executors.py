@@ -25,6 +25,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from .errors import UserError
+
 MAX_ATTEMPTS = 2
 
 
@@ -221,7 +223,7 @@ def _close(process: subprocess.Popen[str] | None, *, force: bool) -> None:
         process.stdout.close()
 
 
-def _die_with_parent() -> None:
+def die_with_parent() -> None:
     """Ask Linux to kill this worker when the thread that started it dies; elsewhere stdin's end serves."""
     if sys.platform == "linux":
         import ctypes
@@ -231,7 +233,7 @@ def _die_with_parent() -> None:
 
 
 def _worker_main(module: str) -> int:
-    _die_with_parent()
+    die_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
@@ -245,7 +247,7 @@ def _worker_main(module: str) -> int:
 
             traceback.print_exc()
             reason = " ".join(str(error).split()) or type(error).__name__
-            answer = {"error": reason, "retry": not isinstance(error, ValueError)}
+            answer = {"error": reason, "retry": not isinstance(error, ValueError | UserError)}
         answers.write(json.dumps(answer) + "\n")
         answers.flush()
     answers.flush()

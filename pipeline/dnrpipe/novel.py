@@ -42,7 +42,6 @@ def render_novel(
     cameras and the model are the same; a changed model redoes the frames.
     """
     from dnrtrain.checkpoint import load_model
-
     from dnrtrain.dataset import load_views
     from dnrtrain.model import render_views
 

@@ -54,7 +54,7 @@ def test_ssim_of_small_images(side: int) -> None:
 
 def test_flat_images_are_alike() -> None:
     flat = torch.full((1, 3, 16, 16), 0.3)
-    assert float(ssim(flat, flat)) == pytest.approx(1.0, abs=1e-5)
+    assert float(ssim(flat, flat)) == pytest.approx(1.0, abs=1e-4)
     assert float(ssim(flat, 1 - flat)) < 0.95
 
 

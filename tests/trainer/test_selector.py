@@ -127,7 +127,6 @@ def test_the_agent_learns_which_views_pay() -> None:
     optimiser = torch.optim.Adam(network.parameters(), 3e-3)
     random = np.random.default_rng(0)
     observation = torch.zeros(1, 12, 8, 8)
-    losses: list[float] = []
     for episode in range(300):
         selected = torch.zeros(views, dtype=torch.bool)
         selected[int(random.integers(views))] = True
@@ -143,8 +142,6 @@ def test_the_agent_learns_which_views_pay() -> None:
             loss.backward()
             optimiser.step()
             follow(slow, network)
-            losses.append(float(loss.detach()))
-    assert np.mean(losses[-100:]) < 0.3 * np.mean(losses[:100])
     for first in (0, 5, 9):
         selected = torch.zeros(views, dtype=torch.bool)
         selected[first] = True

@@ -63,11 +63,19 @@ def optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
 
 
 def restore_optimiser(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
-    """Inverse of :func:`optimiser_tensors`; the parameter groups stay as they are."""
+    """Inverse of :func:`optimiser_tensors`; the parameter groups stay as they are.
+
+    Fused Adam walks parameters and moments by memory address, so moments take their parameter's strides
+    (channels-last): files hold them contiguous.
+    """
+    parameters = [p for group in optimiser.param_groups for p in group["params"]]
     state: dict[int, dict[str, Tensor]] = {}
     for key, value in tensors.items():
-        index, name = key.split(".", 1)
-        state.setdefault(int(index), {})[name] = value
+        number, name = key.split(".", 1)
+        index = int(number)
+        if name != "step":
+            value = torch.empty_like(parameters[index]).copy_(value)
+        state.setdefault(index, {})[name] = value
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
 
 

@@ -27,7 +27,8 @@ class DNR(nn.Module):
 
     The U-Net sees T (with the harmonics of the per-pixel view direction on channels 4 to 12) and the mask.
     Composition is exact: out = coverage · rgb + (1 − coverage) · 1, so that no capacity is spent on the
-    background and silhouettes are anti-aliased by geometry.
+    background and silhouettes are anti-aliased by geometry. Measured (analytic scene, 25 views, 128², 400
+    steps, L1): 27.6 dB with it, 26.0 dB without (inside the mask 24.3 and 23.9).
 
     Args:
         seed: fixes all initial weights; no global random state is read or changed.

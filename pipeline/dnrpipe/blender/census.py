@@ -119,7 +119,7 @@ def _triangles(obj: Any) -> int:
 
 def _material(material: Any) -> dict[str, Any]:
     """Nodes of one material and what they imply."""
-    tree = material.node_tree if material.use_nodes else None
+    tree = material.node_tree
     nodes = list(walk(tree))
     kinds = {node.type for node in nodes}
     principled = [node for node in nodes if node.type == "BSDF_PRINCIPLED"]
@@ -199,7 +199,7 @@ def _lights(scene: bpy.types.Scene) -> list[dict[str, Any]]:
 def _world(world: Any) -> dict[str, Any] | None:
     if world is None:
         return None
-    tree = world.node_tree if world.use_nodes else None
+    tree = world.node_tree
     kinds = Counter(node.type for node in walk(tree))
     image = next((n.image.name for n in walk(tree) if n.type == "TEX_ENVIRONMENT" and n.image), None)
     return {

@@ -13,7 +13,7 @@ from dnrpipe.errors import UserError
 
 ENGINES = ("eevee", "workbench", "cycles-direct")
 TIMEOUT = 120.0  # seconds
-SLOWEST_FRAME = 5.0  # seconds per 256² frame beyond which direct light on the CPU is the better base
+SLOWEST_FRAME = 1.0  # seconds per 256² frame (a GPU: milliseconds); beyond it direct light is the better bargain
 
 
 def choose_raster(requested: str) -> tuple[str, str]:

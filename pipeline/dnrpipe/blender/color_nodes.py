@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from .textures import LUMINANCE
+
 Arrays = list[np.ndarray]
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
 
 
 def _first_input(node: Any) -> int:

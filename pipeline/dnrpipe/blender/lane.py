@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from dnrpipe.errors import UserError
-from dnrpipe.executors import _die_with_parent
+from dnrpipe.executors import die_with_parent
 from dnrtrain.contract import View
 
 Kind = Literal["gbuffer", "coverage", "raster"]
@@ -76,7 +76,7 @@ class Lane:
 
 def _serve(connection: Connection, kind: Kind, common: dict[str, Any]) -> None:
     """Body of the process: a renderer is made at the first task, so that its errors reach the parent."""
-    _die_with_parent()
+    die_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     draw: Callable[[View, Path], None] | None = None
     while True:

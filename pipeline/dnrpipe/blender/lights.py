@@ -136,6 +136,10 @@ def _note_ignored(obj: Any, light: Any, findings: Findings) -> None:
     linking = getattr(obj, "light_linking", None)
     if linking is not None and (linking.receiver_collection or linking.blocker_collection):
         findings.add("ignored", "light linking", "the lamp lights everything", object=obj.name)
+    if light.type == "POINT" and light.shadow_soft_size > 1e-5 and light.use_soft_falloff:
+        findings.add(
+            "approximated", "soft falloff", "a true sphere: some percent off close to the lamp", object=obj.name
+        )
     if light.type != "SUN" and not light.normalize:
         findings.add("approximated", "lamp power not normalised", "converted through its area", object=obj.name)
 

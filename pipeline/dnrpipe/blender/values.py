@@ -16,7 +16,7 @@ from mathutils import Euler
 from .color_nodes import OPERATIONS
 from .findings import Findings
 from .sockets import Scope, Source, find_input, resolve
-from .textures import LUMINANCE, Constant, ImageReader, Placement, Textured, Value, constant
+from .textures import Constant, ImageReader, Placement, Textured, Value, constant
 
 FRESNEL_AVERAGE = 0.09
 """Cosine-weighted mean of the dielectric Fresnel term at IOR 1.45-1.5 (0.085-0.092)."""
@@ -255,8 +255,3 @@ class Evaluator:
             return constant(0.5)
         own = next((s for s in node.inputs if s.type in {"RGBA", "VALUE"} and s.enabled), None)
         return constant(0.5) if own is None else constant(self._value(own, source.scope).mean)
-
-
-def luminance(rgb: np.ndarray) -> np.ndarray:
-    """Rec.709 luminance of [..., 3] as [..., 1]."""
-    return (rgb @ LUMINANCE)[..., None]

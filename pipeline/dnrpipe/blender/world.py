@@ -36,7 +36,7 @@ def export_world(
     world = scene.world
     if world is None:
         return False
-    tree = world.node_tree if world.use_nodes else None
+    tree = world.node_tree
     if tree is None:
         return _constant(root, np.array(world.color))
     if surface_source(tree, "Volume") is not None:
