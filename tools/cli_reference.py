@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import click
+
 from dnrpipe.cli import cli
 
 HEADER = """# Command line reference

@@ -43,7 +43,7 @@ class PassSettings(Strict):
 
     raster: Literal["auto", "eevee", "workbench", "cycles-direct"] = "auto"
     raster_samples: int = Field(default=4, ge=1, le=4096)
-    coverage_samples: int = Field(default=16, ge=1, le=4096, description="samples of the coverage pass")
+    coverage_samples: int = Field(default=64, ge=1, le=4096, description="samples of the coverage pass")
     workers: int = Field(default=0, ge=0, description="0 = one per core")
 
 
@@ -93,18 +93,18 @@ PRESETS: dict[str, dict[str, Any]] = {
         "cameras": {"train": 40, "val": 4, "test": 12, "width": 128, "height": 128},
         "raytrace": {"spp": 128, "evaluation_spp": 256},
         "model": {"texture_size": 128, "width": 24, "depth": 3, "aggregator": "residual"},
-        "select": {"step1": {"epochs": 12}},
-        "finetune": {"step2": {"epochs": 30, "photometric": "l1"}},
+        "select": {"step1": {"epochs": 12, "texture_rate_scale": 10.0}},
+        "finetune": {"step2": {"epochs": 30, "texture_rate_scale": 10.0, "photometric": "l1", "perceptual_crop": 64}},
     },
     "standard": {
         "cameras": {"train": 100, "val": 10, "test": 50, "width": 384, "height": 384},
         "raytrace": {"spp": 256, "evaluation_spp": 512},
         "model": {"texture_size": 256, "width": 32, "depth": 4, "aggregator": "residual"},
-        "select": {"step1": {"epochs": 30}},
-        "finetune": {"step2": {"epochs": 60, "photometric": "l1"}},
+        "select": {"step1": {"epochs": 30, "texture_rate_scale": 10.0}},
+        "finetune": {"step2": {"epochs": 60, "texture_rate_scale": 10.0, "photometric": "l1", "perceptual_crop": 192}},
     },
-    # The paper's numbers: every default of the models above is the paper's.
-    "paper": {},
+    # The paper's numbers: every other default of the models above is the paper's.
+    "paper": {"select": {"step1": {"reward_scale": "raw", "q_target": "plain"}}},
 }
 
 

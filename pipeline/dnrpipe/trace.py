@@ -81,7 +81,7 @@ def trace_views(
     if all(is_made(task) for task in tasks):
         return tasks
     choice = choose_variant(settings.raytrace.variant)
-    console.say(f"ray tracing with Mitsuba {choice.variant} ({choice.reason})")
+    console.say(f"ray tracing with Mitsuba {choice.variant}")
     workers = 1 if choice.variant.startswith("cuda") else worker_count(settings.raytrace.workers)
 
     def book(task: dict[str, Any], result: dict[str, Any], count: int) -> CostRecord:

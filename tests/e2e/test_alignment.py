@@ -46,7 +46,8 @@ for name, data in json.loads(sys.stdin.read()).items():
     sensor = mi.load_dict(sensor_dict(mi, view))
     import drjit as dr
     y, x = np.mgrid[0:view.height, 0:view.width]
-    at = mi.Point2f(((x.ravel() + 0.5) / view.width).astype(np.float32), ((y.ravel() + 0.5) / view.height).astype(np.float32))
+    at = [((a.ravel() + 0.5) / n).astype(np.float32) for a, n in ((x, view.width), (y, view.height))]
+    at = mi.Point2f(at)
     ray, _ = sensor.sample_ray(0.0, 0.5, at, mi.Point2f(0.5, 0.5))
     si = scene.ray_intersect(ray)
     hit = np.array(si.is_valid())
@@ -59,7 +60,15 @@ for name, data in json.loads(sys.stdin.read()).items():
     position = image(si.p, 3)
     depth = np.where(hit, (position - view.position) @ forward, 0)
     shape = (view.height, view.width, -1)
-    np.savez(out / f"{name}.npz", mask=hit.reshape(shape[:2]), depth=depth.reshape(shape[:2]), uv=image(si.uv, 2).reshape(shape), normal=image(si.sh_frame.n, 3).reshape(shape), position=position.reshape(shape))
+    np.savez(
+        out / f"{name}.npz",
+        mask=hit.reshape(shape[:2]),
+        depth=depth.reshape(shape[:2]),
+        uv=image(si.uv, 2).reshape(shape),
+        normal=image(si.sh_frame.n, 3).reshape(shape),
+        # Cycles turns the shading normal to the camera where it hits a back face.
+        facing=np.sign((-direction * image(si.n, 3)).sum(-1)).reshape(shape[:2]),
+    )
 """
 
 
@@ -91,7 +100,7 @@ def _compare(workspace: Path, scratch: Path) -> dict[str, float]:
         # A ray that grazes an edge may hit either triangle; such pixels (< 0.1 %) show as a jump in depth.
         worst["depth"] = max(worst["depth"], float(np.quantile(relative, 0.999)))
         worst["uv"] = max(worst["uv"], float(np.quantile(np.abs(uv - mitsuba["uv"]).max(-1)[both], 0.999)))
-        cosine = np.clip((normal * mitsuba["normal"]).sum(-1)[both], -1, 1)
+        cosine = np.clip((normal * mitsuba["normal"]).sum(-1) * mitsuba["facing"], -1, 1)[both]
         worst["normal"] = max(worst["normal"], float(np.degrees(np.arccos(np.quantile(cosine, 0.01)))))
     print(worst)
     return worst

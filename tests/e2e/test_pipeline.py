@@ -101,9 +101,7 @@ def test_novel_views(tiny: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_killed_anywhere_and_run_again_gives_the_same(
-    stage: str, tiny: Path, tmp_path: Path, demo_blend: Path
-) -> None:
+def test_killed_anywhere_and_run_again_gives_the_same(stage: str, tiny: Path, tmp_path: Path, demo_blend: Path) -> None:
     """SIGKILL at random moments of each stage, then the rest: every pixel, weight and metric is the same."""
     expected = contents(tiny)
     seconds = json.loads((tiny / "manifest.json").read_text())["stages"]

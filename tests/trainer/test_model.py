@@ -98,7 +98,7 @@ def test_bfloat16_is_close_and_textures_stay_float32() -> None:
     batch = random_batch(32, 32)
     with torch.no_grad():
         exact = model(batch)
-        model.bfloat16 = True
+        model.use_bfloat16 = True
         coarse = model(batch)
     assert coarse.rgb.dtype == coarse.texture.dtype == torch.float32
     assert not torch.equal(exact.rgb, coarse.rgb)

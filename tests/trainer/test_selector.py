@@ -91,9 +91,9 @@ def test_epsilon_decays_from_start_to_end() -> None:
 
 def test_rewards() -> None:
     scale = RewardScale()
-    assert scale.relative(0.4) == 0.0 and scale.mean == pytest.approx(0.4)
-    assert scale.relative(0.2) == pytest.approx(0.5) and scale.mean == pytest.approx(0.39)
-    assert scale.relative(float("nan")) == 0.0 and scale.mean == pytest.approx(0.39)
+    assert scale.reward(0.4) == 0.0 and scale.mean == pytest.approx(0.4)
+    assert scale.reward(0.2) == pytest.approx(0.5) and scale.mean == pytest.approx(0.39)
+    assert scale.reward(float("nan")) == 0.0 and scale.mean == pytest.approx(0.39)
     assert reward_of("neg-loss", 0.5, None, None) == 0.5 and reward_of("pos-loss", 0.5, None, None) == -0.5
     assert reward_of("improvement", 0.0, 0.4, 0.3) == pytest.approx(0.25)
 

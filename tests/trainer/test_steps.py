@@ -161,9 +161,11 @@ def test_learning_rate_falls_exponentially() -> None:
     assert learning_rate(0, 1, 1e-3, 1e-4) == 1e-3
 
 
-def test_precision_setting() -> None:
+def test_precision_setting(monkeypatch: pytest.MonkeyPatch) -> None:
     assert decide_bfloat16("bfloat16", "cpu") and not decide_bfloat16("float32", "cpu")
-    assert decide_bfloat16("auto", "cpu") in (True, False)
+    for capabilities, expected in (({"avx512_bf16": True}, True), ({"amx_bf16": True}, True), ({"avx2": True}, False)):
+        monkeypatch.setattr(torch.cpu, "get_capabilities", lambda found=capabilities: found)
+        assert decide_bfloat16("auto", "cpu") is expected
 
 
 def _epoch(progress: Path) -> int:

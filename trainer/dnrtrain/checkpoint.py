@@ -142,5 +142,5 @@ def load_model(folder: Path, device: str | torch.device = "cpu") -> DNR:
     except (ValidationError, RuntimeError, KeyError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ContractError(f"{folder}: model does not fit this version ({reason}); train it again") from None
-    model.bfloat16 = bool(record.get("bfloat16", False))
+    model.use_bfloat16 = bool(record.get("bfloat16", False))
     return model.to(device).eval()

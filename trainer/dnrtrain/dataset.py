@@ -58,7 +58,7 @@ class Batch:
 
     def _map(self, function) -> Batch:  # type: ignore[no-untyped-def]
         values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Batch(**{k: None if v is None else function(v) for k, v in values.items()})
+        return Batch(**{k: None if v is None else function(v) for k, v in values.items()})  # pyright: ignore[reportArgumentType]
 
 
 @dataclass(frozen=True)

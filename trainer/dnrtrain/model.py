@@ -37,7 +37,7 @@ class DNR(nn.Module):
     def __init__(self, settings: ModelSettings, seed: int) -> None:
         super().__init__()
         self.settings = settings
-        self.bfloat16 = False
+        self.use_bfloat16 = False
         generator = torch.Generator().manual_seed(seed)
         # Module constructors fill weights from the global generator; they are all overwritten below.
         with torch.random.fork_rng(devices=[]):
@@ -49,11 +49,11 @@ class DNR(nn.Module):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, batch: Batch) -> Output:
-        texture = self.aggregator(batch, bfloat16=self.bfloat16)
+        texture = self.aggregator(batch, bfloat16=self.use_bfloat16)
         seen = texture
         if self.settings.spherical_harmonics:
             seen = apply_harmonics(texture, batch.view_dir)
-        rgb = self.renderer(torch.cat([seen, batch.mask], dim=1), bfloat16=self.bfloat16)
+        rgb = self.renderer(torch.cat([seen, batch.mask], dim=1), bfloat16=self.use_bfloat16)
         return Output(compose(rgb, batch.coverage), texture)
 
 

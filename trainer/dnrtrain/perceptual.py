@@ -46,6 +46,9 @@ LOSS_WEIGHTS = (1 / 16, 1 / 8, 1 / 4, 1.0)
 class Features(nn.Module):
     """Frozen convolutions of one network; ReLU outputs at the first ``taps`` tap points."""
 
+    shift: Tensor
+    scale: Tensor
+
     def __init__(self, network: Network, weights: Mapping[str, Tensor], taps: int = 5) -> None:
         super().__init__()
         self.network = network

@@ -37,12 +37,19 @@ class Step1Settings(Strict):
     epochs: int = Field(default=50, ge=1, description="one epoch is as many steps as there are candidate views")
     learning_rate: float = Field(default=1e-3, gt=0)
     learning_rate_end: float = Field(default=1e-4, gt=0)
+    texture_rate_scale: float = Field(default=1.0, gt=0, description="learning rate of texels over the networks'")
     weight_rl: float = Field(default=0.1, ge=0, description="lambda_RL")
     weight_dnr: float = Field(default=1.0, ge=0, description="lambda_DNRc")
     gamma: float = Field(default=0.99, ge=0, le=1, description="discount factor")
     epsilon_start: float = Field(default=0.9, ge=0, le=1)
     epsilon_end: float = Field(default=0.05, ge=0, le=1)
     reward: Literal["neg-loss", "pos-loss", "improvement"] = "neg-loss"
+    reward_scale: Literal["relative", "raw"] = Field(
+        default="relative", description="relative: loss rewards over the running mean loss; raw: the paper's"
+    )
+    q_target: Literal["double", "plain"] = Field(
+        default="double", description="double: double Q-learning, averaged target network; plain: equation 3"
+    )
     embedding: int = Field(default=64, ge=4, description="width of camera embedding and hidden vector")
     precision: Literal["auto", "float32", "bfloat16"] = Field(
         default="auto", description="auto: bfloat16 where it is fast"
@@ -68,6 +75,7 @@ class Step2Settings(Strict):
     batch: int = Field(default=1, ge=1, description="views per optimiser step")
     learning_rate: float = Field(default=1e-3, gt=0)
     learning_rate_end: float = Field(default=1e-4, gt=0)
+    texture_rate_scale: float = Field(default=1.0, gt=0, description="learning rate of texels over the networks'")
     photometric: Literal["l1", "mse"] = "mse"
     augment: bool = Field(default=True, description="random flips and quarter turns")
     precision: Literal["auto", "float32", "bfloat16"] = Field(

@@ -115,12 +115,12 @@ class _Step1:
         if policy == "rl":
             shape = (len(views), model.texture_channels, settings.embedding, seed + 1)
             self.agent, self.slow = QNetwork(*shape).to(device), QNetwork(*shape).to(device)
-        self.adam_dnr = adam([self.dnr], settings.learning_rate, device)
+        self.adam_dnr = adam([self.dnr], settings.learning_rate, device, settings.texture_rate_scale)
         self.adam_agent = adam([self.agent], settings.learning_rate, device) if self.agent else None
         self.probes: list[int] = []
         if self.agent and settings.reward == "improvement":
             self.probes = FarthestPolicy().choose(self.cameras, min(PROBES, len(views)), seed)
-        self.scale = RewardScale()
+        self.scale = RewardScale(raw=settings.reward_scale == "raw")
         self.history: list[dict] = []
         self.book = EpochBook()
         self.step = 0
@@ -149,7 +149,7 @@ class _Step1:
             "seed": self.seed,
             "selected": names,
             "details": details,
-            "bfloat16": self.dnr.bfloat16,
+            "bfloat16": self.dnr.use_bfloat16,
             "history": self.history,
         }
         checkpoint.save_model(self.folder, self.dnr, info)
@@ -217,7 +217,7 @@ class _Step1:
         selected = torch.zeros(len(self.views), dtype=torch.bool, device=self.device)
         view = int(random.integers(len(self.views)))
         loss, texture = self._train_view(view)
-        self.scale.relative(loss)
+        self.scale.reward(loss)
         selected[view] = True
         probe = self._probe_loss()
         for taken in range(1, self.budget):
@@ -225,12 +225,13 @@ class _Step1:
             view = epsilon_greedy(values.detach(), selected, epsilon, random)
             loss, texture = self._train_view(view)
             after = self._probe_loss()
-            reward = reward_of(s.reward, self.scale.relative(loss), probe, after)
+            reward = reward_of(s.reward, self.scale.reward(loss), probe, after)
             probe = after
             selected = selected.clone()
             selected[view] = True
             terminal = taken == self.budget - 1
-            target = td_target(agent, self.slow, reward, s.gamma, selected, agent.encode(texture), terminal)
+            slow = self.slow if s.q_target == "double" else agent
+            target = td_target(agent, slow, reward, s.gamma, selected, agent.encode(texture), terminal)
             loss_rl = (values[view] - target).square()
             if not guarded_step(self.adam_agent, s.weight_rl * loss_rl, self._rate(self.step - 1)):
                 self.book.skipped += 1
@@ -283,7 +284,7 @@ class _Step1:
         info = {
             "run": self.key,
             "epoch": epoch,
-            "bfloat16": self.dnr.bfloat16,
+            "bfloat16": self.dnr.use_bfloat16,
             "reward_mean": self.scale.mean,
             "history": self.history,
         }
@@ -293,11 +294,11 @@ class _Step1:
         """Load the state of an interrupted run of the same key; -> epochs done. Else start afresh."""
         saved = checkpoint.load_state(self.folder)
         if saved is None or saved.info.get("run") != self.key:
-            self.dnr.bfloat16 = decide_bfloat16(self.settings.precision, self.device)
+            self.dnr.use_bfloat16 = decide_bfloat16(self.settings.precision, self.device)
             self._save(0)
             return 0
-        self.dnr.bfloat16, self.history = saved.info["bfloat16"], saved.info["history"]
-        self.scale = RewardScale(saved.info["reward_mean"])
+        self.dnr.use_bfloat16, self.history = saved.info["bfloat16"], saved.info["history"]
+        self.scale = RewardScale(saved.info["reward_mean"], raw=self.settings.reward_scale == "raw")
         checkpoint.load_module(self.dnr, checkpoint.unprefixed("dnr", saved.tensors))
         checkpoint.restore_optimiser(self.adam_dnr, checkpoint.unprefixed("adam_dnr", saved.tensors))
         if self.agent is not None and self.slow is not None and self.adam_agent is not None:

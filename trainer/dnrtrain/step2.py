@@ -95,7 +95,7 @@ class _Step2:
         ]  # fmt: skip
         self.key = run_key(fingerprint, views, parts)
         self.steps_per_epoch = -(-len(views) // settings.batch)
-        self.optimiser = adam([self.dnr], settings.learning_rate, device)
+        self.optimiser = adam([self.dnr], settings.learning_rate, device, settings.texture_rate_scale)
         self.history: list[dict] = []
 
     def events(self) -> Iterator[Event]:
@@ -118,7 +118,7 @@ class _Step2:
             "seed": self.seed,
             "views": list(self.views.names),
             "perceptual": self.loss.perceptual is not None,
-            "bfloat16": self.dnr.bfloat16,
+            "bfloat16": self.dnr.use_bfloat16,
             "history": self.history,
         }
         checkpoint.save_model(self.folder, self.dnr, info)
@@ -136,7 +136,7 @@ class _Step2:
                 batch = batch.augment(int(random.integers(DIHEDRAL_ORDER)))
             assert batch.target is not None
             rate = learning_rate(epoch * self.steps_per_epoch + step, total, s.learning_rate, s.learning_rate_end)
-            loss, terms = self.loss(self.dnr(batch), batch.target, random, bfloat16=self.dnr.bfloat16)
+            loss, terms = self.loss(self.dnr(batch), batch.target, random, bfloat16=self.dnr.use_bfloat16)
             book.count(guarded_step(self.optimiser, loss, rate))
             values = torch.stack([loss, *terms.values()]).detach().tolist()
             book.add(**dict(zip(["total", *terms], values, strict=True)))
@@ -160,7 +160,7 @@ class _Step2:
     def _save(self, epoch: int) -> None:
         tensors = checkpoint.prefixed("dnr", self.dnr.state_dict())
         tensors |= checkpoint.prefixed("adam", checkpoint.optimiser_tensors(self.optimiser))
-        info = {"run": self.key, "epoch": epoch, "bfloat16": self.dnr.bfloat16, "history": self.history}
+        info = {"run": self.key, "epoch": epoch, "bfloat16": self.dnr.use_bfloat16, "history": self.history}
         checkpoint.save_state(self.folder, tensors, info)
 
     def _restore(self) -> int:
@@ -168,10 +168,10 @@ class _Step2:
         saved = checkpoint.load_state(self.folder)
         if saved is None or saved.info.get("run") != self.key:
             if self.settings.precision != "auto":  # auto: as step 1 decided
-                self.dnr.bfloat16 = decide_bfloat16(self.settings.precision, self.device)
+                self.dnr.use_bfloat16 = decide_bfloat16(self.settings.precision, self.device)
             self._save(0)
             return 0
-        self.dnr.bfloat16, self.history = saved.info["bfloat16"], saved.info["history"]
+        self.dnr.use_bfloat16, self.history = saved.info["bfloat16"], saved.info["history"]
         checkpoint.load_module(self.dnr, checkpoint.unprefixed("dnr", saved.tensors))
         checkpoint.restore_optimiser(self.optimiser, checkpoint.unprefixed("adam", saved.tensors))
         return int(saved.info["epoch"])

@@ -135,13 +135,6 @@ def _texture_coordinates(mesh: FrozenMesh, converted: Converted, findings: Findi
 
 
 def _note_emission(mesh: FrozenMesh, converted: Converted, balance: float, findings: Findings) -> None:
-    findings.add(
-        "approximated",
-        "emissive mesh",
-        "lights the scene, but hide_emitters hides the surface itself from the camera",
-        object=mesh.object_name,
-        material=converted.name,
-    )
     if balance >= OPEN_MESH:
         findings.add(
             "approximated",

@@ -210,13 +210,13 @@ class Evaluator:
             if isinstance(value, Textured):
                 self.note("approximated", "textured Mapping node", "the mean is used")
             parts[name] = value.mean.astype(np.float64)
-        rotation = np.array(Euler(parts["Rotation"]).to_matrix())
+        rotation = np.array(Euler(parts["Rotation"]).to_matrix(), dtype=np.float64)
         size = parts["Scale"]
         if node.vector_type == "TEXTURE":
             if (np.abs(size) < 1e-12).any():
                 return None
             linear = np.diag(1 / size) @ rotation.T
-            shift = -linear @ parts["Location"]
+            shift = -(linear @ parts["Location"])
         elif node.vector_type in {"POINT", "VECTOR"}:
             linear = rotation @ np.diag(size)
             shift = parts["Location"] if node.vector_type == "POINT" else np.zeros(3)

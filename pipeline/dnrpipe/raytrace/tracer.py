@@ -19,6 +19,8 @@ import numpy as np
 from dnrtrain.contract import View
 from dnrtrain.exr import write_exr
 
+from .visibility import camera_integrator
+
 # Samples per kernel launch x pixels: bounds the wavefront's memory (about 1 GiB on the CPU).
 MAX_WAVEFRONT = 4_000_000
 REPAIR_ROUNDS = 3
@@ -53,14 +55,7 @@ class Worker:
         spp, seed = int(task["spp"]), int(task["seed"])
         started, cpu = time.monotonic(), time.process_time()
         sensor = mi.load_dict(sensor_dict(mi, view))
-        integrator = mi.load_dict(
-            {
-                "type": "path",
-                "max_depth": int(task["max_depth"]),
-                "rr_depth": max(5, int(task["max_depth"]) // 2),
-                "hide_emitters": True,
-            }
-        )
+        integrator, integrator_name = camera_integrator(mi, self.scene, int(task["max_depth"]))
         half_a, done_a = self._render(sensor, integrator, view, (spp + 1) // 2, seed * 2)
         half_b, done_b = self._render(sensor, integrator, view, spp // 2, seed * 2 + 1) if spp > 1 else (half_a, 0)
         half_a, half_b, repaired, masked = self._repair(
@@ -73,7 +68,7 @@ class Worker:
             "spp": total,
             "max_depth": int(task["max_depth"]),
             "seed": seed,
-            "integrator": "path",
+            "integrator": integrator_name,
             "variant": self.variant,
             "seconds": time.monotonic() - started,
             "cpu_seconds": time.process_time() - cpu,

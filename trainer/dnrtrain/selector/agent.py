@@ -41,11 +41,11 @@ def td_target(
 ) -> float:
     """q_t of equation 3: r_{t+1} + γ max_a Q(s_{t+1}, a), or the reward alone at the episode's end.
 
-    The maximum runs over views that are not selected in s_{t+1}: the others are no actions. Taken
-    literally, with one network for both sides, it diverges here (values of +8 for rewards of −0.001:
-    the maximum feeds on its own errors), so the maximising action comes from ``network`` and its value
-    from ``slow``, an exponential average of it (double Q-learning, van Hasselt et al. 2016; the average
-    is MVSelect's).
+    The maximum runs over views that are not selected in s_{t+1}: the others are no actions. With ``slow``
+    the same as ``network`` this is the equation, literally. So taken it diverges here (values of +8 for
+    rewards of −0.001: the maximum feeds on its own errors), so by default the maximising action comes from
+    ``network`` and its value from ``slow``, an exponential average of it (double Q-learning, van Hasselt et
+    al. 2016; the average is MVSelect's).
     """
     if terminal:
         return reward
@@ -71,18 +71,20 @@ class RewardScale:
 
     −L shrinks fifty-fold while the DNR converges; raw, it vanishes below the network's own noise. So
     neg-loss is (mean − L) / mean: the same ranking of episodes (all have equal length, and the mean is
-    common to all views), but of order one throughout training.
+    common to all views), but of order one throughout training. ``raw`` keeps −L, the paper's.
     """
 
     KEEP = 0.95
 
-    def __init__(self, mean: float | None = None) -> None:
-        self.mean = mean
+    def __init__(self, mean: float | None = None, *, raw: bool = False) -> None:
+        self.mean, self.raw = mean, raw
 
-    def relative(self, loss: float) -> float:
+    def reward(self, loss: float) -> float:
         """(mean − loss) / mean with the mean before this loss; then takes it in. Non-finite losses are 0."""
         if not np.isfinite(loss):
             return 0.0
+        if self.raw:
+            return -loss
         mean = loss if self.mean is None else self.mean
         self.mean = self.KEEP * mean + (1.0 - self.KEEP) * loss
         return (mean - loss) / max(mean, 1e-8)
