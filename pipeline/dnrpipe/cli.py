@@ -5,12 +5,10 @@ Exit codes: 0 done; 1 some views failed; 2 bad input (one line says what, where,
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import sys
 from collections.abc import Callable
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,9 +18,7 @@ from . import __version__
 from .errors import UserError
 
 if TYPE_CHECKING:
-    from .console import Console
-    from .settings import Settings
-    from .workspace import Workspace
+    from .session import Session
 
 
 class _Group(click.Group):
@@ -262,10 +258,11 @@ def status(workspace: str | None, as_json: bool) -> None:
     """
     from . import stages
     from .console import clock
+    from .session import resolve_settings
     from .workspace import Workspace, find_workspace
 
     found = Workspace.open(find_workspace(workspace))
-    rows = stages.status(found, _settings(found, {}, None))
+    rows = stages.status(found, resolve_settings(found, {}, None))
     if as_json:
         click.echo(json.dumps({"workspace": str(found.root), "stages": rows}, indent=2))
         return
@@ -374,157 +371,16 @@ def weights(offline: bool, as_json: bool) -> None:
     )
 
 
-class _Session:
-    """One locked workspace with its settings, for the length of a command."""
-
-    def __init__(self, command: str, options: dict[str, Any], scene: Path | None, overrides: dict[str, Any]) -> None:
-        self.command, self.options, self.scene, self.overrides = command, options, scene, overrides
-        self.stack = ExitStack()
-        self.answers: dict[str, Any] = {}
-
-    def __enter__(self) -> _Session:
-        try:
-            return self._open()
-        except BaseException:
-            self.stack.close()
-            raise
-
-    def _open(self) -> _Session:
-        from .console import Console
-        from .settings import merge, parse_assignment
-        from .workspace import Workspace, find_workspace, locked
-
-        self.console: Console = Console(json_mode=self.options["as_json"], quiet=self.options["quiet"])
-        overrides = self.overrides
-        for text in self.options["assignments"]:
-            overrides = merge(overrides, parse_assignment(text))
-        preset = self.options["preset"]
-        if self.scene is not None:
-            source = _source(self.scene)
-            root = _root_for(self.scene, self.options["workspace"])
-            # Bad settings are refused before a folder is made.
-            stored = Workspace.open(root) if (root / "manifest.json").exists() else None
-            planned = _resolve(root, preset or (stored.manifest.preset if stored else None), stored, overrides)
-            self._check_budget(planned, stored)
-            self.stack.enter_context(locked(root, self.command))
-            self.workspace: Workspace = Workspace.create(root, source)
-        else:
-            root = find_workspace(self.options["workspace"])
-            Workspace.open(root)
-            self.stack.enter_context(locked(root, self.command))
-            self.workspace = Workspace.open(root)
-        self.settings: Settings = _settings(self.workspace, overrides, preset)
-        manifest = self.workspace.manifest
-        self._check_budget(self.settings, self.workspace)
-        manifest.preset = preset or manifest.preset
-        manifest.overrides = merge(manifest.overrides, overrides)
-        return self
-
-    def __exit__(self, *exception: Any) -> None:
-        self.stack.__exit__(*exception)
-
-    def stages(self, *names: str) -> None:
-        """Run stages in order; flags are remembered once the first one's inputs are known to be there."""
-        from .stages import STAGES, require_inputs, run_stage
-
-        require_inputs(STAGES[names[0]], self.workspace, self.settings)
-        self.workspace.manifest.settings = self.settings.model_dump(mode="json")
-        self.workspace.save()
-        if "prepare" in names:
-            size = f"{self.settings.cameras.width}x{self.settings.cameras.height}"
-            self.console.say(f"workspace {self.workspace.root}, preset {self.settings.preset} ({size})")
-        for name in names:
-            self.answers[name] = run_stage(
-                name, self.workspace, self.settings, self.console, force=self.options["force"]
-            )
-        if "report" not in self.command and self.command != "run":
-            self.console.result({"workspace": str(self.workspace.root), **self.answers})
-
-    def render(
-        self,
-        orbit: int,
-        elevation: float,
-        camera_file: Path | None,
-        frames: str,
-        movie: str,
-        resolution: int | None,
-    ) -> None:
-        from dnrtrain.contract import parse_transforms
-
-        from .cameras import orbit_views
-        from .novel import render_novel
-        from .prepare import read_summary
-        from .stages import STAGES, require_inputs
-
-        require_inputs(STAGES["evaluate"], self.workspace, self.settings)
-        cameras = self.settings.cameras
-        if camera_file is not None:
-            views = parse_transforms(camera_file, (cameras.width, cameras.height))
-            name = camera_file.stem
-        else:
-            if resolution is not None:
-                cameras = cameras.model_copy(update={"width": resolution, "height": resolution})
-            views = orbit_views(read_summary(self.workspace), cameras, orbit, elevation)
-            name = f"orbit-{orbit}"
-        answer = render_novel(self.workspace, self.settings, self.console, views, name=name, frames=frames, movie=movie)
-        self.console.say(f"{answer['frames']} frames, {answer['neural_ms']:.1f} ms each for the network")
-        self.console.say(answer["movie"] or answer["folder"])
-        self.console.result(answer)
-
-    def report(self) -> None:
-        from .report import build_report
-
-        path = build_report(self.workspace.root)
-        self.console.say(f"report: {path}")
-        self.console.result({"workspace": str(self.workspace.root), **self.answers, "report": str(path)})
-
-    def _check_budget(self, settings: Settings, workspace: Workspace | None) -> None:
-        """Refuse a budget above the candidates before any work is done or folder made."""
-        from .training import check_budget
-
-        record = workspace.manifest.stages.get("prepare") if workspace else None
-        if self.command == "run" and settings.cameras.source in ("auto", "dome", "sphere"):
-            check_budget(settings.select.budget, settings.cameras.train)
-        elif self.command == "select" and record is not None:
-            check_budget(settings.select.budget, record.detail["views"]["train"])
-
-
 def _session(
     command: str,
     options: dict[str, Any],
     *,
     scene: Path | None = None,
     overrides: dict[str, Any] | None = None,
-) -> _Session:
-    return _Session(command, options, scene, overrides or {})
+) -> Session:
+    from .session import Session
 
-
-def _settings(workspace: Workspace, overrides: dict[str, Any], preset: str | None) -> Settings:
-    return _resolve(workspace.root, preset or workspace.manifest.preset, workspace, overrides)
-
-
-def _resolve(root: Path, preset: str | None, stored: Workspace | None, overrides: dict[str, Any]) -> Settings:
-    """preset < ./dnrpipe.toml < workspace's dnrpipe.toml < environment < flags given before < flags."""
-    from .settings import merge, resolve
-
-    files = [path for path in (Path("dnrpipe.toml"), root / "dnrpipe.toml") if path.is_file()]
-    flags = merge(stored.manifest.overrides if stored else {}, overrides)
-    return resolve(preset, flags, toml_files=files)
-
-
-def _source(scene: Path) -> Any:
-    from .workspace import Source, file_sha256
-
-    if scene.is_dir():
-        raise UserError(f"{scene}: is a folder; name the scene file in it")
-    if not scene.exists():
-        raise UserError(f"{scene}: no such file")
-    return Source(path=str(scene.resolve()), sha256=file_sha256(scene))
-
-
-def _root_for(scene: Path, explicit: str | None) -> Path:
-    named = explicit or os.environ.get("DNRPIPE_WORKSPACE")
-    return Path(named) if named else Path(f"{scene.stem}.dnr")
+    return Session(command, options, scene, overrides or {})
 
 
 def _camera_overrides(options: dict[str, Any]) -> dict[str, Any]:
@@ -572,59 +428,13 @@ def _main(arguments: list[str] | None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # a reader such as `head` left: no noise at exit
     except Exception as error:
-        explained = _explain(error)
+        from .failures import explain
+
+        explained = explain(error)
         if explained is None:
             raise
         return _fail(*explained)
     return 0
-
-
-def _explain(error: Exception) -> tuple[str, int] | None:
-    """(one line, exit code) for a failure that we expect; None for a bug, which keeps its traceback."""
-    from dnrtrain.contract import ContractError
-
-    from .tasks import TasksFailed
-
-    if isinstance(error, UserError | ContractError):
-        return str(error), 2
-    if isinstance(error, TasksFailed):
-        return str(error), 1
-    if isinstance(error, click.UsageError):
-        command = error.ctx.command_path if error.ctx else "dnrpipe"
-        return f"{error.format_message()} See `{command} --help`.", 2
-    if isinstance(error, click.ClickException):
-        return error.format_message(), 2
-    if isinstance(error, ModuleNotFoundError):
-        module = (error.name or "").split(".")[0]
-        if module in _EXTRAS:
-            return f"{module} is not installed; run `pip install 'dnrpipe[{_EXTRAS[module]}]'`", 2
-    if isinstance(error, OSError):
-        return _explain_os(error)
-    return None
-
-
-def _explain_os(error: OSError) -> tuple[str, int] | None:
-    where = error.filename or "the workspace"
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return f"{where}: the disk is full; free some space and run the same command to go on", 2
-    if error.errno in (errno.EACCES, errno.EROFS, errno.EPERM):
-        return f"{where}: cannot be written (read-only or not yours); choose another folder with -w", 2
-    if error.errno in (errno.ENOTDIR, errno.EISDIR):
-        return f"{where}: {os.strerror(error.errno).lower()}", 2
-    return None
-
-
-_EXTRAS = {
-    "torch": "train",
-    "bpy": "render",
-    "mitsuba": "render",
-    "drjit": "render",
-    "flip_evaluator": "render",
-    "imageio_ffmpeg": "render",
-    "PIL": "render",
-    "jinja2": "render",
-    "matplotlib": "render",
-}
 
 
 def _fail(message: str, code: int) -> int:

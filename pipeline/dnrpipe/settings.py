@@ -94,7 +94,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "raytrace": {"spp": 128, "evaluation_spp": 256},
         "model": {"texture_size": 128, "width": 24, "depth": 3, "aggregator": "residual"},
         "select": {"step1": {"epochs": 12, "texture_rate_scale": 10.0}},
-        "finetune": {"step2": {"epochs": 30, "texture_rate_scale": 10.0, "photometric": "l1", "perceptual_crop": 64}},
+        "finetune": {"step2": {"epochs": 50, "texture_rate_scale": 10.0, "photometric": "l1", "perceptual_crop": 64}},
     },
     "standard": {
         "cameras": {"train": 100, "val": 10, "test": 50, "width": 384, "height": 384},

@@ -19,8 +19,8 @@ SLOWEST_FRAME = 1.0  # seconds per 256² frame (a GPU: milliseconds); beyond it 
 def choose_raster(requested: str) -> tuple[str, str]:
     """The engine to rasterise with, and why. ``requested``: auto, eevee, workbench or cycles-direct.
 
-    auto is EEVEE if it survives a trial and a 256² frame takes at most 5 s, else Cycles with direct
-    light only. Raises UserError when a requested engine does not run here, or is unknown.
+    auto is EEVEE if it survives a trial and a 256² frame takes at most SLOWEST_FRAME, else Cycles with
+    direct light only. Raises UserError when a requested engine does not run here, or is unknown.
     """
     if requested == "cycles-direct":
         return requested, "requested"
