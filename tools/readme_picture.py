@@ -1,6 +1,6 @@
 """Make docs/images/demo.png from the demo's workspace: ground truth, neural rendering and error of three test views.
 
-    python tools/readme_picture.py demo-output/demo.dnr docs/images/demo.png
+python tools/readme_picture.py demo-output/demo.dnr docs/images/demo.png
 """
 
 from __future__ import annotations

@@ -1,0 +1,73 @@
+"""What `make demo` promises: the demo scene at the draft preset reaches its quality, and costs nothing twice."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from importlib import util
+from pathlib import Path
+
+import numpy as np
+import pytest
+from e2e_harness import command, image
+
+pytestmark = [pytest.mark.slow, pytest.mark.e2e]
+
+
+def _dnrpipe(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(command(*arguments), cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory, demo_blend: Path) -> Path:
+    folder = tmp_path_factory.mktemp("demo")
+    _dnrpipe("run", str(demo_blend), "--budget", "25", "--quiet", folder=folder)
+    return folder / "demo.dnr"
+
+
+@pytest.mark.timeout(1200)
+def test_held_out_quality(demo: Path) -> None:
+    metrics = json.loads((demo / "evaluation" / "metrics.json").read_text())
+    assert len(metrics["views"]) == 12
+    mean = metrics["mean"]
+    print({key: round(value, 4) for key, value in mean.items() if value is not None})
+    assert mean["psnr"] >= 25.0
+    assert mean["ssim"] >= 0.88
+    # A picture of the scene, not of a mean colour: it beats the best constant inside the mask by far.
+    for view in metrics["views"]:
+        truth = image(demo / "evaluation" / f"{view['name']}.truth.png")
+        prediction = image(demo / "evaluation" / f"{view['name']}.prediction.png")
+        inside = (truth < 0.99).any(-1)
+        constant = ((truth[inside] - truth[inside].mean(0)) ** 2).mean()
+        assert ((truth - prediction)[inside] ** 2).mean() < 0.35 * constant
+
+
+def test_again_does_nothing(demo: Path, demo_blend: Path) -> None:
+    started = time.monotonic()
+    done = _dnrpipe("run", str(demo_blend), "--budget", "25", folder=demo.parent)
+    assert time.monotonic() - started < 10
+    assert done.stdout.count("up to date") == 5
+
+
+def test_the_report_draws_in_a_browser(demo: Path, tmp_path: Path) -> None:
+    spec = util.spec_from_file_location("browser", Path(__file__).parents[1] / "browser.py")
+    assert spec and spec.loader
+    browser = util.module_from_spec(spec)
+    sys.modules["browser"] = browser
+    spec.loader.exec_module(browser)
+    if browser.find_chromium() is None:
+        pytest.skip("no Chromium is installed")
+    page = demo / "report" / "report.html"
+    text = page.read_text(encoding="utf-8")
+    assert "http://" not in text.replace("http://www.w3.org", "")
+    assert "https://" not in text
+    browser.screenshot(page, tmp_path / "report.png", width=1200, height=1600)
+    picture = image(tmp_path / "report.png")[..., :3]
+    # Colourful: the scene's pictures are on it, not only text on a ground.
+    assert (np.ptp(picture, axis=-1) > 0.2).mean() > 0.01
+    mean = json.loads((demo / "evaluation" / "metrics.json").read_text())["mean"]
+    assert f"{mean['psnr']:.2f}" in browser.dump_dom(page)
