@@ -33,6 +33,7 @@ def ledger_lines(workspace: Path) -> list[str]:
 def precision_line() -> str:
     """Training step of the draft network, float32 over bfloat16, alternating in one run."""
     import torch
+
     from dnrtrain.renderer import UNet
 
     torch.manual_seed(0)
