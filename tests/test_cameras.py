@@ -160,6 +160,35 @@ def test_files_that_are_no_camera_files(tmp_path: Path, text: str) -> None:
         parse_transforms(path)
 
 
+def test_camera_files_must_have_one_size_and_square_pixels(tmp_path: Path) -> None:
+    frame = {"transform_matrix": np.eye(4).tolist(), "fl_x": 50.0, "w": 64, "h": 64}
+    sizes = _transforms(tmp_path, [frame, frame | {"w": 32}])
+    with pytest.raises(UserError, match="several image sizes"):
+        make_cameras(SUMMARY, CameraSettings(source=str(sizes)))
+    stretched = _transforms(tmp_path, [frame | {"fl_y": 60.0}])
+    with pytest.raises(UserError, match="square pixels"):
+        make_cameras(SUMMARY, CameraSettings(source=str(stretched)))
+
+
+def test_names_are_safe_and_unique() -> None:
+    cameras = [_camera(name=name) for name in ("Cam 1", "Cam.1", "Cam_1", "Камера")]
+    views = make_cameras(SUMMARY | {"cameras": cameras}, CameraSettings(source="scene", test=0, val=0))["train"]
+    names = [view.name for view in views]
+    assert names == ["Cam_1", "Cam.1", "Cam_1-2", "______"]
+
+
+def test_a_split_may_be_empty(tmp_path: Path) -> None:
+    write_cameras(tmp_path / "val.json", [], "val")
+    assert read_cameras(tmp_path / "val.json") == []
+
+
+@pytest.mark.parametrize("frame", ["text", 3, None, {"file_path": "a"}])
+def test_frames_that_are_no_frames(tmp_path: Path, frame: object) -> None:
+    path = _transforms(tmp_path, [frame], fl_x=50, w=64, h=64)  # type: ignore[list-item]
+    with pytest.raises(ContractError, match="frame 0: has no 'transform_matrix'"):
+        parse_transforms(path)
+
+
 def test_ray_directions_point_at_their_pixels() -> None:
     view = make_cameras(SUMMARY, CameraSettings(train=1, width=20, height=10))["train"][0]
     rays = view.ray_directions()

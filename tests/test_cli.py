@@ -113,6 +113,57 @@ def test_a_folder_that_is_no_workspace_is_left_alone(tmp_path: Path) -> None:
     assert (tmp_path / "a.dnr" / "precious.txt").read_text() == "keep me"
 
 
+def test_a_workspace_of_another_scene_with_the_same_name_is_not_taken_over(tmp_path: Path) -> None:
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "scene.blend").write_bytes(b"BLENDER-v300")
+    Workspace.create(tmp_path / "scene.dnr", Source(path=str(tmp_path / "a" / "scene.blend"), sha256="0"))
+    _refused(_run("prepare", "b/scene.blend", folder=tmp_path), "belongs to", "a/scene.blend", "-w")
+
+
+def test_a_refused_scene_leaves_no_workspace(tmp_path: Path) -> None:
+    (tmp_path / "a.blend").write_text("not a scene")
+    _refused(_run("prepare", "a.blend", folder=tmp_path), "a.blend", "not a Blender file")
+    assert not (tmp_path / "a.dnr").exists()
+
+
+def test_a_refused_scene_leaves_an_older_workspace_as_it_was(workspace: Workspace) -> None:
+    workspace.finish_stage("prepare", fingerprint="f", output="o", seconds=1.0, detail={"views": {"train": 3}})
+    before = (workspace.root / "manifest.json").read_text()
+    bad = workspace.root.parent / "bad.blend"
+    bad.write_text("not a scene")
+    _refused(_run("prepare", "bad.blend", "-w", "scene.dnr", folder=bad.parent), "not a Blender file")
+    assert (workspace.root / "manifest.json").read_text() == before
+
+
+def test_preparing_again_mends_a_damaged_manifest(workspace: Workspace) -> None:
+    (workspace.root / "manifest.json").write_text("{")
+    done = _run("prepare", "scene.blend", folder=workspace.root.parent)  # goes on to open the scene, which is none
+    assert "manifest" not in done.stderr
+    assert (workspace.root / "manifest.json.damaged").exists()
+    assert Workspace.open(workspace.root).manifest.source.path.endswith("scene.blend")
+
+
+def test_nan_in_a_camera_file_is_refused_before_any_work(tmp_path: Path) -> None:
+    (tmp_path / "a.blend").write_bytes(b"BLENDER-v300")
+    frame = {"transform_matrix": [[float("nan")] * 4] * 4, "fl_x": 50.0, "w": 64, "h": 64}
+    (tmp_path / "nan.json").write_text(json.dumps({"frames": [frame]}))
+    _refused(_run("prepare", "a.blend", "--cameras", "nan.json", folder=tmp_path), "nan.json", "NaN")
+    assert not (tmp_path / "a.dnr").exists()
+
+
+def test_work_done_without_weights_is_stale_once_they_are_here(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    from dnrpipe.stages import weights_cached
+
+    monkeypatch.setenv("DNRPIPE_CACHE", str(tmp_path / "cache"))
+    assert not weights_cached()
+    (tmp_path / "cache" / "weights").mkdir(parents=True)
+    (tmp_path / "cache" / "weights" / "weights.json").write_text("{}")
+    assert weights_cached()
+
+
 def test_broken_camera_file(tmp_path: Path) -> None:
     (tmp_path / "a.blend").write_bytes(b"BLENDER-v300")
     _refused(_run("prepare", "a.blend", "--cameras", "none.json", folder=tmp_path), "none.json")

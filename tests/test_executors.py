@@ -93,6 +93,22 @@ def test_a_module_that_cannot_be_imported_fails_every_task(tmp_path: Path) -> No
     assert "No module named" in (tmp_path / "log.txt").read_text()
 
 
+def test_a_worker_that_cannot_be_started_is_an_error_and_not_a_hang(module: str, tmp_path: Path) -> None:
+    (tmp_path / "log.txt").mkdir()
+    results, _ = _run(module, tmp_path, ["ok", "ok"])
+    assert all("log.txt" in (r.error or "") and r.died for r in results)
+
+
+def test_a_worker_that_cannot_be_made_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code = "class Worker:\n    def __init__(self, common):\n        raise ValueError('broken bundle')\n"
+    (tmp_path / "broken_worker.py").write_text(code)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    results, retries = _run("broken_worker", tmp_path, ["ok"])
+    assert results[0].error == "broken bundle"
+    assert not results[0].died
+    assert not retries
+
+
 def test_closing_the_iterator_kills_the_workers(module: str, tmp_path: Path) -> None:
     tasks = [{"kind": "ok", "n": 0}, {"kind": "hang", "n": 1}]
     outcomes = run_tasks(module, {"folder": str(tmp_path)}, tasks, workers=2, log=tmp_path / "log.txt")

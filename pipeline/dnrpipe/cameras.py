@@ -15,13 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from dnrtrain.contract import SPLITS, ContractError, View, parse_transforms
+from dnrtrain.contract import SPLITS, ContractError, View, file_name, parse_transforms, unique_names
 
 from .errors import UserError
 from .settings import CameraSettings
 
+KEYWORDS = ("auto", "dome", "sphere", "scene", "animation")
 DEFAULT_LENS = 50.0  # mm on a 36 mm sensor: Blender's default camera
 DEFAULT_SENSOR = 36.0
+SQUARE_PIXELS = 1e-4  # largest relative difference of fl_x and fl_y that counts as square
 LOWEST, HIGHEST = math.radians(5.0), math.radians(85.0)
 # Splits drawn from different streams, so that asking for more of one leaves the others as they were.
 _STREAM = {"train": 0, "val": 1, "test": 2}
@@ -48,17 +50,36 @@ def make_cameras(summary: dict[str, Any], settings: CameraSettings) -> dict[str,
         cameras = [c for c in summary["cameras"] if c["type"] == "PERSP"]
         if not cameras:
             raise UserError("--cameras scene: the scene has no perspective camera; use --cameras dome")
-        return split_views([_scene_view(c, settings) for c in cameras], settings)
+        return split_views(unique_names([_scene_view(c, settings) for c in cameras]), settings)
     if source == "animation":
         frames = [f for f in summary["animation"] if f.get("type", "PERSP") == "PERSP"]
         if len(frames) < 2:
             raise UserError("--cameras animation: the active camera does not move; use --cameras scene or dome")
         return split_views([_scene_view(f, settings) for f in frames], settings)
+    return split_views(read_camera_file(Path(source), settings), settings)
+
+
+def read_camera_file(path: Path, settings: CameraSettings) -> list[View]:
+    """Views of a NeRF ``transforms.json`` that the whole pipeline can use.
+
+    Raises UserError: broken, several image sizes (the trainer needs one), or pixels that are not square
+    (Mitsuba has square pixels only).
+    """
     try:
-        views = parse_transforms(Path(source), (settings.width, settings.height))
+        views = parse_transforms(path, (settings.width, settings.height))
     except ContractError as error:
         raise UserError(str(error)) from None
-    return split_views(views, settings)
+    sizes = sorted({(view.width, view.height) for view in views})
+    if len(sizes) > 1:
+        listed = ", ".join(f"{w}x{h}" for w, h in sizes[:4])
+        raise UserError(f"{path}: has several image sizes ({listed}); training needs one: resample the cameras")
+    for view in views:
+        if abs(view.fl_x - view.fl_y) > SQUARE_PIXELS * view.fl_x:
+            raise UserError(
+                f"{path}: view {view.name} has fl_x {view.fl_x:g} and fl_y {view.fl_y:g}; the ray tracer needs"
+                " square pixels: resample the cameras"
+            )
+    return views
 
 
 def sphere_views(
@@ -180,7 +201,7 @@ def _scene_view(camera: dict[str, Any], settings: CameraSettings) -> View:
     focal = camera["lens"] / sensor * side
     name = f"frame{camera['frame']:05d}" if "frame" in camera else camera["name"]
     return View(
-        name="".join(c if c.isalnum() or c in "_-" else "_" for c in name),
+        name=file_name(name),
         width=width,
         height=height,
         fl_x=focal,

@@ -387,10 +387,16 @@ def _camera_overrides(options: dict[str, Any]) -> dict[str, Any]:
     cameras: dict[str, Any] = {}
     source = options.pop("cameras")
     if source is not None:
-        known = ("auto", "dome", "sphere", "scene", "animation")
-        if source not in known and not Path(source).is_file():
-            raise UserError(f"--cameras {source}: neither {', '.join(known)} nor a camera file")
-        cameras["source"] = source if source in known else str(Path(source).resolve())
+        from .cameras import KEYWORDS
+
+        if source not in KEYWORDS and not Path(source).is_file():
+            raise UserError(f"--cameras {source}: neither {', '.join(KEYWORDS)} nor a camera file")
+        if source in KEYWORDS:
+            cameras |= {"source": source, "source_sha256": ""}
+        else:
+            from .workspace import file_sha256
+
+            cameras |= {"source": str(Path(source).resolve()), "source_sha256": file_sha256(Path(source))}
     views, resolution, raster = options.pop("views"), options.pop("resolution"), options.pop("raster")
     if views is not None:
         cameras["train"] = views

@@ -10,6 +10,7 @@ share is ``seconds / workers`` (exact when the workers were busy throughout, an 
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -102,7 +103,7 @@ class Ledger:
                     line = b"\n" + line
             written = os.write(descriptor, line)
             if written != len(line):
-                raise OSError(f"{self.path}: only {written} of {len(line)} bytes written; is the disk full?")
+                raise OSError(errno.ENOSPC, f"only {written} of {len(line)} bytes written", str(self.path))
             os.fsync(descriptor)
         finally:
             os.close(descriptor)

@@ -95,7 +95,7 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
         + (f", LPIPS {mean['lpips_alex']:.4f} (alex)" if mean["lpips_alex"] is not None else ", no LPIPS weights")
     )
     stable = [{k: v for k, v in row.items() if not k.startswith("seconds")} for row in rows]
-    return Outcome(digest(stable), {"mean": mean, "views": len(rows)})
+    return Outcome(digest(stable), {"mean": mean, "views": len(rows), "perceptual": perceptual is not None})
 
 
 def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:

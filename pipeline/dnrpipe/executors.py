@@ -11,6 +11,7 @@ of standard output; what libraries print goes to the log file.
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib
 import json
 import os
@@ -32,19 +33,24 @@ MAX_ATTEMPTS = 2
 
 @dataclass
 class TaskResult:
-    """Outcome of one task: ``result`` when it succeeded, else ``error`` (one line)."""
+    """Outcome of one task: ``result`` when it succeeded, else ``error`` (one line).
+
+    ``died``: the worker process ended or hung, rather than answering with an error. ``errno``: of the
+    OSError that the worker met, or None.
+    """
 
     task: dict[str, Any]
     result: dict[str, Any] | None = None
     error: str | None = None
     attempts: int = 1
     seconds: float = 0.0
+    died: bool = False
+    errno: int | None = None
 
 
 @dataclass
 class _Slot:
     process: subprocess.Popen[str] | None = None
-    died: int = 0
 
 
 @dataclass
@@ -81,7 +87,6 @@ def run_tasks(
         pending.put((task, 1))
     outcomes: queue.SimpleQueue[TaskResult | Retry] = queue.SimpleQueue()
     stopping = threading.Event()
-    remaining = threading.Semaphore(0)
     open_tasks = _Counter(len(tasks))
     slots = [_Slot() for _ in range(max(1, min(workers, len(tasks))))]
     log.parent.mkdir(parents=True, exist_ok=True)
@@ -99,10 +104,10 @@ def run_tasks(
                     if slot.process is None or slot.process.poll() is not None:
                         slot.process = _spawn(module, common, log, environment)
                     answer = _ask(slot.process, task, timeout)
-                except WorkerDied as death:
+                except (WorkerDied, OSError, ValueError) as death:  # also: cannot be started, torn answer
                     _kill(slot.process)
                     slot.process = None
-                    answer = {"error": str(death), "retry": True}
+                    answer = {"error": " ".join(str(death).split()), "retry": True, "died": True}
                 if stopping.is_set():
                     return
                 seconds = time.monotonic() - started
@@ -114,10 +119,10 @@ def run_tasks(
                     pending.put((task, attempt + 1))
                 else:
                     open_tasks.add(-1)
-                    outcomes.put(TaskResult(task, None, answer["error"], attempt, seconds))
+                    died, number = answer.get("died", False), answer.get("errno")
+                    outcomes.put(TaskResult(task, None, answer["error"], attempt, seconds, died, number))
         finally:
             _close(slot.process, force=stopping.is_set())
-            remaining.release()
 
     threads = [threading.Thread(target=serve, args=(slot,), daemon=True) for slot in slots]
     for thread in threads:
@@ -172,10 +177,15 @@ def _spawn(module: str, common: dict[str, Any], log: Path, environment: dict[str
 
 def _ask(process: subprocess.Popen[str], task: dict[str, Any], timeout: float) -> dict[str, Any]:
     assert process.stdin is not None and process.stdout is not None
-    timer = threading.Timer(timeout, process.kill)
+    hung = threading.Event()
+
+    def kill() -> None:
+        hung.set()
+        process.kill()
+
+    timer = threading.Timer(timeout, kill)
     timer.daemon = True
     timer.start()
-    started = time.monotonic()
     try:
         try:
             process.stdin.write(json.dumps(task) + "\n")
@@ -184,8 +194,7 @@ def _ask(process: subprocess.Popen[str], task: dict[str, Any], timeout: float) -
         except OSError:
             line = ""
         if not line:
-            hung = time.monotonic() - started >= timeout
-            raise WorkerDied(f"worker hung for {timeout:.0f} s" if hung else _epitaph(process))
+            raise WorkerDied(f"worker hung for {timeout:.0f} s" if hung.is_set() else _epitaph(process))
         return json.loads(line)
     finally:
         timer.cancel()
@@ -238,16 +247,21 @@ def _worker_main(module: str) -> int:
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
     common = json.loads(sys.stdin.readline())
-    worker = importlib.import_module(module).Worker(common)
+    worker: Any = None
     for line in sys.stdin:
         try:
+            if worker is None:  # made on the first task: its failure is that task's answer
+                worker = importlib.import_module(module).Worker(common)
             answer = {"result": worker(json.loads(line))}
         except Exception as error:  # reported to the parent, the traceback goes to the log
             import traceback
 
             traceback.print_exc()
             reason = " ".join(str(error).split()) or type(error).__name__
-            answer = {"error": reason, "retry": not isinstance(error, ValueError | UserError)}
+            # Bad input and a full disk stay what they are; anything else gets its second try.
+            full = isinstance(error, OSError) and error.errno == errno.ENOSPC
+            retry = not (full or isinstance(error, ValueError | UserError))
+            answer = {"error": reason, "retry": retry, "errno": getattr(error, "errno", None)}
         answers.write(json.dumps(answer) + "\n")
         answers.flush()
     answers.flush()

@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 
 from dnrtrain.atomic import atomic_path, write_json
-from dnrtrain.contract import SceneFrame, View, write_cameras
+from dnrtrain.contract import View, write_cameras
 
 from .console import Console
 from .costs import CostRecord
+from .errors import UserError
 from .evaluate import write_png
-from .prepare import pass_common, pass_task, scene_fingerprint
+from .prepare import pass_common, pass_task
+from .scene_files import read_frame, scene_fingerprint
 from .settings import Settings
 from .stages import STAGES, require_inputs
 from .tasks import run_view_tasks, view_record, worker_count
@@ -46,13 +48,15 @@ def render_novel(
     from dnrtrain.model import render_views
 
     require_inputs(STAGES["evaluate"], workspace, settings)  # what evaluate needs is what this needs
+    if movie != "none" and len({(view.width, view.height) for view in views}) > 1:
+        raise UserError("render: the cameras have several image sizes, which no movie can hold; use --movie none")
     folder = workspace.root / "renders" / name
     run_id = f"render-{int(time.time()):x}"
     model_stamp = workspace.manifest.stages["finetune"].output
     stamp = digest([model_stamp, scene_fingerprint(workspace), [v.model_dump(mode="json") for v in views]])
     stamp_file = folder / "frames.json"
     if folder.exists() and (not stamp_file.exists() or stamp_file.read_text().strip() != f'"{stamp}"'):
-        for path in folder.glob("frame_*"):
+        for path in [*folder.glob("frame_*"), *folder.glob(f"{name}.*")]:
             path.unlink()
     write_json(stamp_file, stamp)
     write_cameras(folder / "cameras.json", views, name)
@@ -60,7 +64,7 @@ def render_novel(
     _gbuffers(workspace, settings, console, views, paths, run_id)
     device = torch_device(settings)
     model = load_model(workspace.checkpoints("step2"), device)
-    frame = SceneFrame.model_validate_json((workspace.scene / "frame.json").read_text(encoding="utf-8"))
+    frame = read_frame(workspace)
     pictures: list[np.ndarray] = []
     seconds: list[float] = []
     with console.bar("frames", len(views)) as bar:

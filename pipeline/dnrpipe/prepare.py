@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-import json
+import errno
+import os
+import shutil
 import time
 from pathlib import Path
 from typing import Any
 
 from dnrtrain.atomic import write_json
-from dnrtrain.contract import SPLITS, SceneFrame, View, read_cameras, write_cameras
+from dnrtrain.contract import SPLITS, View, read_cameras, write_cameras
 
 from .cameras import depth_range, make_cameras
 from .console import Console
 from .costs import CostRecord
 from .errors import UserError
 from .executors import Retry, run_tasks
+from .scene_files import read_frame, read_json, read_summary, scene_fingerprint
 from .settings import Settings
-from .stages import STAGES, Outcome, fingerprint
+from .stages import Outcome
 from .tasks import run_view_tasks, view_record, worker_count
 from .workspace import Workspace, digest
 
-SCENE_VERSION = 1  # raise when the conversion or the G-buffer scene changes what it writes
 PASSES_VERSION = 1
 # Evaluation needs G-buffers of test views only; their rasterised colour would never be read.
 RASTERISED = ("train", "val")
@@ -28,8 +30,8 @@ RASTERISED = ("train", "val")
 
 def run(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
     """Do what is missing: convert the scene, place the cameras, render the passes."""
+    summary = _convert(workspace, console, run_id)
     scene_print = scene_fingerprint(workspace)
-    summary = _convert(workspace, console, run_id, scene_print)
     views = _place_cameras(workspace, settings, summary)
     engine, reason = _raster_engine(workspace, settings, console)
     tasks = [
@@ -61,10 +63,9 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
         workers=worker_count(settings.passes.workers),
         book=book,
     )
-    output = fingerprint(STAGES["prepare"], workspace, settings)
-    assert output is not None
     return Outcome(
-        output,
+        # Views, scene and engine are all in the tasks' fingerprints.
+        digest([[Path(task["output"]).parent.name, task["fingerprint"]] for task in tasks]),
         {
             "raster_engine": engine,
             "raster_reason": reason,
@@ -83,19 +84,14 @@ def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
     return min(present, wanted), wanted
 
 
-def scene_fingerprint(workspace: Workspace) -> str:
-    """Hash of what the converted scene comes from."""
-    return digest([SCENE_VERSION, workspace.manifest.source.sha256])
-
-
 def split_views(workspace: Workspace) -> dict[str, list[View]]:
     """The views of each split, as `prepare` placed them."""
     return {split: read_cameras(workspace.cameras(split)) for split in SPLITS if workspace.cameras(split).exists()}
 
 
-def read_summary(workspace: Workspace) -> dict[str, Any]:
-    """``scene/summary.json``: bounds, cameras, counts."""
-    return json.loads((workspace.scene / "summary.json").read_text(encoding="utf-8"))
+def has_test_views(workspace: Workspace) -> bool:
+    """Whether there is anything to evaluate on."""
+    return bool(split_views(workspace).get("test"))
 
 
 def pass_task(
@@ -131,30 +127,24 @@ def pass_common(workspace: Workspace, settings: Settings, engine: str) -> dict[s
     }
 
 
-def _convert(workspace: Workspace, console: Console, run_id: str, scene_print: str) -> dict[str, Any]:
-    """Open the scene in a worker and write ``scene/``; the marker file is written last."""
+def _convert(workspace: Workspace, console: Console, run_id: str) -> dict[str, Any]:
+    """Open the scene in a worker and write ``scene/``, whole or not at all."""
     marker = workspace.scene / "prepared.json"
-    if marker.exists() and json.loads(marker.read_text())["fingerprint"] == scene_print:
+    if marker.exists() and read_json(marker)["fingerprint"] == scene_fingerprint(workspace):
         return read_summary(workspace)
     source = Path(workspace.manifest.source.path)
     if not source.is_file():
         raise UserError(f"{source}: the scene file is gone; run `dnrpipe prepare SCENE` with its new place")
-    marker.unlink(missing_ok=True)
     console.say(f"converting {source.name}")
     started = time.monotonic()
-    task = {"source": str(source), "scene_dir": str(workspace.scene)}
-    with console.bar("scene", 1) as bar:
-        for outcome in run_tasks("dnrpipe.blender.prepare", {}, [task], workers=1, log=workspace.log("prepare")):
-            if isinstance(outcome, Retry):
-                continue
-            if outcome.result is None:
-                if "worker" in (outcome.error or ""):
-                    raise UserError(
-                        f"{source}: Blender could not open it ({outcome.error}): damaged or truncated?"
-                        f" See {workspace.log('prepare')}"
-                    )
-                raise UserError(str(outcome.error))
-            bar.advance()
+    fresh = workspace.root / "scene.new"
+    if fresh.exists():
+        shutil.rmtree(fresh)
+    _run_conversion(source, fresh, workspace, console)
+    # The old scene stays until the new one is whole; killed in between, the next run converts again.
+    if workspace.scene.exists():
+        shutil.rmtree(workspace.scene)
+    fresh.rename(workspace.scene)
     summary = read_summary(workspace)
     for warning in summary["warnings"]:
         console.warn(warning)
@@ -170,13 +160,29 @@ def _convert(workspace: Workspace, console: Console, run_id: str, scene_print: s
             seconds=time.monotonic() - started,
         )
     )
-    write_json(marker, {"fingerprint": scene_print})
+    write_json(marker, {"fingerprint": scene_fingerprint(workspace)})
     return summary
+
+
+def _run_conversion(source: Path, folder: Path, workspace: Workspace, console: Console) -> None:
+    """The worker's outcome, as UserError where it failed."""
+    task = {"source": str(source), "scene_dir": str(folder)}
+    with console.bar("scene", 1) as bar:
+        for outcome in run_tasks("dnrpipe.blender.prepare", {}, [task], workers=1, log=workspace.log("prepare")):
+            if isinstance(outcome, Retry):
+                continue
+            if outcome.errno == errno.ENOSPC:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
+            if outcome.died:
+                raise UserError(f"{source}: Blender could not open it ({outcome.error}): damaged or truncated?")
+            if outcome.result is None:
+                raise UserError(str(outcome.error))
+            bar.advance()
 
 
 def _show_findings(workspace: Workspace, console: Console) -> None:
     """Whatever was not converted exactly is said by name, once, in the terminal; all of it is in census.json."""
-    census = json.loads((workspace.scene / "census.json").read_text(encoding="utf-8"))
+    census = read_json(workspace.scene / "census.json")
     for finding in census["findings"]:
         if finding["kind"] in ("approximated", "ignored", "missing"):
             names = [f"object '{finding['object']}'"] if finding["object"] else []
@@ -191,7 +197,7 @@ def _place_cameras(workspace: Workspace, settings: Settings, summary: dict[str, 
         raise UserError("no candidate views: give more cameras or set cameras.train")
     near, far = depth_range([v for split in SPLITS for v in views[split]], summary)
     frame_path = workspace.scene / "frame.json"
-    frame = SceneFrame.model_validate_json(frame_path.read_text(encoding="utf-8"))
+    frame = read_frame(workspace)
     write_json(frame_path, frame.model_copy(update={"near": near, "far": far}).model_dump(mode="json"))
     for split in SPLITS:
         write_cameras(workspace.cameras(split), views[split], split)
@@ -208,7 +214,7 @@ def _raster_engine(workspace: Workspace, settings: Settings, console: Console) -
 
     record = workspace.root / "passes" / "raster.json"
     if record.exists():
-        chosen = json.loads(record.read_text(encoding="utf-8"))
+        chosen = read_json(record)
         if chosen["requested"] == settings.passes.raster:
             return chosen["engine"], chosen["reason"]
     engine, reason = choose_raster(settings.passes.raster)

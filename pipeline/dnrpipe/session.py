@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +13,7 @@ from .errors import UserError
 if TYPE_CHECKING:
     from .console import Console
     from .settings import Settings
-    from .workspace import Source, Workspace
+    from .workspace import Manifest, Source, Workspace
 
 
 class Session:
@@ -22,6 +23,8 @@ class Session:
         self.command, self.options, self.scene, self.overrides = command, options, scene, overrides
         self.stack = ExitStack()
         self.answers: dict[str, Any] = {}
+        self.before: Manifest | None = None
+        self.fresh = False
 
     def __enter__(self) -> Session:
         try:
@@ -44,19 +47,22 @@ class Session:
             source = _source(self.scene)
             root = _root_for(self.scene, self.options["workspace"])
             # Bad settings are refused before a folder is made.
-            stored = Workspace.open(root) if (root / "manifest.json").exists() else None
+            stored = _stored(root, source, named=self.options["workspace"] is not None)
             planned = resolve_layers(root, preset or (stored.manifest.preset if stored else None), stored, overrides)
-            self._check_budget(planned, stored)
+            self._check(planned, stored)
+            self.fresh = stored is None and not root.exists()
             self.stack.enter_context(locked(root, self.command))
+            self.before = stored.manifest if stored else None
             self.workspace: Workspace = Workspace.create(root, source)
         else:
             root = find_workspace(self.options["workspace"])
             Workspace.open(root)
             self.stack.enter_context(locked(root, self.command))
             self.workspace = Workspace.open(root)
+            self.before = self.workspace.manifest.model_copy(deep=True)
         self.settings: Settings = resolve_settings(self.workspace, overrides, preset)
         manifest = self.workspace.manifest
-        self._check_budget(self.settings, self.workspace)
+        self._check(self.settings, self.workspace)
         manifest.preset = preset or manifest.preset
         manifest.overrides = merge(manifest.overrides, overrides)
         return self
@@ -66,6 +72,7 @@ class Session:
 
     def stages(self, *names: str) -> None:
         """Run stages in order; flags are remembered once the first one's inputs are known to be there."""
+        from .prepare import has_test_views
         from .stages import STAGES, require_inputs, run_stage
 
         require_inputs(STAGES[names[0]], self.workspace, self.settings)
@@ -75,9 +82,17 @@ class Session:
             size = f"{self.settings.cameras.width}x{self.settings.cameras.height}"
             self.console.say(f"workspace {self.workspace.root}, preset {self.settings.preset} ({size})")
         for name in names:
-            self.answers[name] = run_stage(
-                name, self.workspace, self.settings, self.console, force=self.options["force"]
-            )
+            if name == "evaluate" and self.command == "run" and not has_test_views(self.workspace):
+                self.console.warn("no test views: nothing is evaluated; prepare with cameras.test > 0")
+                continue
+            try:
+                self.answers[name] = run_stage(
+                    name, self.workspace, self.settings, self.console, force=self.options["force"]
+                )
+            except UserError:
+                if name == "prepare":
+                    self._take_back()
+                raise
         if "report" not in self.command and self.command != "run":
             self.console.result({"workspace": str(self.workspace.root), **self.answers})
 
@@ -94,7 +109,7 @@ class Session:
 
         from .cameras import orbit_views
         from .novel import render_novel
-        from .prepare import read_summary
+        from .scene_files import read_summary
         from .stages import STAGES, require_inputs
 
         require_inputs(STAGES["evaluate"], self.workspace, self.settings)
@@ -119,15 +134,47 @@ class Session:
         self.console.say(f"report: {path}")
         self.console.result({"workspace": str(self.workspace.root), **self.answers, "report": str(path)})
 
-    def _check_budget(self, settings: Settings, workspace: Workspace | None) -> None:
-        """Refuse a budget above the candidates before any work is done or folder made."""
+    def _take_back(self) -> None:
+        """A refused scene or camera file leaves the workspace as it was; a folder made for it is removed."""
+        if self.fresh:
+            shutil.rmtree(self.workspace.root, ignore_errors=True)
+        elif self.before is not None:
+            self.workspace.manifest = self.before
+            self.workspace.save()
+
+    def _check(self, settings: Settings, workspace: Workspace | None) -> None:
+        """Refuse bad camera files and a budget above the candidates before any work is done or folder made."""
+        from .cameras import KEYWORDS, read_camera_file
         from .training import check_budget
 
         record = workspace.manifest.stages.get("prepare") if workspace else None
+        if settings.cameras.source not in KEYWORDS and (self.command == "prepare" or self.scene is not None):
+            read_camera_file(Path(settings.cameras.source), settings.cameras)
         if self.command == "run" and settings.cameras.source in ("auto", "dome", "sphere"):
             check_budget(settings.select.budget, settings.cameras.train)
         elif self.command == "select" and record is not None:
             check_budget(settings.select.budget, record.detail["views"]["train"])
+
+
+def _stored(root: Path, source: Source, *, named: bool) -> Workspace | None:
+    """The workspace that is there, or None. A damaged manifest is put aside: the work is found by its files.
+
+    Raises UserError: it belongs to another scene of the same name and was not named with -w.
+    """
+    from .workspace import DamagedManifest, Workspace
+
+    path = root / "manifest.json"
+    if not path.exists():
+        return None
+    try:
+        workspace = Workspace.open(root)
+    except DamagedManifest:
+        path.replace(root / "manifest.json.damaged")
+        return None
+    other = Path(workspace.manifest.source.path)
+    if not named and str(other) != source.path and other.exists():
+        raise UserError(f"{root}: belongs to {other}; name another workspace with -w")
+    return workspace
 
 
 def resolve_settings(workspace: Workspace, overrides: dict[str, Any], preset: str | None) -> Settings:

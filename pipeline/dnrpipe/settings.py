@@ -29,6 +29,7 @@ class CameraSettings(Strict):
     source: str = Field(
         default="auto", description="auto (= dome), dome, sphere, scene, animation, or a transforms.json"
     )
+    source_sha256: str = Field(default="", description="set by --cameras FILE, so that a changed file is noticed")
     train: int = Field(default=100, ge=1, le=100_000, description="candidate views")
     val: int = Field(default=100, ge=0, le=100_000)
     test: int = Field(default=200, ge=0, le=100_000)

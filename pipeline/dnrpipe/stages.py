@@ -8,16 +8,19 @@ state              = missing | partial | stale | done
 from __future__ import annotations
 
 import importlib
+import os
 import platform
 import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from . import __version__
 from .console import Console, clock
 from .errors import UserError
+from .scene_files import scene_fingerprint
 from .settings import Settings
 from .workspace import Workspace, digest
 
@@ -122,14 +125,17 @@ def fingerprint(stage: Stage, workspace: Workspace, settings: Settings) -> str |
             "stage": stage.name,
             "version": stage.version,
             "settings": stage.settings(settings),
-            "source": workspace.manifest.source.sha256 if not stage.needs else None,
+            "source": None if stage.needs else scene_fingerprint(workspace),
             "inputs": {need: records[need].output for need in stage.needs},
         }
     )
 
 
 def state(stage: Stage, workspace: Workspace, settings: Settings) -> str:
-    """missing: never finished; partial: files are absent; stale: inputs or settings changed; done."""
+    """missing: never finished; partial: files are absent; stale: inputs or settings changed; done.
+
+    Work done without perceptual weights is stale once they are here; the other way round it stays.
+    """
     record = workspace.manifest.stages.get(stage.name)
     present, wanted = _call(stage.progress, workspace, settings)
     if record is None:
@@ -137,6 +143,8 @@ def state(stage: Stage, workspace: Workspace, settings: Settings) -> str:
     if record.fingerprint != fingerprint(stage, workspace, settings):
         return "stale"
     if any(state(STAGES[need], workspace, settings) == "stale" for need in stage.needs):
+        return "stale"
+    if record.detail.get("perceptual") is False and weights_cached():
         return "stale"
     return "done" if present >= wanted else "partial"
 
@@ -154,7 +162,14 @@ def run_stage(
         console.say(f"{stage.command}: up to date")
         return {"stage": name, "ran": False, **workspace.manifest.stages[name].detail}
     if force:
+        if not stage.needs and not Path(workspace.manifest.source.path).is_file():
+            raise UserError(
+                f"{workspace.manifest.source.path}: the scene file is gone; --force would lose its conversion"
+            )
         clear(stage, workspace)
+    record = workspace.manifest.stages.get(name)
+    if record is not None and record.fingerprint != fingerprint(stage, workspace, settings):
+        record.fingerprint = ""  # its files are about to change: not done until this run has finished
     started = time.monotonic()
     run_id = f"{name}-{int(time.time()):x}"
     workspace.manifest.versions = {"dnrpipe": __version__, "python": platform.python_version()}
@@ -193,6 +208,12 @@ def clear(stage: Stage, workspace: Workspace) -> None:
             shutil.rmtree(path)
         else:
             path.unlink(missing_ok=True)
+
+
+def weights_cached() -> bool:
+    """Whether `dnrpipe weights` has been here; a look at the folder, without importing torch."""
+    base = os.environ.get("DNRPIPE_CACHE") or Path.home() / ".cache" / "dnrpipe"
+    return (Path(base) / "weights" / "weights.json").is_file()
 
 
 def status(workspace: Workspace, settings: Settings) -> list[dict[str, Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -62,6 +63,8 @@ def run_view_tasks(
                 name = task_name(outcome.task)
                 if isinstance(outcome, Retry):
                     console.warn(f"{label}: {name}: {outcome.reason}; trying once more")
+                elif outcome.errno == errno.ENOSPC:
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), outcome.task["output"])
                 elif outcome.result is None:
                     console.warn(f"{label}: {name} failed twice: {outcome.error}")
                     failed.append(name)

@@ -11,8 +11,9 @@ from dnrtrain.exr import read_metadata
 
 from .console import Console
 from .costs import CostRecord
-from .prepare import scene_fingerprint, split_views
+from .prepare import split_views
 from .raytrace.variants import choose_variant
+from .scene_files import scene_fingerprint
 from .settings import Settings
 from .stages import Outcome
 from .tasks import is_made, run_view_tasks, view_record, worker_count

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from dnrtrain.atomic import write_json
-from dnrtrain.contract import SceneFrame, View
+from dnrtrain.contract import View
 from dnrtrain.events import EpochEnd, Event, Note, Selected
 
 from .console import Bar, Console
 from .costs import CostRecord
 from .errors import UserError
 from .prepare import split_views
+from .scene_files import read_frame
 from .settings import Settings
 from .stages import STAGES, Outcome, fingerprint
 from .workspace import Workspace, digest, file_sha256
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 def run_select(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
     """Step 1: train the coarse DNR and choose ``budget`` views."""
     import numpy as np
+
     from dnrtrain.step1 import run_step1
 
     views = split_views(workspace)
@@ -131,7 +133,7 @@ def load(workspace: Workspace, views: list[View], split: str, *, raytraced: bool
     """G-buffers of the views, with rasterised (train, val) or ray-traced targets, or none (test)."""
     from dnrtrain.dataset import load_views
 
-    frame = SceneFrame.model_validate_json((workspace.scene / "frame.json").read_text(encoding="utf-8"))
+    frame = read_frame(workspace)
     return load_views(
         [workspace.passes(split, view.name) for view in views],
         [workspace.raytraced(split, view.name) for view in views] if raytraced else None,

@@ -75,6 +75,10 @@ class Manifest(BaseModel):
     versions: dict[str, str] = Field(default_factory=dict)
 
 
+class DamagedManifest(UserError):
+    """``manifest.json`` is torn or foreign; preparing the scene again makes a new one."""
+
+
 class Workspace:
     """Paths and the manifest of one workspace. Open with :meth:`open`, make with :meth:`create`."""
 
@@ -120,7 +124,7 @@ class Workspace:
         if (root / "manifest.json").exists():
             workspace = cls.open(root)
             workspace.manifest.source = source
-        elif root.exists() and any(entry.name not in LOCK_FILES for entry in root.iterdir()):
+        elif root.exists() and not _is_ours(root):
             raise UserError(f"{root}: exists and is not a dnrpipe workspace; choose another with -w")
         else:
             workspace = cls(root, Manifest(source=source))  # pyright: ignore[reportCallIssue]
@@ -136,7 +140,7 @@ class Workspace:
         except FileNotFoundError:
             raise UserError(f"{root}: not a dnrpipe workspace; make one with `dnrpipe prepare SCENE`") from None
         except (json.JSONDecodeError, UnicodeDecodeError) as error:
-            raise UserError(f"{path}: damaged ({error}); run `dnrpipe prepare SCENE` again") from None
+            raise DamagedManifest(f"{path}: damaged ({error}); run `dnrpipe prepare SCENE` again") from None
         schema = data.get("schema") if isinstance(data, dict) else None
         if isinstance(schema, int) and schema > SCHEMA:
             raise UserError(f"{root}: workspace schema {schema} is newer than this dnrpipe ({SCHEMA}); upgrade dnrpipe")
@@ -145,7 +149,9 @@ class Workspace:
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(map(str, first["loc"]))
-            raise UserError(f"{path}: damaged ({where}: {first['msg']}); run `dnrpipe prepare SCENE` again") from None
+            raise DamagedManifest(
+                f"{path}: damaged ({where}: {first['msg']}); run `dnrpipe prepare SCENE` again"
+            ) from None
 
     def save(self) -> None:
         """Write the manifest atomically."""
@@ -169,6 +175,12 @@ class Workspace:
             detail=dict(detail or {}),
         )
         self.save()
+
+
+def _is_ours(root: Path) -> bool:
+    """Nothing in the folder but a lock, or what an earlier dnrpipe left whose manifest was put aside."""
+    names = {entry.name for entry in root.iterdir()} - set(LOCK_FILES)
+    return not names or "manifest.json.damaged" in names
 
 
 def find_workspace(explicit: str | None, folder: Path | None = None) -> Path:

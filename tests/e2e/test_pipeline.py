@@ -14,6 +14,7 @@ import pytest
 from e2e_harness import STAGES, command, contents, environment, image, run
 
 from dnrpipe.costs import Ledger
+from dnrtrain.exr import read_exr
 
 pytestmark = [pytest.mark.slow, pytest.mark.e2e]
 
@@ -83,6 +84,71 @@ def test_a_larger_budget_traces_the_new_views_only(tiny: Path, tmp_path: Path) -
     assert sorted(traced) == sorted(f"train/{name}" for name in new - old)
 
 
+def test_going_back_after_an_interrupted_change_is_not_up_to_date(tiny: Path, tmp_path: Path) -> None:
+    """A run with other samples overwrites one view and is killed; the old samples must come back."""
+    copy = tmp_path / "demo.dnr"
+    shutil.copytree(tiny, copy)
+    expected = contents(copy)
+    before = {path: path.stat().st_mtime_ns for path in (copy / "raytraced" / "train").glob("*.exr")}
+    change = command("raytrace-selected", "--spp", "3000", "--set", "raytrace.workers=1", "--quiet")
+    process = subprocess.Popen(change, cwd=tmp_path, env=environment(), stderr=subprocess.DEVNULL)
+    for _ in range(600):
+        time.sleep(0.1)
+        if any(path.stat().st_mtime_ns != old for path, old in before.items()):
+            break
+    process.kill()
+    process.wait()
+    done = run("raytrace-selected", "--spp", "32", folder=tmp_path)
+    assert "up to date" not in done.stdout
+    assert contents(copy) == expected
+
+
+def test_another_camera_file_makes_everything_after_it_stale(tiny: Path, tmp_path: Path, demo_blend: Path) -> None:
+    copy = tmp_path / "demo.dnr"
+    shutil.copytree(tiny, copy)
+    cameras = tmp_path / "cameras.json"
+    shutil.copy(copy / "cameras" / "train.json", cameras)
+    run("prepare", str(demo_blend), "--cameras", str(cameras), "-w", str(copy), folder=tmp_path)
+    run("select", "--budget", "2", "--policy", "farthest", folder=copy)
+    data = json.loads(cameras.read_text())
+    for frame in data["frames"]:
+        frame["transform_matrix"][2][3] += 0.1
+    cameras.write_text(json.dumps(data))
+    run("prepare", str(demo_blend), "--cameras", str(cameras), "-w", str(copy), folder=tmp_path)
+    states = {row["stage"]: row["state"] for row in json.loads(run("status", "--json", folder=copy).stdout)["stages"]}
+    assert states["prepare"] == "done"
+    assert states["select"] == states["raytrace"] == "stale"
+
+
+def test_a_changed_texture_is_noticed(tmp_path: Path) -> None:
+    """An OBJ whose texture file changes is converted again, and its passes are made again."""
+    from PIL import Image
+
+    (tmp_path / "square.obj").write_text(
+        "mtllib square.mtl\nusemtl paint\nv 0 0 0\nv 1 0 0\nv 1 1 0.3\nvt 0 0\nvt 1 0\nvt 1 1\nf 1/1 2/2 3/3\n"
+    )
+    (tmp_path / "square.mtl").write_text("newmtl paint\nmap_Kd paint.png\n")
+    means = []
+    for colour in ((200, 30, 30), (30, 30, 200)):
+        Image.new("RGB", (8, 8), colour).save(tmp_path / "paint.png")
+        done = run("prepare", "square.obj", folder=tmp_path)
+        assert "up to date" not in done.stdout
+        channels, _ = read_exr(sorted((tmp_path / "square.dnr" / "passes" / "train").glob("*.exr"))[0])
+        inside = channels["mask"] > 0.5
+        means.append([float(channels[c][inside].mean()) for c in "RGB"])
+    assert "up to date" in run("prepare", "square.obj", folder=tmp_path).stdout
+    assert means[0][0] > 2 * means[0][2] > 0  # lit (by the neutral world) and red
+    assert means[1][2] > 2 * means[1][0] > 0  # and now blue
+
+
+def test_no_validation_and_no_test_views(tmp_path: Path, demo_blend: Path) -> None:
+    off = ("--set", "cameras.val=0", "--set", "cameras.test=0")
+    done = run("run", str(demo_blend), *off, DNRPIPE_SELECT__STEP1__EPOCHS="1", folder=tmp_path)
+    assert "no test views" in done.stderr
+    assert "report" in done.stdout
+    assert run("status", folder=tmp_path).returncode == 0
+
+
 def test_novel_views(tiny: Path, tmp_path: Path) -> None:
     copy = tmp_path / "demo.dnr"
     shutil.copytree(tiny, copy)
@@ -140,7 +206,6 @@ def _forget(workspace: Path, stage: str) -> None:
 def _torn(workspace: Path) -> list[Path]:
     """Files under their final name that do not read: there must be none at any moment."""
     from dnrtrain.contract import ContractError
-    from dnrtrain.exr import read_exr
 
     torn = []
     for path in workspace.rglob("[!.]*"):

@@ -8,6 +8,7 @@ model.json          settings, fingerprint, history; written last, so its presenc
 
 from __future__ import annotations
 
+import errno
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -42,8 +43,12 @@ def save(path: Path, tensors: Mapping[str, Tensor], info: Mapping[str, Any]) -> 
     """Write tensors and JSON into one safetensors file, atomically. NaN in ``info`` is refused."""
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     header = {HEADER: json.dumps(dict(info), allow_nan=False)}
-    with atomic_path(path) as temporary:
-        save_file(plain, temporary, metadata=header)
+    try:
+        with atomic_path(path) as temporary:
+            save_file(plain, temporary, metadata=header)
+    except SafetensorError as error:  # hides the system's reason in its text
+        number = errno.ENOSPC if f"os error {errno.ENOSPC}" in str(error) else errno.EIO
+        raise OSError(number, str(error), str(path)) from None
 
 
 def load(path: Path) -> Saved | None:

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -134,11 +135,13 @@ def write_cameras(path: Path, views: Sequence[View], split: str) -> None:
 
 
 def read_cameras(path: Path) -> list[View]:
-    """Read a ``transforms`` file that :func:`write_cameras` wrote. Raises ContractError."""
-    return parse_transforms(path)
+    """Read a ``transforms`` file that :func:`write_cameras` wrote; it may hold no view. Raises ContractError."""
+    return parse_transforms(path, may_be_empty=True)
 
 
-def parse_transforms(path: Path, default_size: tuple[int, int] | None = None) -> list[View]:
+def parse_transforms(
+    path: Path, default_size: tuple[int, int] | None = None, *, may_be_empty: bool = False
+) -> list[View]:
     """Read views from any NeRF / nerfstudio / instant-ngp ``transforms.json``.
 
     Intrinsics may stand per frame or once per file: ``fl_x``/``fl_y``, or ``camera_angle_x``/``_y``
@@ -154,21 +157,40 @@ def parse_transforms(path: Path, default_size: tuple[int, int] | None = None) ->
         raise ContractError(f"{path}: no such camera file") from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ContractError(f"{path}: not a JSON camera file ({error})") from None
-    if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
+    frames = data.get("frames") if isinstance(data, dict) else None
+    if not isinstance(frames, list) or not (frames or may_be_empty):
         raise ContractError(f"{path}: has no 'frames'; expected a NeRF transforms.json")
     views: list[View] = []
-    for index, frame in enumerate(data["frames"]):
+    for index, frame in enumerate(frames):
+        if not isinstance(frame, dict) or "transform_matrix" not in frame:
+            raise ContractError(f"{path}: frame {index}: has no 'transform_matrix'")
         try:
             views.append(_parse_frame(frame, data, index, default_size))
-        except (ValueError, TypeError, KeyError) as error:
+        except (ValueError, TypeError) as error:
             reason = str(error).replace("\n", " ")
             if hasattr(error, "errors"):
                 reason = "; ".join(e["msg"].removeprefix("Value error, ") for e in error.errors())  # type: ignore[attr-defined]
             raise ContractError(f"{path}: frame {index}: {reason}") from None
-    names = [view.name for view in views]
-    if len(set(names)) != len(names):
-        views = [view.model_copy(update={"name": f"{i:04d}"}) for i, view in enumerate(views)]
-    return views
+    return unique_names(views)
+
+
+def unique_names(views: Sequence[View]) -> list[View]:
+    """Views that share a name are told apart by a number: ``a``, ``a-2``, ``a-3``. Files are named by it."""
+    taken: set[str] = set()
+    result = []
+    for view in views:
+        name, number = view.name, 1
+        while name in taken:
+            number += 1
+            name = f"{view.name}-{number}"
+        taken.add(name)
+        result.append(view if name == view.name else view.model_copy(update={"name": name}))
+    return result
+
+
+def file_name(text: str) -> str:
+    """``text`` as a view's name: letters, digits, dot, dash and underscore of ASCII; others become "_"."""
+    return re.sub(r"[^A-Za-z0-9_.-]", "_", text) or "_"
 
 
 def _parse_frame(frame: Any, shared: dict[str, Any], index: int, size: tuple[int, int] | None) -> View:
@@ -200,7 +222,7 @@ def _parse_frame(frame: Any, shared: dict[str, Any], index: int, size: tuple[int
     stem = name.rsplit(".", 1)[0] if name.lower().endswith((".png", ".jpg", ".jpeg", ".exr")) else name
     matrix = np.asarray(frame["transform_matrix"], dtype=np.float64)
     return View(
-        name="".join(c if c.isalnum() or c in "_.-" else "_" for c in stem),
+        name=file_name(stem),
         width=int(width),
         height=int(height),
         fl_x=fl_x,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -35,8 +37,13 @@ def write_exr(path: Path, channels: Mapping[str, np.ndarray], metadata: Mapping[
         "type": OpenEXR.scanlineimage,
         METADATA_KEY: json.dumps(dict(metadata), sort_keys=True),
     }
-    with atomic_path(path) as temporary, OpenEXR.File(header, pixels) as file:
-        file.write(str(temporary))
+    try:
+        with atomic_path(path) as temporary, OpenEXR.File(header, pixels) as file:
+            file.write(str(temporary))
+    except RuntimeError as error:  # the binding hides the system's reason in its text
+        if os.strerror(errno.ENOSPC) in str(error):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path)) from None
+        raise OSError(errno.EIO, str(error), str(path)) from None
 
 
 def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -38,7 +38,10 @@ def build_atlas(meshes: Sequence[FrozenMesh], *, smart_limit: int = SMART_LIMIT)
             bpy.ops.uv.average_islands_scale()
             _normalise_scale(objects, meshes)
             # FRACTION, which searches for the margin, took 17-55 s on a 5,856-triangle cow; ADD takes 1 s.
-            bpy.ops.uv.pack_islands(rotate=True, scale=True, margin_method="ADD", margin=MARGIN)
+            # Free rotation took 40 s on a single cube, quarter turns 2.6 s at the same occupancy.
+            bpy.ops.uv.pack_islands(
+                rotate=True, rotate_method="CARDINAL", scale=True, margin_method="ADD", margin=MARGIN
+            )
         else:
             bpy.ops.uv.lightmap_pack(
                 PREF_CONTEXT="ALL_FACES", PREF_PACK_IN_ONE=True, PREF_NEW_UVLAYER=False, PREF_MARGIN_DIV=0.05

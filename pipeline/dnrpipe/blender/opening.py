@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -86,7 +87,38 @@ def _import(path: Path, suffix: str) -> list[str]:
         reason = " ".join(str(error).removeprefix("Error: ").split())
         raise UserError(f"{path}: cannot be imported as {suffix[1:].upper()} ({reason})") from None
     require_renderable(path)
-    return missing_files()
+    return [*_neutral_light(path), *missing_files()]
+
+
+def _neutral_light(path: Path) -> list[str]:
+    """Mesh formats bring no world and often no lamp: a white world of strength 1 then, said to the user."""
+    scene = bpy.context.scene
+    if scene.world is not None or any(o.type == "LIGHT" for o in scene.objects):
+        return []
+    world = bpy.data.worlds.new("neutral")
+    world.use_nodes = True
+    background = next(node for node in world.node_tree.nodes if node.type == "BACKGROUND")
+    background.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
+    background.inputs["Strength"].default_value = 1.0
+    scene.world = world
+    return [f"{path.name} brings no light: a white world of strength 1 lights it"]
+
+
+def external_files(path: Path) -> list[Path]:
+    """Files beside ``path`` that the open scene was read from: images, libraries, .mtl and glTF buffers."""
+    found = [
+        Path(bpy.path.abspath(image.filepath, library=image.library))
+        for image in bpy.data.images
+        if image.filepath and not image.packed_file
+    ]
+    found += [Path(bpy.path.abspath(library.filepath)) for library in bpy.data.libraries]
+    if path.suffix.lower() == ".obj":
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        found += [path.parent / line.split(maxsplit=1)[1].strip() for line in lines if line.startswith("mtllib ")]
+    elif path.suffix.lower() == ".gltf":
+        buffers = json.loads(path.read_text(encoding="utf-8")).get("buffers", [])
+        found += [path.parent / b["uri"] for b in buffers if "uri" in b and not b["uri"].startswith("data:")]
+    return sorted({file.resolve() for file in found if file.is_file()})
 
 
 def require_renderable(path: Path) -> None:

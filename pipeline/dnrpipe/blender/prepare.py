@@ -8,6 +8,7 @@ from typing import Any
 import bpy
 import numpy as np
 
+from dnrpipe.workspace import file_sha256
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import SceneFrame
 
@@ -21,7 +22,7 @@ from .frozen import FrozenMesh, save_geometry
 from .gbuffer_scene import add_gbuffer_scene
 from .geometry import freeze_scene
 from .light import has_light, light_warnings
-from .opening import open_scene
+from .opening import external_files, open_scene
 from .packing import pack_everything, save_blend
 
 
@@ -43,6 +44,7 @@ def prepare(source: Path, scene_dir: Path) -> dict[str, Any]:
     """
     scene_dir.mkdir(parents=True, exist_ok=True)
     warnings = open_scene(source)
+    external = external_files(source)
     scene = bpy.context.scene
     frozen = freeze_scene(scene)
     warnings += frozen.warnings + light_warnings(scene, frozen.meshes)
@@ -67,6 +69,7 @@ def prepare(source: Path, scene_dir: Path) -> dict[str, Any]:
         "atlas": atlas,
         "repairs": frozen.repairs,
         "has_light": has_light(scene, frozen.meshes),
+        "external": {str(path): file_sha256(path) for path in external},
     }
     warnings += pack_everything()
     add_gbuffer_scene(frozen.meshes)

@@ -141,7 +141,7 @@ def sensor_dict(mi: Any, view: View) -> dict[str, Any]:
     The field of view is along x; pixels may be non-square only together with fl_x = fl_y.
     """
     to_world = view.matrix @ np.diag([-1.0, 1.0, -1.0, 1.0])
-    if abs(view.fl_x - view.fl_y) > 1e-4 * view.fl_x:
+    if abs(view.fl_x - view.fl_y) > 1e-3 * view.fl_x:
         raise ValueError(
             f"view {view.name}: fl_x and fl_y differ ({view.fl_x:g}, {view.fl_y:g});"
             " Mitsuba has square pixels only: resample the camera file"

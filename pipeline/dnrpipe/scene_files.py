@@ -1,0 +1,53 @@
+"""Read ``scene/``: summary, frame, and the fingerprint of what the scene was converted from."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from dnrtrain.contract import SceneFrame
+
+from .errors import UserError
+from .workspace import Workspace, digest, file_sha256
+
+SCENE_VERSION = 2  # raise when the conversion or the G-buffer scene changes what it writes
+
+
+def read_json(path: Path) -> Any:
+    """JSON that an earlier stage wrote. Raises UserError when it is missing or damaged."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UserError(f"{path}: is missing; run `dnrpipe prepare --force`") from None
+    except ValueError:
+        raise UserError(f"{path}: damaged; run `dnrpipe prepare --force`") from None
+
+
+def read_summary(workspace: Workspace) -> dict[str, Any]:
+    """``scene/summary.json``: bounds, cameras, counts, external files."""
+    return read_json(workspace.scene / "summary.json")
+
+
+def read_frame(workspace: Workspace) -> SceneFrame:
+    """``scene/frame.json``. Raises UserError when it is missing or damaged."""
+    path = workspace.scene / "frame.json"
+    try:
+        return SceneFrame.model_validate(read_json(path))
+    except ValidationError:
+        raise UserError(f"{path}: damaged; run `dnrpipe prepare --force`") from None
+
+
+def scene_fingerprint(workspace: Workspace) -> str:
+    """Hash of what the scene is converted from: the scene file and the files it refers to.
+
+    A file that is gone counts as it was: a workspace lives without its sources.
+    """
+    summary = workspace.scene / "summary.json"
+    recorded: dict[str, str] = read_json(summary).get("external", {}) if summary.exists() else {}
+    current = {name: file_sha256(Path(name)) if Path(name).is_file() else sha for name, sha in recorded.items()}
+    # Without their folders: moving a scene with its textures changes nothing.
+    files = sorted((Path(name).name, sha) for name, sha in current.items())
+    return digest([SCENE_VERSION, workspace.manifest.source.sha256, files])
