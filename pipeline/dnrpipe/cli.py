@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -418,7 +419,9 @@ def _select_overrides(options: dict[str, Any]) -> dict[str, Any]:
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point: runs the command and turns every expected failure into one line and an exit code."""
-    sys.exit(_main(arguments))
+    code = _main(arguments)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is written; a late Ctrl-C must not spoil the exit code
+    sys.exit(code)
 
 
 def _main(arguments: list[str] | None) -> int:
