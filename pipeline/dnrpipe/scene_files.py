@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -47,7 +48,19 @@ def scene_fingerprint(workspace: Workspace) -> str:
     """
     summary = workspace.scene / "summary.json"
     recorded: dict[str, str] = read_json(summary).get("external", {}) if summary.exists() else {}
-    current = {name: file_sha256(Path(name)) if Path(name).is_file() else sha for name, sha in recorded.items()}
+    current = {name: _sha256_now(Path(name)) if Path(name).is_file() else sha for name, sha in recorded.items()}
     # Without their folders: moving a scene with its textures changes nothing.
     files = sorted((Path(name).name, sha) for name, sha in current.items())
     return digest([SCENE_VERSION, workspace.manifest.source.sha256, files])
+
+
+def _sha256_now(path: Path) -> str:
+    """Hash of the file as it is; one command asks many times, so it is read again only when it changed."""
+    stat = path.stat()
+    return _sha256_cached(path, stat.st_mtime_ns, stat.st_size)
+
+
+@functools.lru_cache(maxsize=1024)
+def _sha256_cached(path: Path, modified_ns: int, size: int) -> str:
+    del modified_ns, size  # part of the key only
+    return file_sha256(path)
