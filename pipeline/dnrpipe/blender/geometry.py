@@ -16,6 +16,8 @@ from .frozen import FrozenMesh
 DEGENERATE = 1e-12
 SURFACELESS = {"CURVES", "POINTCLOUD", "VOLUME", "GREASEPENCIL"}
 
+UV_STEPS = 2**20  # artist's UVs are rounded to multiples of 1 / UV_STEPS
+
 
 @dataclass
 class Frozen:
@@ -189,7 +191,8 @@ def _read_local(obj: bpy.types.Object) -> _Local | None:
             # Renderers use the last slot for indices beyond it.
             material_index=np.clip(slot[polygons], 0, len(materials) - 1),
             materials=materials,
-            uv_layers=uv_layers,
+            # Modifiers give the last bits of interpolated UVs either way from run to run: a texel's 1/256 at 4096².
+            uv_layers={layer: np.round(uv * UV_STEPS) / np.float32(UV_STEPS) for layer, uv in uv_layers.items()},
             active_uv=active,
         )
     finally:
