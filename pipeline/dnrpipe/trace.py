@@ -65,7 +65,7 @@ def trace_views(
     purpose: str,
 ) -> list[dict[str, Any]]:
     """Path-trace ``views`` into ``raytraced/<split>``; views already there are kept. Returns all tasks."""
-    bundle = bundle_fingerprint(workspace)
+    bundle = scene_fingerprint(workspace)
     tasks = [
         {
             "view": view.model_dump(mode="json"),
@@ -110,11 +110,6 @@ def trace_views(
     )
     _warn_repairs(tasks, console)
     return tasks
-
-
-def bundle_fingerprint(workspace: Workspace) -> str:
-    """Hash of what the Mitsuba bundle comes from."""
-    return scene_fingerprint(workspace)
 
 
 def view_seed(seed: int, split: str, name: str) -> int:
