@@ -11,7 +11,7 @@ import pytest
 from dnrpipe.executors import Retry, TaskResult, run_tasks
 
 WORKER = """
-import os, pathlib, signal, sys, time
+import os, pathlib, signal, sys, tempfile, time
 print("noise on import")
 
 class Worker:
@@ -34,6 +34,9 @@ class Worker:
             raise ValueError("bad input,\\nsaid on two lines")
         elif kind == "sleep":
             time.sleep(0.4)
+        elif kind == "litter":
+            pathlib.Path(tempfile.gettempdir(), "left-behind").touch()
+            return {"temporary": tempfile.gettempdir()}
         return {"n": task["n"], "pid": os.getpid()}
 """
 
@@ -152,3 +155,9 @@ def test_workers_die_with_their_parent(module: str, tmp_path: Path) -> None:
 
 def _running(pid: int) -> bool:
     return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+
+
+def test_what_workers_leave_in_the_temporary_folder_goes_with_them(module: str, tmp_path: Path) -> None:
+    results, _ = _run(module, tmp_path, ["litter"])
+    assert results[0].result is not None
+    assert not Path(results[0].result["temporary"]).exists()

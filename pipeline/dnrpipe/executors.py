@@ -19,6 +19,7 @@ import queue
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -90,6 +91,9 @@ def run_tasks(
     open_tasks = _Counter(len(tasks))
     slots = [_Slot() for _ in range(max(1, min(workers, len(tasks))))]
     log.parent.mkdir(parents=True, exist_ok=True)
+    # Workers end without Blender's own clean-up (see _worker_main); what it leaves in the temporary folder goes here.
+    litter = tempfile.TemporaryDirectory(prefix="dnrpipe-workers-", ignore_cleanup_errors=True)
+    surroundings = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), litter.name) | (environment or {})
 
     def serve(slot: _Slot) -> None:
         # The thread lives as long as its worker: PR_SET_PDEATHSIG follows the spawning thread.
@@ -102,7 +106,7 @@ def run_tasks(
                 started = time.monotonic()
                 try:
                     if slot.process is None or slot.process.poll() is not None:
-                        slot.process = _spawn(module, common, log, environment)
+                        slot.process = _spawn(module, common, log, surroundings)
                     answer = _ask(slot.process, task, timeout)
                 except (WorkerDied, OSError, ValueError) as death:  # also: cannot be started, torn answer
                     _kill(slot.process)
@@ -140,6 +144,7 @@ def run_tasks(
                 _kill(slot.process)
         for thread in threads:
             thread.join(timeout=10)
+        litter.cleanup()
 
 
 class WorkerDied(RuntimeError):
@@ -156,7 +161,7 @@ class _Counter:
             self.value += step
 
 
-def _spawn(module: str, common: dict[str, Any], log: Path, environment: dict[str, str] | None) -> subprocess.Popen[str]:
+def _spawn(module: str, common: dict[str, Any], log: Path, environment: dict[str, str]) -> subprocess.Popen[str]:
     with log.open("a") as sink:
         process = subprocess.Popen(
             [sys.executable, "-m", "dnrpipe.executors", module],
@@ -164,7 +169,7 @@ def _spawn(module: str, common: dict[str, Any], log: Path, environment: dict[str
             stdout=subprocess.PIPE,
             stderr=sink,
             text=True,
-            env={**os.environ, "PYTHONUNBUFFERED": "1", **(environment or {})},
+            env={**os.environ, "PYTHONUNBUFFERED": "1", **environment},
         )
     assert process.stdin is not None
     try:
