@@ -9,6 +9,14 @@ from __future__ import annotations
 from typing import Any
 
 LAMP_PREFIX = "light-"
+UNSEEN_PREFIX = "unseen-"
+"""Shapes that are invisible to camera rays only."""
+ROULETTE_DEPTH = 5
+OWN: dict[str, dict[str, Any]] = {
+    "path-without-caustics": {"type": "dnr_path", "caustics": False},
+    "path-of-any-depth": {"type": "dnr_path"},
+}
+"""Integrators of :mod:`.paths`."""
 
 
 def glowing_shapes(scene: Any) -> list[Any]:
@@ -16,39 +24,101 @@ def glowing_shapes(scene: Any) -> list[Any]:
     return [shape for shape in scene.shapes() if shape.is_emitter() and not shape.id().startswith(LAMP_PREFIX)]
 
 
-def camera_integrator(mi: Any, scene: Any, max_depth: int) -> tuple[Any, str]:
-    """(integrator, its name for the file's metadata): ``path``, or ``path+glow`` where surfaces glow."""
-    settings = {"type": "path", "max_depth": max_depth, "rr_depth": max(5, max_depth // 2)}
+def camera_integrator(mi: Any, scene: Any, max_depth: int, kind: str = "path") -> tuple[Any, str]:
+    """(integrator, its name for the file's metadata): ``kind``, or ``kind+glow`` where surfaces glow.
+
+    kind: Mitsuba's ``direct``, ``path`` or ``volpath``, or one of ``OWN``. Roulette starts at a fixed depth: with
+    the same seed, a path cut at one depth is then the beginning of the path cut at a larger one, which the depth
+    pilot relies on.
+    """
+    settings: dict[str, Any] = dict(OWN.get(kind, {"type": kind}))
+    if kind == "direct":
+        settings |= {"emitter_samples": 1, "bsdf_samples": 1}
+    else:
+        settings |= {"max_depth": max_depth, "rr_depth": ROULETTE_DEPTH}
     hidden = mi.load_dict({**settings, "hide_emitters": True})
-    if not glowing_shapes(scene):
-        return hidden, "path"
-    return _glow_integrator(mi, scene, hidden, mi.load_dict({**settings, "hide_emitters": False})), "path+glow"
+    unseen = any(shape.id().startswith(UNSEEN_PREFIX) for shape in scene.shapes())
+    if not glowing_shapes(scene) and not unseen:
+        return hidden, kind
+    return _camera_view(mi, scene, hidden, mi.load_dict({**settings, "hide_emitters": False})), f"{kind}+glow"
 
 
-def _glow_integrator(mi: Any, scene: Any, hidden: Any, shown: Any) -> Any:
-    """Path tracing that shows a glowing surface to the camera where it is the first thing hit.
+def _camera_view(mi: Any, scene: Any, hidden: Any, shown: Any) -> Any:
+    """Integrator that treats what camera rays meet first, and leaves the rest to Mitsuba's own.
 
-    Both parts are Mitsuba's own ``path``: the one that shows emitters for camera rays that first hit a glowing
-    surface, the one that hides them for all others. A lamp in front of a glowing surface hides it too.
+    Lamps and unseen shapes are passed. Where a glowing surface comes next, its emission is added; it passes the ray on
+    (alpha), or scatters it into ``shown``, in which all emitters are visible. Anything else is for ``hidden``.
     """
     import drjit as dr
 
-    class PathWithGlow(mi.SamplingIntegrator):
+    apart = [shape for shape in scene.shapes() if shape.id().startswith((LAMP_PREFIX, UNSEEN_PREFIX))]
+    lamps = [shape for shape in apart if shape.id().startswith(LAMP_PREFIX)]
+    jit = dr.is_jit_v(mi.Float)
+
+    def is_one_of(hit: Any, shapes: list[Any]) -> Any:
+        if not jit:  # scalar variants: one ray at a time, no shape where nothing is hit
+            return hit.is_valid() and any(hit.shape is shape or hit.instance is shape for shape in shapes)
+        found = mi.Mask(False)
+        for shape in shapes:  # pointers compare element by element
+            found |= (hit.shape == mi.ShapePtr(shape)) | (hit.instance == mi.ShapePtr(shape))
+        return found & hit.is_valid()
+
+    def glows(hit: Any) -> Any:
+        if not jit:
+            return hit.is_valid() and hit.shape.is_emitter() and not is_one_of(hit, lamps)
+        return hit.is_valid() & hit.shape.is_emitter() & ~is_one_of(hit, lamps)
+
+    def first_visible(scene: Any, ray: Any, active: Any) -> tuple[Any, Any]:
+        """(ray that starts behind what the camera does not see, its first hit)."""
+        ray = mi.Ray3f(ray)
+        hit = scene.ray_intersect(ray, active)
+        if not apart:
+            return ray, hit
+
+        def onwards(ray: Any, hit: Any, passing: Any) -> tuple[Any, Any, Any]:
+            ray = hit.spawn_ray(ray.d)
+            hit = scene.ray_intersect(ray, passing)
+            return ray, hit, passing & is_one_of(hit, apart)
+
+        state = (ray, hit, active & is_one_of(hit, apart))
+        ray, hit, _ = dr.while_loop(state, lambda ray, hit, passing: passing, onwards)
+        return ray, hit
+
+    def glowing_layers(scene: Any, sampler: Any, ray: Any, hit: Any, glow: Any) -> tuple[Any, Any, Any, Any]:
+        """Walk through the glowing surfaces in front.
+
+        Returns (their emission, weight of the rest, ray to it, whether that starts from a scattering at the last one).
+        """
+
+        def onwards(
+            sampler: Any, ray: Any, hit: Any, glow: Any, radiance: Any, weight: Any, bounced: Any
+        ) -> tuple[Any, ...]:
+            radiance = radiance + weight * hit.emitter(scene, glow).eval(hit, glow)
+            pair = sampler.next_1d(glow), sampler.next_2d(glow)
+            found, passed = hit.bsdf().sample(mi.BSDFContext(), hit, *pair, glow)
+            weight = weight * passed
+            ray = hit.spawn_ray(hit.to_world(found.wo))
+            null = mi.has_flag(found.sampled_type, mi.BSDFFlags.Null)
+            hit = scene.ray_intersect(ray, glow)
+            glow = glow & null & glows(hit) & (dr.max(weight) > 0)
+            return sampler, ray, hit, glow, radiance, weight, dr.select(null, mi.Bool(False), mi.Bool(True))
+
+        state = (sampler, ray, hit, glow, mi.Spectrum(0.0), mi.Spectrum(1.0), mi.Bool(False))
+        found = dr.while_loop(state, lambda *state: state[3], onwards)
+        _, ray, _, _, radiance, weight, bounced = found
+        return radiance, weight, ray, bounced
+
+    class CameraView(mi.SamplingIntegrator):
         def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> Any:
-            hit = scene.ray_intersect(ray, active)
-            glows = active & hit.is_valid() & _is_glowing(hit)
-            dark, valid, _ = hidden.sample(scene, sampler, ray, medium, dr.select(glows, False, active))
-            bright, _, _ = shown.sample(scene, sampler, ray, medium, active & glows)
-            return dr.select(glows, bright, dark), valid | glows, []
+            seen, hit = first_visible(scene, ray, active)
+            front = active & glows(hit)
+            radiance, weight, seen, bounced = glowing_layers(scene, sampler, seen, hit, front)
+            rest = active & (dr.max(weight) > 0)
+            rest_ray = mi.RayDifferential3f(seen)
+            lit, _, _ = shown.sample(scene, sampler, rest_ray, medium, rest & bounced)
+            rest = rest & dr.select(bounced, False, True)
+            dark, found, _ = hidden.sample(scene, sampler, rest_ray, medium, rest)
+            total = radiance + weight * (dr.select(bounced, lit, 0) + dr.select(rest, dark, 0))
+            return total, (front & bounced) | (rest & found), []
 
-    lamps = [shape for shape in scene.shapes() if shape.id().startswith(LAMP_PREFIX)]
-
-    def _is_glowing(hit: Any) -> Any:
-        if not dr.is_jit_v(mi.Float):  # scalar variants: one ray at a time, no shape where nothing is hit
-            return hit.shape is not None and hit.shape.is_emitter() and not hit.shape.id().startswith(LAMP_PREFIX)
-        glows = hit.shape.is_emitter()
-        for lamp in lamps:  # pointers compare element by element
-            glows &= hit.shape != mi.ShapePtr(lamp)
-        return glows
-
-    return PathWithGlow(mi.Properties("path_with_glow"))
+    return CameraView(mi.Properties("camera_view"))

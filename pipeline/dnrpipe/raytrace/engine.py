@@ -1,0 +1,104 @@
+"""Mitsuba in this process: one variant, bundles loaded once, frames as arrays."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dnrpipe.errors import UserError
+from dnrtrain.contract import View
+
+from . import paths, plugins
+from .sensors import sensor_dict
+from .units import scaled_lens, scaled_view, unit_scale
+from .visibility import camera_integrator
+
+# Samples per kernel launch x pixels: bounds the wavefront's memory (about 1 GiB on the CPU).
+MAX_WAVEFRONT = 4_000_000
+PASSES = "albedo:albedo,depth:depth,position:position,normal:sh_normal,geometric:geo_normal,uv:uv"
+
+
+class Engine:
+    """Renders views of bundles under one variant.
+
+    Bundles are loaded here, before threads go away: Mitsuba's loader waits for ever on an empty pool. With
+    ``threads`` 1 sums over samples are in a fixed order, so the same seed gives the same bits; views run side by
+    side in several workers instead. 0: all cores. The bundles are variants of one scene, in the same units.
+    """
+
+    def __init__(self, variant: str, threads: int, bundles: Sequence[Path]) -> None:
+        import drjit as dr
+        import mitsuba as mi
+
+        mi.set_variant(variant)
+        mi.set_log_level(mi.LogLevel.Warn)
+        plugins.register(mi)
+        self.compiled = not variant.startswith("scalar")
+        if self.compiled:
+            paths.register(mi)
+        else:
+            _refuse_instances(bundles)
+        self.mi = mi
+        self.variant = variant
+        started = time.monotonic()
+        self.scenes = {str(bundle): mi.load_file(str(bundle)) for bundle in bundles}
+        self.load_seconds = time.monotonic() - started
+        self.unit_scale = unit_scale(bundles[0])
+        if threads > 0:  # the caller's thread works too
+            dr.set_thread_count(threads - 1)
+        self._integrators: dict[tuple[str, str, int, bool], tuple[Any, str]] = {}
+
+    def integrator(self, bundle: Path, kind: str, max_depth: int, passes: bool = False) -> tuple[Any, str]:
+        """(integrator, its name for the file's metadata); see :func:`.visibility.camera_integrator`.
+
+        passes: also compute Mitsuba's auxiliary channels, which cost time and are thrown away (for comparison).
+        """
+        if kind == "path-without-caustics" and not self.compiled:
+            raise UserError("leaving caustics out needs a jit variant of Mitsuba (LLVM or CUDA); see `dnrpipe doctor`")
+        key = (str(bundle), kind, max_depth, passes)
+        if key not in self._integrators:
+            inner, name = camera_integrator(self.mi, self.scenes[str(bundle)], max_depth, kind)
+            if passes:
+                inner, name = self.mi.load_dict({"type": "aov", "aovs": PASSES, "image": inner}), f"{name}+aov"
+            self._integrators[key] = (inner, name)
+        return self._integrators[key]
+
+    def sensor(self, view: View, lens: dict[str, float] | None = None) -> Any:
+        """A Mitsuba sensor for the view, in the bundles' units."""
+        view, lens = scaled_view(view, self.unit_scale), scaled_lens(lens, self.unit_scale)
+        return self.mi.load_dict(sensor_dict(self.mi, view, lens))
+
+    def frame(
+        self, bundle: Path, integrator: Any, sensor: Any, view: View, spp: int, seed: int
+    ) -> tuple[np.ndarray, int]:
+        """(mean RGBA [H, W, 4] float64, samples taken), in launches that fit in memory."""
+        chunk = max(1, min(spp, MAX_WAVEFRONT // (view.width * view.height)))
+        total = np.zeros((view.height, view.width, 4), dtype=np.float64)
+        done = launch = 0
+        while done < spp:
+            samples = min(chunk, spp - done)
+            part = self.mi.render(
+                self.scenes[str(bundle)],
+                sensor=sensor,
+                integrator=integrator,
+                spp=samples,
+                seed=((seed & 0xFFFFF) << 12) + launch,  # pyright: ignore[reportArgumentType]
+            )
+            total += np.array(part, dtype=np.float64)[..., :4] * samples
+            done += samples
+            launch += 1
+        return total / done, done
+
+
+def _refuse_instances(bundles: Sequence[Path]) -> None:
+    """Mitsuba 3.9.1's scalar variants end with a segmentation fault on instances under hidden emitters."""
+    for bundle in bundles:
+        if '<shape type="instance"' in bundle.read_text(encoding="utf-8"):
+            raise UserError(
+                f"{bundle}: has instances, which Mitsuba's scalar variant cannot render;"
+                " install LLVM (see `dnrpipe doctor`)"
+            )

@@ -1,0 +1,24 @@
+"""Mitsuba plugins for what Blender has and Mitsuba has not: small Python textures and BSDFs.
+
+The bundle names them in ``scene.xml`` (types ``dnr_*``), so whoever loads a bundle calls :func:`register` after
+``mi.set_variant`` and before ``mi.load_file``. In jit variants Dr.Jit compiles them into the render kernel (no
+cost to speak of); ``scalar_rgb`` interprets them, some hundred times slower, so the exporters use them only where
+a material needs one. One family per file; every class is made for the variant at hand, since its bases are.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from . import emitters, layers, lookups, normals, refraction, sums, transparency, views
+
+FAMILIES = (lookups, views, normals, sums, transparency, refraction, emitters, layers)
+
+
+def register(mi: Any) -> None:
+    """Make all ``dnr_*`` plugins known to the current variant of ``mi`` (the mitsuba module, variant set).
+
+    Calling it again for the same variant is harmless.
+    """
+    for family in FAMILIES:
+        family.register(mi)

@@ -1,0 +1,72 @@
+"""Energy of GGX lobes: albedo tables that layering and multiple scattering need. numpy only.
+
+Notation
+    m       cosine between view and normal; r roughness, alpha = r^2
+    E       albedo of the lobe with Fresnel 1:  E(m, r) = E_h[G2 / G1], h drawn from the visible normals (Heitz 2018)
+    S       the same, weighted by s(h) = (F(h) - F0) / (1 - F0), F the dielectric Fresnel term of an index of refraction
+
+So a lobe with Fresnel term f0 + (1 - f0) s has the albedo f0 E + (1 - f0) S.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+COSINES, ROUGHNESSES = 32, 32
+STRATA = 24
+MIN_ALPHA = 1e-3
+
+
+def fresnel(cosine: np.ndarray, eta: float) -> np.ndarray:
+    """Unpolarised dielectric reflectance from outside (eta >= 1)."""
+    g = np.sqrt(np.maximum(eta * eta - 1 + cosine * cosine, 0))
+    parallel = (g - cosine) / np.maximum(g + cosine, 1e-9)
+    ratio = (cosine * (g + cosine) - 1) / np.maximum(cosine * (g - cosine) + 1, 1e-9)
+    return 0.5 * parallel**2 * (1 + ratio**2)
+
+
+def average_fresnel(eta: float) -> float:
+    """Cosine-weighted mean of the dielectric Fresnel term over the hemisphere."""
+    cosine = (np.arange(512) + 0.5) / 512
+    return float((2 * cosine * fresnel(cosine, eta)).mean())
+
+
+@lru_cache(maxsize=64)
+def tables(eta: float) -> tuple[np.ndarray, np.ndarray]:
+    """(E, S), float32 [ROUGHNESSES, COSINES]; row r = i / (ROUGHNESSES - 1), column m = (j + 0.5) / COSINES."""
+    axis = (np.arange(STRATA) + 0.5) / STRATA
+    u1, u2 = (grid.ravel() for grid in np.meshgrid(axis, axis))
+    cosine = (np.arange(COSINES) + 0.5) / COSINES
+    view = np.stack([np.sqrt(1 - cosine**2), np.zeros(COSINES), cosine], axis=-1)
+    f0 = ((eta - 1) / (eta + 1)) ** 2
+    whole, share = np.zeros((2, ROUGHNESSES, COSINES), np.float32)
+    for row in range(ROUGHNESSES):
+        alpha = max((row / (ROUGHNESSES - 1)) ** 2, MIN_ALPHA)
+        half = _visible_normals(view[:, None, :], alpha, u1[None], u2[None])
+        along = (view[:, None, :] * half).sum(-1)
+        out = 2 * along[..., None] * half - view[:, None, :]
+        lambda_in, lambda_out = _smith(view[:, None, 2], alpha), _smith(out[..., 2], alpha)
+        kept = np.where(out[..., 2] > 0, (1 + lambda_in) / (1 + lambda_in + lambda_out), 0)
+        s = np.clip((fresnel(np.clip(along, 0, 1), eta) - f0) / (1 - f0), 0, 1)
+        whole[row], share[row] = kept.mean(1), (kept * s).mean(1)
+    return whole, share
+
+
+def _smith(cosine: np.ndarray, alpha: float) -> np.ndarray:
+    """Smith's Lambda of GGX."""
+    c2 = np.clip(cosine * cosine, 1e-12, 1)
+    return 0.5 * (np.sqrt(1 + alpha * alpha * (1 - c2) / c2) - 1)
+
+
+def _visible_normals(view: np.ndarray, alpha: float, u1: np.ndarray, u2: np.ndarray) -> np.ndarray:
+    """GGX normals seen from ``view``, by spherical caps (Dupuy and Benyoub 2023)."""
+    std = np.stack([view[..., 0] * alpha, view[..., 1] * alpha, view[..., 2]], axis=-1)
+    std /= np.linalg.norm(std, axis=-1, keepdims=True)
+    phi = 2 * np.pi * u1
+    z = (1 - u2) * (1 + std[..., 2]) - std[..., 2]
+    flat = np.sqrt(np.clip(1 - z * z, 0, 1))
+    h = np.stack([flat * np.cos(phi), flat * np.sin(phi), z], axis=-1) + std
+    h = np.stack([h[..., 0] * alpha, h[..., 1] * alpha, np.maximum(h[..., 2], 1e-9)], axis=-1)
+    return h / np.linalg.norm(h, axis=-1, keepdims=True)

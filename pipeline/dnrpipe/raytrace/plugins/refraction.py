@@ -1,0 +1,64 @@
+"""BSDF ``dnr_refraction``: what an interface transmits, nothing lost to Fresnel (Blender's Refraction BSDF)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from .nesting import only, parameter
+
+
+def register(mi: Any) -> None:
+    """``dnr_refraction`` for the current variant."""
+    import drjit as dr
+
+    class Refraction(mi.BSDF):
+        """Nested ``dielectric`` or ``roughdielectric`` of relative index ``eta``, its transmission divided by 1 - F.
+
+        F is the dielectric Fresnel term at the microfacet that refracts wi into wo, ``m ~ wi + eta wo``
+        (Walter et al. 2007, equation 16). Total internal reflection gives nothing, as in Cycles.
+        """
+
+        def __init__(self, props: Any) -> None:
+            super().__init__(props)
+            self.eta = parameter(mi, float(props["eta"]))
+            self.nested = only(props, mi.BSDF, "dnr_refraction")
+            self.m_components = [self.nested.flags(i) for i in range(self.nested.component_count())]
+            self.m_flags = self.nested.flags()
+            lobes = enumerate(self.m_components)
+            wanted = int(mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.DeltaTransmission)
+            self.lobe = next(i for i, flags in lobes if int(flags) & wanted)
+
+        def _only_transmission(self) -> Any:
+            ctx = mi.BSDFContext()
+            ctx.component = self.lobe
+            return ctx
+
+        def _gain(self, si: Any, wo: Any) -> Any:
+            cosine = mi.Frame3f.cos_theta(si.wi)
+            eta = dr.select(cosine >= 0, self.eta, 1 / self.eta)
+            m = dr.normalize(si.wi + wo * eta)
+            m = dr.select(mi.Frame3f.cos_theta(m) * cosine >= 0, m, -m)
+            reflected = mi.fresnel(dr.dot(si.wi, m) * dr.sign(cosine), self.eta)[0]
+            return dr.select(cosine * mi.Frame3f.cos_theta(wo) < 0, 1 / dr.maximum(1 - reflected, 1e-3), 0)
+
+        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
+            found, weight = self.nested.sample(self._only_transmission(), si, sample1, sample2, active)
+            return found, weight * self._gain(si, found.wo)
+
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self.nested.eval(self._only_transmission(), si, wo, active) * self._gain(si, wo)
+
+        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self.nested.pdf(self._only_transmission(), si, wo, active)
+
+        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+            value, density = self.nested.eval_pdf(self._only_transmission(), si, wo, active)
+            return value * self._gain(si, wo), density
+
+        def traverse(self, callback: Any) -> None:
+            callback.put("nested_bsdf", self.nested, mi.ParamFlags.Differentiable)
+
+        def to_string(self) -> str:
+            return "dnr_refraction[]"
+
+    mi.register_bsdf("dnr_refraction", Refraction)

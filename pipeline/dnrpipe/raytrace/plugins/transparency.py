@@ -1,0 +1,94 @@
+"""BSDF ``dnr_transparent``: tinted straight-through transmission beside another BSDF (Blender's Transparent BSDF)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from .nesting import nested
+
+
+def register(mi: Any) -> None:
+    """``dnr_transparent`` for the current variant."""
+    import drjit as dr
+
+    class Transparent(mi.BSDF):
+        """Mitsuba's ``mask`` with a colour: opacity a, tint c, nested f: ``a f + (1 - a) c`` straight on.
+
+        ``transmittance``: texture c (default 1). ``opacity``: texture a in [0, 1] (default 0). A nested BSDF, to be
+        two-sided itself, or none: then what is not transmitted is absorbed.
+        """
+
+        def __init__(self, props: Any) -> None:
+            super().__init__(props)
+            self.transmittance = props.get_texture("transmittance", 1.0)
+            self.opacity = props.get_texture("opacity", 0.0)
+            parts = nested(props, mi.BSDF)
+            if len(parts) > 1:
+                raise RuntimeError(f"dnr_transparent: at most one nested BSDF, found {len(parts)}")
+            self.nested = parts[0] if parts else None
+            own = [self.nested.flags(i) for i in range(self.nested.component_count())] if self.nested else []
+            null = int(mi.BSDFFlags.Null | mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide)
+            self.m_components = [*own, null]
+            self.m_flags = null | (self.nested.flags() if self.nested else 0)
+
+        def _opacity(self, si: Any, active: Any) -> Any:
+            if self.nested is None:
+                return mi.Float(0.0)
+            return dr.clip(self.opacity.eval_1(si, active), 0, 1)
+
+        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
+            opacity = self._opacity(si, active)
+            through = sample1 >= opacity
+            straight = dr.zeros(mi.BSDFSample3f)
+            straight.wo = -si.wi
+            straight.eta = 1.0
+            straight.pdf = 1.0 - opacity
+            straight.sampled_type = mi.UInt32(int(mi.BSDFFlags.Null))
+            straight.sampled_component = mi.UInt32(len(self.m_components) - 1)
+            tint = self.transmittance.eval(si, active & through)
+            if self.nested is None:
+                return straight, tint
+            rescaled = dr.minimum(sample1 / dr.maximum(opacity, 1e-6), 1)
+            found, weight = self.nested.sample(ctx, si, rescaled, sample2, active & (sample1 < opacity))
+            found.pdf *= opacity
+            return dr.select(through, straight, found), dr.select(through, tint, weight)
+
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            if self.nested is None:
+                return mi.Spectrum(0.0)
+            return self.nested.eval(ctx, si, wo, active) * self._opacity(si, active)
+
+        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            if self.nested is None:
+                return mi.Float(0.0)
+            return self.nested.pdf(ctx, si, wo, active) * self._opacity(si, active)
+
+        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+            if self.nested is None:
+                return mi.Spectrum(0.0), mi.Float(0.0)
+            value, density = self.nested.eval_pdf(ctx, si, wo, active)
+            opacity = self._opacity(si, active)
+            return value * opacity, density * opacity
+
+        def eval_null_transmission(self, si: Any, active: Any = True) -> Any:
+            opacity = self._opacity(si, active)
+            straight = self.transmittance.eval(si, active) * (1 - opacity)
+            if self.nested is None:
+                return straight
+            return straight + self.nested.eval_null_transmission(si, active) * opacity
+
+        def eval_diffuse_reflectance(self, si: Any, active: Any = True) -> Any:
+            if self.nested is None:
+                return mi.Spectrum(0.0)
+            return self.nested.eval_diffuse_reflectance(si, active) * self._opacity(si, active)
+
+        def traverse(self, callback: Any) -> None:
+            callback.put("transmittance", self.transmittance, mi.ParamFlags.Differentiable)
+            callback.put("opacity", self.opacity, mi.ParamFlags.Differentiable)
+            if self.nested is not None:
+                callback.put("nested_bsdf", self.nested, mi.ParamFlags.Differentiable)
+
+        def to_string(self) -> str:
+            return "dnr_transparent[]"
+
+    mi.register_bsdf("dnr_transparent", Transparent)

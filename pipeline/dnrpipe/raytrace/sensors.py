@@ -1,0 +1,85 @@
+"""Views as Mitsuba sensors: pinhole, and thin lens where the scene's camera has depth of field."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from dnrtrain.contract import View
+
+
+def sensor_dict(mi: Any, view: View, lens: dict[str, float] | None = None) -> dict[str, Any]:
+    """Mitsuba ``perspective`` (``thinlens`` with a lens) sensor of a view: box filter, RGBA film.
+
+    Mitsuba looks along +Z with +X left; flipping X and Z takes our OpenGL axes there.
+    The field of view is along x; pixels may be non-square only together with fl_x = fl_y.
+
+    lens: {"aperture_radius", "focus_distance"}, scene units; Blender's camera with depth of field:
+    aperture_radius = lens / (2000 fstop).
+    """
+    to_world = view.matrix @ np.diag([-1.0, 1.0, -1.0, 1.0])
+    if abs(view.fl_x - view.fl_y) > 1e-3 * view.fl_x:
+        raise ValueError(
+            f"view {view.name}: fl_x and fl_y differ ({view.fl_x:g}, {view.fl_y:g});"
+            " Mitsuba has square pixels only: resample the camera file"
+        )
+    common: dict[str, Any] = {
+        "fov_axis": "x",
+        "near_clip": 1e-4,
+        "far_clip": 1e7,
+        "to_world": mi.ScalarTransform4f(to_world.tolist()),
+        "sampler": {"type": "independent"},
+    }
+    film: dict[str, Any] = {
+        "type": "hdrfilm",
+        "pixel_format": "rgba",
+        "component_format": "float32",
+        "rfilter": {"type": "box"},
+    }
+    if lens is None:
+        return {
+            **common,
+            "type": "perspective",
+            "fov": _fov(view.width, view.fl_x),
+            "principal_point_offset_x": (view.width / 2 - view.cx) / view.width,
+            "principal_point_offset_y": (view.height / 2 - view.cy) / view.height,
+            "film": {**film, "width": view.width, "height": view.height},
+        }
+    width, left = _centred(view.width, view.cx)
+    height, top = _centred(view.height, view.cy)
+    crop = {
+        "width": width,
+        "height": height,
+        "crop_width": view.width,
+        "crop_height": view.height,
+        "crop_offset_x": left,
+        "crop_offset_y": top,
+    }
+    return {
+        **common,
+        "type": "thinlens",
+        "fov": _fov(width, view.fl_x),
+        "aperture_radius": lens["aperture_radius"],
+        "focus_distance": lens["focus_distance"],
+        "film": {
+            **film,
+            **(crop if (width, height) != (view.width, view.height) else {"width": width, "height": height}),
+        },
+    }
+
+
+def _fov(width: int, focal: float) -> float:
+    return math.degrees(2 * math.atan(0.5 * width / focal))
+
+
+def _centred(size: int, centre: float) -> tuple[int, int]:
+    """(film size, crop offset) of the smallest film about the principal point that holds the picture.
+
+    ``thinlens`` has no shifted lens: the film is symmetric about ``centre`` and cropped. Exact for a centre at
+    whole or half pixels, else off by at most a quarter of a pixel.
+    """
+    twice = round(2 * centre)
+    offset = max(0, size - twice)
+    return twice + 2 * offset, offset

@@ -1,0 +1,132 @@
+"""The ``dnr_*`` plugins of Mitsuba by themselves: known energies in a white furnace, both variants alike."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dnrpipe.raytrace import plugins
+from dnrpipe.raytrace.variants import choose_variant
+
+mi = pytest.importorskip("mitsuba")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _variant() -> None:
+    chosen = choose_variant("auto")
+    os.environ.update(chosen.environment)
+    mi.set_variant(chosen.variant)
+    plugins.register(mi)
+    plugins.register(mi)  # twice is harmless
+
+
+def rgb(*value: float) -> dict[str, Any]:
+    return {"type": "rgb", "value": list(value)}
+
+
+def diffuse(value: float) -> dict[str, Any]:
+    return {"type": "diffuse", "reflectance": rgb(value, value, value)}
+
+
+def furnace(bsdf: dict[str, Any], integrator: str = "path") -> np.ndarray:
+    """Mean radiance [3] of a sphere's middle under radiance 1 from everywhere: its albedo seen straight on."""
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": integrator, "max_depth": 8},
+            "sensor": {
+                "type": "perspective",
+                "fov": 1,
+                "to_world": mi.ScalarTransform4f().look_at([0, -10, 0], [0, 0, 0], [0, 0, 1]),
+                "film": {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}},
+            },
+            "light": {"type": "constant"},
+            "ball": {"type": "sphere", "bsdf": bsdf},
+        }
+    )
+    return np.array(mi.render(scene, spp=1024, seed=1)).mean(axis=(0, 1))
+
+
+def test_sum_adds_smooth_and_mirror_lobes() -> None:
+    mirror = {"type": "conductor", "material": "none", "specular_reflectance": rgb(0.5, 0.5, 0.5)}
+    assert furnace({"type": "dnr_add", "a": diffuse(0.3), "b": diffuse(0.4)}) == pytest.approx(0.7, abs=0.005)
+    assert furnace({"type": "dnr_add", "a": diffuse(0.3), "b": mirror}) == pytest.approx(0.8, abs=0.01)
+
+
+@pytest.mark.parametrize("integrator", ["path", "volpath"])
+def test_transparency_tints_at_both_walls(integrator: str) -> None:
+    found = furnace({"type": "dnr_transparent", "transmittance": rgb(0.5, 0.8, 1.0)}, integrator)
+    assert found == pytest.approx([0.25, 0.64, 1.0], abs=1e-3)
+
+
+def test_transparency_without_tint_is_a_mask() -> None:
+    nested = {"type": "twosided", "nested": diffuse(0.5)}
+    ours = furnace({"type": "dnr_transparent", "opacity": 0.3, "nested": nested})
+    assert ours == pytest.approx(furnace({"type": "mask", "opacity": 0.3, "nested": nested}), abs=0.01)
+
+
+@pytest.mark.parametrize("kind", [{"type": "dielectric"}, {"type": "roughdielectric", "alpha": 0.05}])
+def test_refraction_loses_nothing(kind: dict[str, Any]) -> None:
+    nested = {**kind, "int_ior": 1.45, "ext_ior": 1.0}
+    assert furnace({"type": "dnr_refraction", "eta": 1.45, "nested": nested}) == pytest.approx(1.0, abs=0.01)
+    assert furnace(nested) == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("layer", [{}, {"metallic": 1.0}, {"coat": 1.0, "coat_roughness": 0.1}])
+def test_principled_keeps_white_white(layer: dict[str, Any]) -> None:
+    found = furnace({"type": "dnr_principled", "base_color": rgb(1, 1, 1), "roughness": 0.6, **layer})
+    assert found == pytest.approx(1.0, abs=0.015)
+
+
+def test_principled_coat_of_black_reflects_its_fresnel_term() -> None:
+    black = {"type": "dnr_principled", "base_color": rgb(0, 0, 0), "roughness": 1.0, "eta": 1.0001}
+    coated = furnace({**black, "coat": 1.0, "coat_roughness": 0.05, "coat_eta": 1.5})
+    assert furnace(black) == pytest.approx(0.0, abs=1e-3)
+    assert coated == pytest.approx(0.04, abs=0.002)
+
+
+def test_view_table_is_read_by_the_cosine() -> None:
+    table = np.zeros((2, 256, 3), np.float32)
+    table[0] = np.linspace(0, 0.6, 256)[:, None]
+    table[1] = 9.0  # the back, which nobody sees
+    texture = {
+        "type": "dnr_view",
+        "size": 256,
+        "values": {"type": "bitmap", "bitmap": mi.Bitmap(table), "raw": True, "wrap_mode": "clamp"},
+    }
+    assert furnace({"type": "diffuse", "reflectance": texture}) == pytest.approx(0.6, abs=0.02)
+
+
+@pytest.mark.parametrize("flip", [0, 180])
+def test_open_emitter_glows_on_both_sides(flip: float) -> None:
+    transform = mi.ScalarTransform4f
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "direct"},
+            "sensor": {
+                "type": "perspective",
+                "fov": 20,
+                "to_world": transform().look_at([0, 0, 0.9], [0, 0, 0], [0, 1, 0]),
+                "film": {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}},
+            },
+            "lamp": {
+                "type": "rectangle",
+                "to_world": transform().translate([0, 0, 1]).rotate([1, 0, 0], flip).scale(0.5),
+                "emitter": {"type": "dnr_area", "radiance": 3.0},
+            },
+            "floor": {"type": "rectangle", "to_world": transform().scale(4), "bsdf": diffuse(0.5)},
+        }
+    )
+    # Radiosity's form factor of two parallel unit squares at distance 1 is 0.1998, from the middle 0.2395.
+    assert np.array(mi.render(scene, spp=256)).mean() == pytest.approx(3.0 * 0.5 * 0.2395, rel=0.03)
+
+
+def test_unknown_profile_and_missing_parts_are_refused() -> None:
+    with pytest.raises(RuntimeError, match="no profile"):
+        mi.load_dict({"type": "sphere", "emitter": {"type": "dnr_lamp", "profile": "laser", "radiance": 1.0}})
+    with pytest.raises(RuntimeError, match="exactly two"):
+        mi.load_dict({"type": "dnr_add", "a": diffuse(0.5)})
