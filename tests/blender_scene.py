@@ -21,7 +21,7 @@ from dnrpipe.blender.cameras import camera_animation, scene_cameras
 from dnrpipe.blender.frozen import save_geometry
 from dnrpipe.blender.gbuffer_scene import add_gbuffer_scene
 from dnrpipe.blender.geometry import freeze_scene
-from dnrpipe.blender.light import has_light, light_warnings
+from dnrpipe.blender.light import ensure_light, has_light
 from dnrpipe.blender.opening import open_scene
 from dnrpipe.blender.packing import pack_everything, save_blend
 from dnrtrain.atomic import write_json
@@ -138,7 +138,7 @@ def freeze(source: str, folder: str) -> None:
     assert len(bpy.data.objects) == before
     save_geometry(scene_dir / "geometry.npz", frozen.meshes)
     report = {
-        "warnings": warnings + frozen.warnings + light_warnings(scene, frozen.meshes),
+        "warnings": warnings + frozen.warnings + ensure_light(scene, frozen.meshes),
         "repairs": frozen.repairs,
         "atlas": atlas,
         "cameras": scene_cameras(scene),

@@ -24,11 +24,14 @@ from dnrpipe.blender.display import (  # noqa: E402
     display_values,
     export_display,
 )
-from dnrpipe.blender.export import closure, export_bundle  # noqa: E402
+from dnrpipe.blender.export import export_bundle  # noqa: E402
 from dnrpipe.blender.findings import Findings  # noqa: E402
 from dnrpipe.blender.geometry import freeze_scene  # noqa: E402
+from dnrpipe.blender.shapes import closure  # noqa: E402
 from dnrpipe.blender.textures import linear_to_srgb  # noqa: E402
+from dnrpipe.raytrace import plugins  # noqa: E402
 from dnrpipe.raytrace.variants import choose_variant  # noqa: E402
+from dnrpipe.raytrace.visibility import camera_integrator  # noqa: E402
 
 SIZE, SPP = 64, 256
 MITSUBA_SPP = 1024
@@ -203,6 +206,7 @@ def mitsuba(folder: Path) -> np.ndarray:
         chosen = choose_variant("auto")
         os.environ.update(chosen.environment)
         mi.set_variant(chosen.variant)
+    plugins.register(mi)
     scene = mi.load_file(str(folder / "scene.xml"))
     camera = bpy.context.scene.camera
     pose = np.array(camera.matrix_world)
@@ -221,7 +225,9 @@ def mitsuba(folder: Path) -> np.ndarray:
             "sampler": {"type": "independent", "sample_count": MITSUBA_SPP},
         }
     )
-    return np.array(mi.render(scene, sensor=sensor, spp=MITSUBA_SPP))
+    kind = "volpath" if scene.integrator().class_name().startswith("Vol") else "path"
+    integrator, _ = camera_integrator(mi, scene, 12, kind)
+    return np.array(mi.render(scene, sensor=sensor, spp=MITSUBA_SPP, integrator=integrator))
 
 
 def compare(folder: Path) -> tuple[float, float, Findings]:
@@ -504,24 +510,25 @@ def _kinds(findings: Findings) -> set[tuple[str, str]]:
 
 def test_procedural_and_unsupported_features_are_reported(tmp_path: Path) -> None:
     empty_scene()
-    material = principled("Procedural", Subsurface_Weight=0.3, Coat_Weight=0.5)
+    material = principled("Procedural", Subsurface_Weight=0.3, Sheen_Weight=0.5)
     tree = material.node_tree
     noise, bump = tree.nodes.new("ShaderNodeTexNoise"), tree.nodes.new("ShaderNodeBump")
     shader = tree.nodes["Principled BSDF"]
     tree.links.new(noise.outputs["Color"], shader.inputs["Base Color"])
     tree.links.new(noise.outputs["Fac"], bump.inputs["Height"])
     tree.links.new(bump.outputs["Normal"], shader.inputs["Normal"])
-    floor(material)
-    lamp("AREA", 10, (0, 0, 2), spread=math.radians(60))
-    lamp("SPOT", 10, (1, 0, 2), shadow_soft_size=0.3)
+    floor(material).visible_shadow = False
+    lamp("POINT", 10, (0, 0, 2), use_shadow=False)
+    lamp("SPOT", 10, (1, 0, 2)).scale = (1.0, 2.0, 1.0)
     findings = export(tmp_path)
     expected = {
         ("approximated", "Noise Texture node"),
         ("approximated", "subsurface scattering"),
-        ("approximated", "coat"),
+        ("approximated", "sheen"),
         ("ignored", "Bump node"),
-        ("approximated", "area lamp spread 60 degrees"),
-        ("approximated", "spot radius"),
+        ("ignored", "lamp without shadow"),
+        ("ignored", "ray visibility"),
+        ("approximated", "stretched spot"),
     }
     assert expected <= _kinds(findings)
     assert {e["material"] for e in findings.to_list() if e["feature"] == "Bump node"} == {"Procedural"}
@@ -547,7 +554,7 @@ def test_missing_image_is_magenta_and_reported(tmp_path: Path) -> None:
     assert texel[1] == 0 and texel[0] > 0.8 and texel[2] > 0.8
 
 
-def test_second_uv_layer_and_mesh_without_uv_are_reported(tmp_path: Path) -> None:
+def test_second_uv_layer_is_looked_up_and_a_mesh_without_is_reported(tmp_path: Path) -> None:
     empty_scene()
     material = principled("Two")
     tree = material.node_tree
@@ -562,8 +569,11 @@ def test_second_uv_layer_and_mesh_without_uv_are_reported(tmp_path: Path) -> Non
     while bare.data.uv_layers:
         bare.data.uv_layers.remove(bare.data.uv_layers[0])
     findings = export(tmp_path)
-    assert ("approximated", "image on a second UV layer ('Second')") in _kinds(findings)
-    assert ("missing", "UV layer 'UVMap'") in _kinds(findings)
+    assert {kind for kind, _ in _kinds(findings)} == {"missing"}
+    assert {("missing", "UV layer 'UVMap'"), ("missing", "UV layer 'Second'")} <= _kinds(findings)
+    lookups = ET.parse(tmp_path / "scene.xml").getroot().findall(".//texture[@type='dnr_uv_layer']")
+    assert [(e.get("name"), e.find("string").get("value")) for e in lookups] == [("roughness", "vertex_uv1")]
+    assert b"property float uv1_x" in (tmp_path / "meshes" / "Plane.ply").read_bytes()[:1000]
 
 
 def test_bundle_is_relative_deduplicated_and_stable(tmp_path: Path) -> None:

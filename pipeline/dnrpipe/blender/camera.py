@@ -71,4 +71,22 @@ def describe(camera: bpy.types.Object) -> dict[str, object]:
         "clip_start": data.clip_start,
         "clip_end": data.clip_end,
         "ortho_scale": data.ortho_scale,
+        "dof": _depth_of_field(camera),
     }
+
+
+def _depth_of_field(camera: bpy.types.Object) -> dict[str, float] | None:
+    """Thin lens of a camera with depth of field, scene units: aperture_radius = lens / (2000 fstop), as in Cycles.
+
+    The focus object, where there is one, gives the distance along the view axis.
+    """
+    dof = camera.data.dof
+    if not dof.use_dof or dof.aperture_fstop <= 0:
+        return None
+    distance = dof.focus_distance
+    if dof.focus_object is not None:
+        matrix = np.array(rigid(camera.matrix_world))
+        distance = abs(float((matrix[:3, 3] - np.array(dof.focus_object.matrix_world.translation)) @ matrix[:3, 2]))
+    if distance <= 0:
+        return None
+    return {"aperture_radius": camera.data.lens / (2000 * dof.aperture_fstop), "focus_distance": distance}

@@ -8,38 +8,54 @@ from typing import Any
 import bpy
 
 from .camera import describe
+from .framing import usable
 
 MAX_FRAMES = 500
 
 
 def scene_cameras(scene: bpy.types.Scene) -> list[dict[str, Any]]:
-    """Every camera object of the scene at its current frame (see :func:`camera.describe`)."""
-    return [
-        {"name": obj.name, "active": obj == scene.camera, **describe(obj)}
-        for obj in scene.objects
-        if obj.type == "CAMERA"
-    ]
+    """Every camera of the scene that can see, at the current frame (see :func:`camera.describe`)."""
+    return [{"name": obj.name, "active": obj == scene.camera, **describe(obj)} for obj in scene.objects if usable(obj)]
 
 
 def camera_animation(scene: bpy.types.Scene, max_frames: int = MAX_FRAMES) -> list[dict[str, Any]]:
     """The active camera over the frame range, at most ``max_frames`` frames; [] when it does not move.
 
-    Camera markers are followed. The scene is left at the frame it was at.
+    Camera markers are followed. Frames are evaluated in a scene that holds the cameras alone, with what they
+    depend on: a heavy scene would take minutes. Rigid-body cameras need their whole scene and stay where they are.
     """
     if not _may_move(scene):
         return []
-    before, subframe = scene.frame_current, scene.frame_subframe
     step = max(1, math.ceil((scene.frame_end - scene.frame_start + 1) / max_frames))
-    frames = []
+    helper: Any = bpy.data.scenes.new("dnrpipe.cameras")
     try:
+        for name in ("frame_map_old", "frame_map_new"):
+            setattr(helper.render, name, getattr(scene.render, name))
+        for bound in {scene.camera, *(marker.camera for marker in scene.timeline_markers)} - {None}:
+            helper.collection.objects.link(bound)
+        frames = []
         for frame in range(scene.frame_start, scene.frame_end + 1, step):
-            scene.frame_set(frame)
-            if scene.camera is not None:
-                frames.append({"frame": frame, "name": scene.camera.name, **describe(scene.camera)})
+            camera: Any = _camera_at(scene, frame)
+            helper.frame_set(frame)
+            evaluated = None if camera is None else camera.evaluated_get(helper.view_layers[0].depsgraph)
+            if evaluated is not None and usable(evaluated):
+                frames.append({"frame": frame, "name": evaluated.name, **describe(evaluated)})
     finally:
-        scene.frame_set(before, subframe=subframe)
-    moves = any({**f, "frame": 0} != {**frames[0], "frame": 0} for f in frames)
+        bpy.data.scenes.remove(helper)
+    moves = any({**f, "frame": 0, "name": ""} != {**frames[0], "frame": 0, "name": ""} for f in frames)
     return frames if moves else []
+
+
+def _camera_at(scene: bpy.types.Scene, frame: int) -> Any:
+    """The active camera at a frame: of the last marker that binds one, of the first before that, or the scene's."""
+    bound = sorted(
+        ((m.frame, m.camera) for m in scene.timeline_markers if m.camera and not m.camera.hide_render),
+        key=lambda pair: pair[0],
+    )
+    if not bound:
+        return scene.camera
+    past = [camera for start, camera in bound if start <= frame]
+    return past[-1] if past else bound[0][1]
 
 
 def _may_move(scene: bpy.types.Scene) -> bool:
@@ -53,7 +69,7 @@ def _may_move(scene: bpy.types.Scene) -> bool:
         if obj is None or obj in seen:
             continue
         seen.add(obj)
-        if obj.animation_data or (obj.data and obj.data.animation_data) or obj.rigid_body:
+        if obj.animation_data or (obj.data and obj.data.animation_data):
             return True
         todo.append(obj.parent)
         todo += [getattr(constraint, "target", None) for constraint in obj.constraints]

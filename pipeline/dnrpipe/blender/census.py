@@ -3,56 +3,50 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import bpy
+import numpy as np
 
+from .census_materials import describe_material
 from .findings import Findings
+from .frozen import FrozenMesh
 from .lights import visible_lights
+from .names import find_material
 from .sockets import find_input, resolve, surface_source, walk
 
-PROCEDURAL = {
-    "TEX_BRICK",
-    "TEX_CHECKER",
-    "TEX_GABOR",
-    "TEX_GRADIENT",
-    "TEX_MAGIC",
-    "TEX_MUSGRAVE",
-    "TEX_NOISE",
-    "TEX_VORONOI",
-    "TEX_WAVE",
-    "TEX_WHITE_NOISE",
-}
-"""Texture nodes without image."""
-VIEW_DEPENDENT = {"FRESNEL", "LAYER_WEIGHT", "LIGHT_PATH", "CAMERA", "AMBIENT_OCCLUSION"}
-VOLUME_NODES = {"VOLUME_ABSORPTION", "VOLUME_SCATTER", "PRINCIPLED_VOLUME", "VOLUME_COEFFICIENTS"}
-TRANSMISSIVE = {"BSDF_GLASS", "BSDF_REFRACTION", "BSDF_TRANSLUCENT"}
+NAMES_PER_MATERIAL = 8  # objects listed as examples for each material
 
 
-def take_census(scene: bpy.types.Scene, findings: Findings) -> dict[str, Any]:
+def take_census(scene: bpy.types.Scene, findings: Findings, meshes: Sequence[FrozenMesh]) -> dict[str, Any]:
     """Count the objects, materials, lights, images and special features that renders of ``scene`` see.
 
-    Missing images are recorded as findings ``missing``, hair and volumes as ``ignored``. The result is JSON-able;
-    its key ``findings`` holds everything collected so far.
+    meshes: the frozen geometry, so that nothing is evaluated twice. Missing images are recorded as findings
+    ``missing``; motion blur as ``ignored`` (hair and volume objects are the freezing's to report). The result is
+    JSON-able; its key ``findings`` holds everything collected so far.
     """
-    instances, triangles, types, materials, by_object = _geometry(scene)
+    instances, triangles, by_object = _counts(meshes)
+    layer = next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
+    types = Counter(obj.type for obj in layer.objects if not obj.hide_render)
+    users = _users(meshes)
+    described = {
+        name: {**describe_material(material), "objects": users[name]} for name, material in _materials(users).items()
+    }
     hair = _hair(scene)
     volumes = sorted(obj.name for obj in scene.objects if obj.type == "VOLUME" and not obj.hide_render)
-    for name in hair:
-        findings.add("ignored", "hair", "strands are not converted", object=name)
-    for name in volumes:
-        findings.add("ignored", "volume object", "not converted", object=name)
-    described = {material.name: _material(material) for material in materials}
     report: dict[str, Any] = {
         "scene": scene.name,
         "blender": bpy.app.version_string,
         "file_version": ".".join(str(v) for v in bpy.data.version),
         "objects": dict(sorted(types.items())),
+        "meshes": len(meshes),
         "instances": instances,
         "triangles": triangles,
         "triangles_by_object": by_object,
         "materials": described,
+        "default_material": users.get(None, []),
         "lights": _lights(scene),
         "world": _world(scene.world),
         "images": _images(findings),
@@ -67,6 +61,8 @@ def take_census(scene: bpy.types.Scene, findings: Findings) -> dict[str, Any]:
         "view_dependent_nodes": _using(described, "view_dependent"),
         "volumes": sorted({*volumes, *_using(described, "volume")}),
         "hair": hair,
+        "depth_of_field": sorted(o.name for o in scene.objects if o.type == "CAMERA" and o.data.dof.use_dof),
+        "motion": _motion(scene, findings),
         "view_transform": scene.view_settings.view_transform,
         "render_engine": scene.render.engine,
     }
@@ -74,104 +70,30 @@ def take_census(scene: bpy.types.Scene, findings: Findings) -> dict[str, Any]:
     return report
 
 
-def _geometry(
-    scene: bpy.types.Scene,
-) -> tuple[int, int, Counter[str], list[Any], dict[str, int]]:
-    """Instances, triangles, object types, materials in use, triangles by object; as the viewport evaluates them."""
-    layer = next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
-    with bpy.context.temp_override(scene=scene, view_layer=layer):
-        depsgraph = bpy.context.evaluated_depsgraph_get()
-    types: Counter[str] = Counter(obj.type for obj in layer.objects if not obj.hide_render)
-    counts: dict[str, int] = {}
-    materials: dict[str, Any] = {}
+def _counts(meshes: Sequence[FrozenMesh]) -> tuple[int, int, dict[str, int]]:
+    """Instances, triangles that rays can hit, and triangles of one instance by object."""
+    by_object: dict[str, int] = {}
     instances = triangles = 0
-    for instance in depsgraph.object_instances:
-        obj = instance.object
-        source = obj.original
-        if not instance.show_self or source.hide_render:
-            continue
-        if obj.type not in {"MESH", "CURVE", "SURFACE", "META", "FONT"}:
-            continue
-        if obj.name not in counts:
-            counts[obj.name] = _triangles(obj)
-        if counts[obj.name] == 0:
-            continue
-        instances += 1
-        triangles += counts[obj.name]
-        for slot in obj.material_slots:
-            if slot.material is not None:
-                original = slot.material.original
-                materials[original.name] = original
-    ordered = [materials[name] for name in sorted(materials)]
-    return instances, triangles, types, ordered, {name: counts[name] for name in sorted(counts)}
+    for mesh in meshes:
+        instances += 1 + len(mesh.copies)
+        triangles += mesh.triangles * (1 + len(mesh.copies))
+        by_object.setdefault(mesh.object_name, mesh.triangles)
+    return instances, triangles, dict(sorted(by_object.items()))
 
 
-def _triangles(obj: Any) -> int:
-    mesh = obj.to_mesh()
-    try:
-        if mesh is None:
-            return 0
-        mesh.calc_loop_triangles()
-        return len(mesh.loop_triangles)
-    finally:
-        obj.to_mesh_clear()
+def _users(meshes: Sequence[FrozenMesh]) -> dict[str | None, list[str]]:
+    """Objects by the material that they show, a few names each; None is Cycles' default grey."""
+    users: dict[str | None, dict[str, None]] = {}
+    for mesh in meshes:
+        for slot in np.unique(mesh.material_index):
+            users.setdefault(mesh.materials[int(slot)], {})[mesh.object_name] = None
+    return {name: list(objects)[:NAMES_PER_MATERIAL] for name, objects in users.items()}
 
 
-def _material(material: Any) -> dict[str, Any]:
-    """Nodes of one material and what they imply."""
-    tree = material.node_tree
-    nodes = list(walk(tree))
-    kinds = {node.type for node in nodes}
-    principled = [node for node in nodes if node.type == "BSDF_PRINCIPLED"]
-    return {
-        "bsdfs": sorted({node.bl_label for node in nodes if _is_shader(node)}),
-        "nodes": dict(sorted(Counter(node.bl_label for node in nodes).items())),
-        "procedural": sorted(node.bl_label for node in nodes if node.type in PROCEDURAL),
-        "transparent": "BSDF_TRANSPARENT" in kinds or any(_active(n, "Alpha", off=1.0) for n in principled),
-        "transmissive": bool(kinds & TRANSMISSIVE)
-        or any(_active(n, "Transmission Weight", "Transmission") for n in principled),
-        "emissive": "EMISSION" in kinds or any(_emits(n) for n in principled),
-        "subsurface": "SUBSURFACE_SCATTERING" in kinds
-        or any(_active(n, "Subsurface Weight", "Subsurface") for n in principled),
-        "metallic": bool(kinds & {"BSDF_GLOSSY", "BSDF_METALLIC"}) or any(_active(n, "Metallic") for n in principled),
-        "normal_map": "NORMAL_MAP" in kinds,
-        "bump": "BUMP" in kinds,
-        "volume": bool(kinds & VOLUME_NODES) or surface_source(tree, "Volume") is not None,
-        "displacement": surface_source(tree, "Displacement") is not None,
-        "view_dependent": sorted({node.bl_label for node in nodes if node.type in VIEW_DEPENDENT}),
-        "min_roughness": min((_roughness(n) for n in principled), default=None),
-    }
-
-
-def _is_shader(node: Any) -> bool:
-    return any(socket.type == "SHADER" for socket in node.outputs) and node.type not in {
-        "GROUP",
-        "GROUP_INPUT",
-        "REROUTE",
-    }
-
-
-def _active(node: Any, *names: str, off: float = 0.0) -> bool:
-    """Whether a scalar input is linked or differs from the value that switches the feature off."""
-    socket = find_input(node, *names)
-    if socket is None:
-        return False
-    source = resolve(socket)
-    return source.linked or abs(float(source.default) - off) > 1e-6
-
-
-def _emits(node: Any) -> bool:
-    colour = find_input(node, "Emission Color", "Emission")
-    if colour is None or not _active(node, "Emission Strength"):
-        return False
-    source = resolve(colour)
-    return source.linked or any(v > 0 for v in list(source.default)[:3])
-
-
-def _roughness(node: Any) -> float:
-    socket = find_input(node, "Roughness")
-    source = None if socket is None else resolve(socket)
-    return 1.0 if source is None or source.linked else float(source.default)
+def _materials(users: dict[str | None, list[str]]) -> dict[str, Any]:
+    """The materials in use, by the names that the geometry gives them."""
+    found = {name: find_material(name) for name in users if name is not None}
+    return {name: material for name, material in sorted(found.items()) if material is not None}
 
 
 def _lights(scene: bpy.types.Scene) -> list[dict[str, Any]]:
@@ -206,9 +128,31 @@ def _world(world: Any) -> dict[str, Any] | None:
         "name": world.name,
         "kind": "hdri" if image else "sky" if kinds["TEX_SKY"] else "nodes" if tree else "color",
         "image": image,
+        "emits": _world_emits(world),
         "volume": surface_source(tree, "Volume") is not None,
         "nodes": dict(sorted(kinds.items())),
     }
+
+
+def _world_emits(world: Any) -> bool:
+    """Whether the world gives light: anything but a plain Background that is black or of strength 0."""
+    tree = world.node_tree
+    if tree is None:
+        return any(v > 0 for v in world.color)
+    surface = surface_source(tree)
+    if surface is None:
+        return False
+    if surface.node.type != "BACKGROUND":
+        return True
+    colour, strength = (find_input(surface.node, name) for name in ("Color", "Strength"))
+    for socket in (colour, strength):
+        source = None if socket is None else resolve(socket)
+        if source is None or source.linked:
+            continue
+        values = [source.default] if isinstance(source.default, float | int) else list(source.default)[:3]
+        if not any(v > 0 for v in values):
+            return False
+    return True
 
 
 def _images(findings: Findings) -> list[dict[str, Any]]:
@@ -250,15 +194,27 @@ def is_missing(image: Any) -> bool:
 
 
 def _hair(scene: bpy.types.Scene) -> list[str]:
-    """Objects with hair: curves objects and particle systems of type hair."""
+    """Objects with hair: curves objects and particle systems of type hair that renders draw as strands."""
     names = set()
     for obj in scene.objects:
         if obj.hide_render:
             continue
-        strands = any(system.settings.type == "HAIR" for system in obj.particle_systems)
+        strands = any(
+            system.settings.type == "HAIR" and system.settings.render_type == "PATH" for system in obj.particle_systems
+        )
         if obj.type == "CURVES" or strands:
             names.add(obj.name)
     return sorted(names)
+
+
+def _motion(scene: bpy.types.Scene, findings: Findings) -> list[str]:
+    """Objects that would be blurred by their motion: animated ones, where the scene asks for motion blur."""
+    if not scene.render.use_motion_blur:
+        return []
+    moving = sorted(obj.name for obj in scene.objects if obj.animation_data and obj.animation_data.action)
+    for name in moving:
+        findings.add("ignored", "motion blur", f"frozen at frame {scene.frame_current}", object=name)
+    return moving
 
 
 def _using(materials: dict[str, dict[str, Any]], feature: str) -> list[str]:

@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import bpy
-import numpy as np
 
 from dnrpipe.errors import UserError
 from dnrtrain.contract import View
 
 from .camera import apply_view, clip_range
-from .gbuffer_scene import GBUFFER_SCENE, set_up_coverage
+from .gbuffer_scene import GBUFFER_SCENE, gbuffer_bounds, set_up_coverage
 from .opening import open_blend
 from .raster import configure_raster
 from .rendering import output_exr, render_to
@@ -28,13 +27,13 @@ def make_renderer(kind: str, common: dict[str, Any]) -> Callable[[View, Path], N
     if not source.is_file():
         raise UserError(f"{source}: no such file; run `dnrpipe prepare` first")
     if kind == "raster":
-        open_blend(source, require_geometry=False)
+        open_blend(source)
         scene = bpy.context.scene
-        bounds = _bounds(_gbuffer_scene(source))
+        bounds = gbuffer_bounds(_gbuffer_scene(source))
         configure_raster(scene, str(common["raster_engine"]), int(common["raster_samples"]))
     else:
         scene = _append_gbuffer(source)
-        bounds = _bounds(scene)
+        bounds = gbuffer_bounds(scene)
         if kind == "coverage":
             set_up_coverage(scene, int(common["coverage_samples"]))
         output_exr(scene, "layers" if kind == "gbuffer" else "image")
@@ -67,10 +66,3 @@ def _gbuffer_scene(source: Path) -> bpy.types.Scene:
     if GBUFFER_SCENE not in bpy.data.scenes:
         raise UserError(f"{source}: has no scene '{GBUFFER_SCENE}'; run `dnrpipe prepare` again")
     return bpy.data.scenes[GBUFFER_SCENE]
-
-
-def _bounds(scene: bpy.types.Scene) -> tuple[np.ndarray, float]:
-    """Centre and radius of a sphere about the box that holds the scene's meshes; scene units."""
-    corners = np.array([corner for obj in scene.objects if obj.type == "MESH" for corner in obj.bound_box])
-    low, high = corners.min(0), corners.max(0)
-    return (low + high) / 2, float(np.linalg.norm(high - low) / 2)

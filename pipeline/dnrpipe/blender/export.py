@@ -21,148 +21,79 @@ from .findings import Findings
 from .frozen import FrozenMesh
 from .lights import export_lights
 from .materials import Converted, MaterialConverter
-from .ply import write_ply
+from .names import find_material
+from .ray_visibility import report_ray_visibility
+from .shapes import export_shapes
 from .textures import ImageReader, TextureStore
+from .units import rescale, unit_scale
 from .world import export_world
 
 FORMAT_VERSION = "3.0.0"
 MAX_DEPTH = 12
 DEFAULT_FOV = 40.0
-OPEN_MESH = 1e-3
-"""A surface whose area vectors sum to more than this share of its area has a rim."""
 
 
-def export_bundle(meshes: Sequence[FrozenMesh], scene_dir: Path, findings: Findings) -> None:
-    """Write the open scene (``bpy.context.scene``) as a bundle into ``scene_dir``.
+def export_bundle(
+    meshes: Sequence[FrozenMesh], scene_dir: Path, findings: Findings, converter: MaterialConverter | None = None
+) -> dict[str | None, Converted]:
+    """Write the open scene (``bpy.context.scene``) as a bundle into ``scene_dir``; return its materials by name.
 
-    meshes: the frozen geometry, world space. Every deviation from Blender goes into ``findings``.
+    meshes: the frozen geometry, world space. converter: brings the baked textures (see :mod:`.bakes`); without one,
+    averages stand for them. Every deviation from Blender goes into ``findings``.
     """
     scene = bpy.context.scene
     assert scene is not None
-    store = TextureStore(scene_dir)
-    images = ImageReader(findings)
-    converter = MaterialConverter(store, images, findings)
+    converter = converter or MaterialConverter(TextureStore(scene_dir), ImageReader(findings), findings)
+    store, images = converter.store, converter.images
     center, radius = bounding_sphere(meshes)
 
     root = ET.Element("scene", {"version": FORMAT_VERSION})
-    root.append(_integrator())
     root.append(_sensor(center, radius))
-    shapes: list[ET.Element] = []
-    used: dict[str, Converted] = {}
-    ids = xmltree.Ids()
-    for mesh in meshes:
-        for slot in np.unique(mesh.material_index):
-            name = mesh.materials[slot]
-            material = None if name is None else bpy.data.materials.get(name)
-            converted = converter.convert(material)
-            used[converted.id] = converted
-            shapes.append(_shape(mesh, int(slot), converted, converter, scene_dir, ids, findings))
-    for converted in used.values():
+    used = [
+        [(int(slot), converter.convert(_material(mesh, int(slot)))) for slot in np.unique(mesh.material_index)]
+        for mesh in meshes
+    ]
+    materials = {converted.id: converted for slots in used for _, converted in slots}
+    shapes = export_shapes(meshes, used, converter, scene_dir, findings)
+    for element in converter.sheets_elements():
+        root.append(element)
+    media = [converted.medium for converted in materials.values() if converted.medium is not None]
+    root.insert(0, _integrator("volpath" if media else "path"))
+    for converted in materials.values():
         root.append(converted.bsdf)
+    for medium in media:
+        root.append(medium)
     for shape in shapes:
         root.append(shape)
+    report_ray_visibility((mesh.object_name for mesh in meshes), findings)
     export_lights(scene, root, store, findings, center, radius)
-    export_world(scene, root, store, images, findings)
+    export_world(scene, root, store, images, findings, center, radius)
+    if unit_scale(radius) != 1.0:
+        rescale(root, unit_scale(radius))
     ET.indent(root)
     write_text(scene_dir / "scene.xml", ET.tostring(root, encoding="unicode") + "\n")
+    return {converted.name: converted for converted in materials.values()}
+
+
+def _material(mesh: FrozenMesh, slot: int) -> bpy.types.Material | None:
+    name = mesh.materials[slot]
+    return None if name is None else find_material(name)
 
 
 def bounding_sphere(meshes: Sequence[FrozenMesh]) -> tuple[np.ndarray, float]:
     """Centre of the bounding box and half its diagonal, scene units."""
-    low = np.min([mesh.positions.min(axis=0) for mesh in meshes], axis=0).astype(np.float64)
-    high = np.max([mesh.positions.max(axis=0) for mesh in meshes], axis=0).astype(np.float64)
+    extents = [mesh.extent() for mesh in meshes]
+    low = np.min([points.min(axis=0) for points in extents], axis=0)
+    high = np.max([points.max(axis=0) for points in extents], axis=0)
     return (low + high) / 2, max(float(np.linalg.norm(high - low)) / 2, 1e-6)
 
 
-def _shape(
-    mesh: FrozenMesh,
-    slot: int,
-    converted: Converted,
-    converter: MaterialConverter,
-    scene_dir: Path,
-    ids: xmltree.Ids,
-    findings: Findings,
-) -> ET.Element:
-    """``ply`` shape of one instance's faces with one material."""
-    corners = np.repeat(mesh.material_index == slot, 3)
-    positions, normals = mesh.positions[corners], mesh.normals[corners]
-    uv = _texture_coordinates(mesh, converted, findings)
-    uv = None if uv is None else uv[corners]
-    emitter = converter.emitter(converted)
-    if emitter is not None:
-        balance, volume = closure(positions)
-        if balance < OPEN_MESH and volume < 0:  # area emitters shine along the normal only
-            order = np.arange(len(positions)).reshape(-1, 3)[:, ::-1].ravel()
-            positions, normals = positions[order], -normals[order]
-            uv = None if uv is None else uv[order]
-        _note_emission(mesh, converted, balance, findings)
-    suffix = "" if len(mesh.materials) == 1 else f"-{xmltree.safe_name(converted.name or 'default')}"
-    identity = ids.take("mesh", mesh.name + suffix)
-    relative = f"meshes/{identity.removeprefix('mesh-')}.ply"
-    write_ply(scene_dir / relative, positions, normals, uv)
-    element = xmltree.plugin("shape", "ply", id=identity)
-    xmltree.text(element, "filename", relative)
-    xmltree.reference(element, converted.id)
-    if emitter is not None:
-        element.append(emitter)
-    return element
+def _integrator(kind: str) -> ET.Element:
+    """``path``, or ``volpath`` where there are media.
 
-
-def _texture_coordinates(mesh: FrozenMesh, converted: Converted, findings: Findings) -> np.ndarray | None:
-    """The UV layer that the material's images use, [3T, 2]; None when the mesh has none."""
-    wanted = converted.uv or mesh.active_uv
-    if wanted in mesh.uv_layers:
-        return mesh.uv_layers[wanted]
-    if converted.uv is not None:
-        findings.add(
-            "missing",
-            f"UV layer '{converted.uv}'",
-            "not on this mesh: coordinates are 0, as in Cycles",
-            object=mesh.object_name,
-            material=converted.name,
-        )
-        return np.zeros((len(mesh.positions), 2), dtype=np.float32)
-    if not converted.textured:
-        return next(iter(mesh.uv_layers.values()), None)
-    findings.add(
-        "missing",
-        "UV layer",
-        "the mesh has none: image coordinates are 0, as in Cycles",
-        object=mesh.object_name,
-        material=converted.name,
-    )
-    return np.zeros((len(mesh.positions), 2), dtype=np.float32)
-
-
-def _note_emission(mesh: FrozenMesh, converted: Converted, balance: float, findings: Findings) -> None:
-    if balance >= OPEN_MESH:
-        findings.add(
-            "approximated",
-            "emissive surface with a rim",
-            "emits from its front only; Blender's emits from both sides",
-            object=mesh.object_name,
-            material=converted.name,
-        )
-
-
-def closure(positions: np.ndarray) -> tuple[float, float]:
-    """How open a surface is, and which way it faces.
-
-    Returns |sum of area vectors| / sum of areas (0 for a closed surface, by the divergence theorem) and the
-    signed volume (negative: normals point inwards).
+    Emitters and environment are invisible to the camera, as Blender's lamps over a clear film.
     """
-    triangles = positions.reshape(-1, 3, 3).astype(np.float64)
-    triangles = triangles - triangles.mean(axis=(0, 1))
-    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    total = float(np.linalg.norm(cross, axis=1).sum())
-    balance = float(np.linalg.norm(cross.sum(axis=0))) / max(total, 1e-20)
-    volume = float(np.einsum("ij,ij->", triangles[:, 0], cross)) / 6
-    return balance, volume
-
-
-def _integrator() -> ET.Element:
-    """``path``: emitters and environment are invisible to the camera, as Blender's lamps over a clear film."""
-    element = xmltree.plugin("integrator", "path", id="integrator")
+    element = xmltree.plugin("integrator", kind, id="integrator")
     xmltree.integer(element, "max_depth", MAX_DEPTH)
     xmltree.flag(element, "hide_emitters", True)
     return element

@@ -23,6 +23,11 @@ class Finding:
     note: str
 
 
+def printable(text: str) -> str:
+    """``text`` that any terminal and UTF-8 file can take: bytes of paths that are not UTF-8 become \\xNN."""
+    return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+
+
 class Findings:
     """Collector of findings, in order of discovery, without repetitions."""
 
@@ -39,7 +44,14 @@ class Findings:
         material: str | None = None,
     ) -> None:
         """Record a finding; a repetition is dropped."""
-        self._found.setdefault(Finding(kind, object, material, feature, note))
+        owner = None if object is None else printable(object)
+        shader = None if material is None else printable(material)
+        self._found.setdefault(Finding(kind, owner, shader, printable(feature), printable(note)))
+
+    def merge(self, other: Findings) -> None:
+        """Add all of another collector's findings."""
+        for finding in other._found:
+            self._found.setdefault(finding)
 
     def to_list(self) -> list[dict[str, Any]]:
         """JSON-able list of {"kind", "object", "material", "feature", "note"}."""

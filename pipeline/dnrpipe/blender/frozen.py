@@ -14,16 +14,32 @@ import numpy as np
 from dnrpipe.errors import UserError
 from dnrtrain.atomic import atomic_path
 
-GEOMETRY_VERSION = 1
+GEOMETRY_VERSION = 2
+
+ATLAS_LAYER = "dnrpipe.atlas"
+"""The scene atlas as a UV layer: ``FrozenMesh.atlas``."""
+
+
+UNIT_TEXTURE_SPACE = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 
 
 def _empty_atlas() -> np.ndarray:
     return np.zeros((0, 2), np.float32)
 
 
+def _no_copies() -> np.ndarray:
+    return np.zeros((0, 4, 4), np.float64)
+
+
+def _identity() -> np.ndarray:
+    return np.eye(4, dtype=np.float64)
+
+
 @dataclass
 class FrozenMesh:
-    """One instance of one object as unindexed triangles: corner ``3 t + k`` is corner k of triangle t.
+    """One object's surface as unindexed triangles: corner ``3 t + k`` is corner k of triangle t.
+
+    Every instance of a scene has a mesh of its own, up to a budget; beyond it they are ``copies`` of one.
 
     Counter-clockwise winding seen from outside, also for mirrored transforms.
     """
@@ -48,10 +64,41 @@ class FrozenMesh:
     """The layer that renders use by default, or None when there is no layer."""
     atlas: np.ndarray = field(default_factory=_empty_atlas)
     """float32 [3T, 2] in [0, 1), V up: this instance's own place in the scene's atlas ([0, 2] until packed)."""
+    colors: dict[str, np.ndarray] = field(default_factory=dict)
+    """float32 [3T, 4] each: colour attributes, linear Rec.709 and alpha."""
+    active_color: str | None = None
+    """The colour attribute that renders use by default, or None when there is none."""
+    object_to_world: np.ndarray = field(default_factory=_identity)
+    """float64 [4, 4]: the object's matrix; its inverse takes ``positions`` to Blender's Object coordinates."""
+    texture_space: tuple[tuple[float, float, float], tuple[float, float, float]] = UNIT_TEXTURE_SPACE
+    """(location, size), object space: Generated = (object position - location) / (2 size) + 1/2."""
+    copies: np.ndarray = field(default_factory=_no_copies)
+    """float64 [K, 4, 4]: further instances, as maps from this mesh's world space to the copy's (identity not listed).
+
+    They share the atlas place and the object id of this mesh.
+    """
+    camera_visible: bool = True
+    """False: seen in mirrors and by indirect light only (Blender's Ray Visibility, Camera)."""
+
+    strands: bool = False
+    """Hair, as thin tubes."""
 
     @property
     def triangles(self) -> int:
+        """Triangles stored, copies not counted."""
         return len(self.material_index)
+
+    def extent(self) -> np.ndarray:
+        """Points [N, 3], float64, world space, whose bounds are those of the mesh and all its copies.
+
+        The vertices, and for every copy the corners of its (transformed) box.
+        """
+        points = self.positions.astype(np.float64)
+        if not len(self.copies):
+            return points
+        low, high = points.min(0), points.max(0)
+        box = np.array([[(low, high)[k >> axis & 1][axis] for axis in range(3)] + [1.0] for k in range(8)])
+        return np.concatenate([points, (box @ self.copies.transpose(0, 2, 1)).reshape(-1, 4)[:, :3]])
 
 
 def save_geometry(path: Path, meshes: Sequence[FrozenMesh]) -> None:
@@ -67,14 +114,23 @@ def save_geometry(path: Path, meshes: Sequence[FrozenMesh]) -> None:
                 "materials": mesh.materials,
                 "active_uv": mesh.active_uv,
                 "uv_layers": list(mesh.uv_layers),
+                "colors": list(mesh.colors),
+                "active_color": mesh.active_color,
+                "texture_space": mesh.texture_space,
+                "camera_visible": mesh.camera_visible,
+                "strands": mesh.strands,
             }
         )
         arrays[f"{i}.positions"] = mesh.positions
         arrays[f"{i}.normals"] = mesh.normals
         arrays[f"{i}.material_index"] = mesh.material_index
         arrays[f"{i}.atlas"] = mesh.atlas
+        arrays[f"{i}.object_to_world"] = mesh.object_to_world
+        arrays[f"{i}.copies"] = mesh.copies
         for j, uv in enumerate(mesh.uv_layers.values()):
             arrays[f"{i}.uv.{j}"] = uv
+        for j, color in enumerate(mesh.colors.values()):
+            arrays[f"{i}.color.{j}"] = color
     header = json.dumps({"version": GEOMETRY_VERSION, "meshes": index}).encode()
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         np.savez(file, header=np.frombuffer(header, np.uint8), **arrays)
@@ -102,6 +158,13 @@ def load_geometry(path: Path) -> list[FrozenMesh]:
                     uv_layers={name: data[f"{i}.uv.{j}"] for j, name in enumerate(entry["uv_layers"])},
                     active_uv=entry["active_uv"],
                     atlas=data[f"{i}.atlas"],
+                    colors={name: data[f"{i}.color.{j}"] for j, name in enumerate(entry["colors"])},
+                    active_color=entry["active_color"],
+                    object_to_world=data[f"{i}.object_to_world"],
+                    texture_space=_texture_space(entry["texture_space"]),
+                    copies=data[f"{i}.copies"],
+                    camera_visible=entry["camera_visible"],
+                    strands=entry["strands"],
                 )
                 for i, entry in enumerate(header["meshes"])
             ]
@@ -109,3 +172,8 @@ def load_geometry(path: Path) -> list[FrozenMesh]:
         raise UserError(f"{path}: no such file; run `dnrpipe prepare` first") from None
     except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
         raise UserError(f"{path}: damaged geometry ({error}); run `dnrpipe prepare` again") from None
+
+
+def _texture_space(value: list[list[float]]) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    location, size = value
+    return (location[0], location[1], location[2]), (size[0], size[1], size[2])

@@ -3,41 +3,36 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 
 import bpy
 import numpy as np
 
 from dnrpipe.errors import UserError
 
+from .findings import Findings
 from .frozen import FrozenMesh
+from .geometry_world import REPAIRS, to_world
+from .instances import Placed, Shared, copy_matrices, share_instances
+from .local_mesh import LocalMesh, read_local, slot_names
+from .simplify import fit_instances
+from .strands import hair_systems, read_curves, read_points
 
-# A triangle whose doubled area is below this fraction of its longest edge squared has no usable normal.
-DEGENERATE = 1e-12
-SURFACELESS = {"CURVES", "POINTCLOUD", "VOLUME", "GREASEPENCIL"}
+SURFACELESS = {"VOLUME", "GREASEPENCIL"}
 
-UV_STEPS = 2**20  # artist's UVs are rounded to multiples of 1 / UV_STEPS
+LONGEST_STEM = 80  # characters of a name in file names: systems allow 255 bytes, and several names may be joined
+MOST_IDS = 32_767  # Object.pass_index, which carries ids through Cycles, is a 16-bit number
 
 
 @dataclass
 class Frozen:
-    """What :func:`freeze` found. ``repairs`` counts dropped triangles and replaced normals."""
+    """What :func:`freeze` found. ``repairs`` counts dropped triangles and replaced normals, UVs and colours."""
 
     meshes: list[FrozenMesh]
     repairs: dict[str, int]
     warnings: list[str]
-
-
-@dataclass
-class _Local:
-    """One evaluated mesh in object space, as unindexed triangles."""
-
-    positions: np.ndarray
-    normals: np.ndarray
-    material_index: np.ndarray
-    materials: list[str | None]
-    uv_layers: dict[str, np.ndarray]
-    active_uv: str | None
+    findings: Findings = field(default_factory=Findings)
 
 
 class _FreezeEngine(bpy.types.RenderEngine):
@@ -72,7 +67,17 @@ def freeze_scene(scene: bpy.types.Scene) -> Frozen:
     render = scene.render
     kept = {
         name: getattr(render, name)
-        for name in ("engine", "resolution_x", "resolution_y", "use_compositing", "use_sequencer", "use_simplify")
+        for name in (
+            "engine",
+            "resolution_x",
+            "resolution_y",
+            "resolution_percentage",
+            "use_border",
+            "use_multiview",
+            "use_compositing",
+            "use_sequencer",
+            "use_simplify",
+        )
     }
     layer = render_layer(scene)
     used = layer.use
@@ -86,6 +91,8 @@ def freeze_scene(scene: bpy.types.Scene) -> Frozen:
         layer.use = True
         render.engine = _FreezeEngine.bl_idname
         render.resolution_x = render.resolution_y = 8
+        render.resolution_percentage = 100
+        render.use_border = render.use_multiview = False
         render.use_compositing = render.use_sequencer = render.use_simplify = False
         bpy.ops.render.render(scene=scene.name, layer=layer.name)
         outcome = _FreezeEngine.outcome
@@ -106,6 +113,7 @@ def freeze_scene(scene: bpy.types.Scene) -> Frozen:
             f"scene '{scene.name}', view layer '{layer.name}': no surface is visible in renders; "
             "unhide an object or enable its collection"
         )
+    fit_instances(outcome.meshes, outcome.repairs, outcome.findings)
     return outcome
 
 
@@ -113,152 +121,88 @@ def freeze(depsgraph: bpy.types.Depsgraph) -> Frozen:
     """Collect every visible surface of an evaluated depsgraph, instances included, in world space.
 
     Normals go through the inverse transpose; mirrored transforms keep counter-clockwise winding.
-    Triangles without area or with non-finite corners are dropped and counted.
+    Triangles without area or with non-finite corners are dropped and counted. Every evaluated mesh is read once;
+    beyond a budget instances share it (see :mod:`~.instances`).
     """
-    cache: dict[tuple[str, int], _Local | None] = {}
-    found: list[tuple[str, tuple[int, ...], np.ndarray, _Local]] = []
-    skipped: dict[str, set[str]] = {}
-    unseen: set[str] = set()
+    cache: dict[tuple[object, ...], tuple[LocalMesh, bytes] | None] = {}
+    unique: dict[bytes, LocalMesh] = {}
+    placed: list[Placed] = []
+    findings = Findings()
     for instance in depsgraph.object_instances:
         obj = instance.object
-        if not instance.show_self:
+        if not (instance.show_self or instance.show_particles):
             continue
-        # Curves, text, surfaces and metaballs come a second time, as the mesh they evaluate to.
-        if not isinstance(obj.data, bpy.types.Mesh):
-            if obj.type in SURFACELESS:
-                skipped.setdefault(obj.type, set()).add(obj.name)
-            continue
-        key = (obj.name, obj.data.as_pointer() if obj.data else 0)
-        if key not in cache:
-            cache[key] = _read_local(obj)
-        if not obj.visible_camera:
-            unseen.add(obj.name)
+        matrix = np.array(instance.matrix_world, np.float64)
         persistent = tuple(instance.persistent_id) if instance.is_instance else ()
-        if (local := cache[key]) is not None:
-            found.append((obj.name, persistent, np.array(instance.matrix_world, np.float64), local))
-    warnings = [
-        f"{len(names)} object(s) of type {kind} have no surface and are left out: {', '.join(sorted(names)[:5])}"
-        for kind, names in sorted(skipped.items())
-    ]
-    if unseen:
-        warnings.append(f"hidden from the camera in Cycles but treated as visible: {', '.join(sorted(unseen)[:5])}")
-    # The depsgraph's order is not promised; names and persistent ids are.
-    found.sort(key=lambda item: (item[0], item[1]))
-    repairs = {"degenerate_triangles": 0, "non_finite_triangles": 0, "normals_replaced": 0, "uv_replaced": 0}
+        for key, read in _surfaces(obj, instance.show_self, instance.show_particles, findings):
+            if key not in cache:
+                local = read()
+                cache[key] = None if local is None or not len(local.material_index) else _intern(local, unique)
+            if (found := cache[key]) is not None:
+                placed.append(Placed(obj.name_full, persistent, matrix, *found, obj.visible_camera))
+    repairs = dict.fromkeys(REPAIRS, 0)
     ids: dict[str, int] = {}
     taken: set[str] = set()
     meshes = []
-    for name, _, matrix, local in found:
-        mesh = _to_world(name, matrix, local, repairs)
-        if mesh.triangles:
-            mesh.object_id = ids.setdefault(name, len(ids) + 1)
-            mesh.name = _unique(name, taken)
-            meshes.append(mesh)
-    return Frozen(meshes, repairs, warnings)
+    for shared in share_instances(placed):
+        lead = shared.lead
+        mesh = to_world(lead.name, lead.matrix, lead.mesh, repairs)
+        if not mesh.triangles:
+            continue
+        mesh.object_id = ids.setdefault(lead.name, min(len(ids) + 1, MOST_IDS))
+        mesh.name = _unique(lead.name, taken)
+        mesh.camera_visible = lead.camera_visible
+        mesh.copies = copy_matrices(shared)
+        if shared.others:
+            _note_sharing(shared, findings)
+        meshes.append(mesh)
+    if len(ids) > MOST_IDS:
+        note = f"{len(ids):,} objects; from number {MOST_IDS:,} on they share one id"
+        findings.add("approximated", "object ids", note)
+    return Frozen(meshes, repairs, [], findings)
 
 
-def _read_local(obj: bpy.types.Object) -> _Local | None:
-    mesh = obj.to_mesh()
-    if mesh is None:  # a metaball that is drawn with another one of its family
-        return None
-    try:
-        mesh.calc_loop_triangles()
-        count = len(mesh.loop_triangles)
-        loops = np.empty(3 * count, np.int32)
-        polygons = np.empty(count, np.int32)
-        mesh.loop_triangles.foreach_get("loops", loops)
-        mesh.loop_triangles.foreach_get("polygon_index", polygons)
-        corner_vertex = np.empty(len(mesh.loops), np.int32)
-        mesh.loops.foreach_get("vertex_index", corner_vertex)
-        vertices = np.empty((len(mesh.vertices), 3), np.float32)
-        mesh.vertices.foreach_get("co", vertices.ravel())
-        normals = np.empty((len(mesh.loops), 3), np.float32)
-        mesh.corner_normals.foreach_get("vector", normals.ravel())
-        slot = np.empty(len(mesh.polygons), np.int32)
-        mesh.polygons.foreach_get("material_index", slot)
-        uv_layers = {}
-        active = None
-        for layer in mesh.uv_layers:
-            uv = np.empty((len(mesh.loops), 2), np.float32)
-            layer.uv.foreach_get("vector", uv.ravel())
-            uv_layers[layer.name] = uv[loops]
-            if layer.active_render:
-                active = layer.name
-        materials = [s.material.name if s.material else None for s in obj.material_slots] or [None]
-        return _Local(
-            positions=vertices[corner_vertex[loops]],
-            normals=normals[loops],
-            # Renderers use the last slot for indices beyond it.
-            material_index=np.clip(slot[polygons], 0, len(materials) - 1),
-            materials=materials,
-            # Modifiers give the last bits of interpolated UVs either way from run to run: a texel's 1/256 at 4096².
-            uv_layers={layer: np.round(uv * UV_STEPS) / np.float32(UV_STEPS) for layer, uv in uv_layers.items()},
-            active_uv=active,
-        )
-    finally:
-        obj.to_mesh_clear()
+def _surfaces(
+    obj: bpy.types.Object, show_self: bool, show_particles: bool, findings: Findings
+) -> Iterator[tuple[tuple[object, ...], Callable[[], LocalMesh | None]]]:
+    """(cache key, reader) of each surface that an instance shows."""
+    data = obj.data
+    # Curves, text, surfaces and metaballs come a second time, as the mesh they evaluate to.
+    if show_self and isinstance(data, bpy.types.Mesh):
+        # Objects that share a mesh share the evaluated one too, where no modifier makes it their own.
+        owner = obj.original.data.name_full if isinstance(obj.original.data, bpy.types.Mesh) else obj.name_full
+        yield (owner, data.as_pointer(), *slot_names(obj)), lambda: read_local(obj)
+    elif show_self and obj.type == "CURVES":
+        yield (obj.name, data.as_pointer(), "curves"), lambda: read_curves(obj, findings)
+    elif show_self and obj.type == "POINTCLOUD":
+        yield (obj.name, data.as_pointer(), "points"), lambda: read_points(obj, findings)
+    elif show_self and obj.type in SURFACELESS:
+        findings.add("ignored", f"{obj.type.lower()} object", "has no surface: left out", object=obj.name)
+    if show_particles and isinstance(data, bpy.types.Mesh):
+        for name, read in hair_systems(obj, findings):
+            yield (obj.name, data.as_pointer(), "hair", name), read
 
 
-def _to_world(name: str, matrix: np.ndarray, local: _Local, repairs: dict[str, int]) -> FrozenMesh:
-    linear = matrix[:3, :3]
-    positions = local.positions.astype(np.float64) @ linear.T + matrix[:3, 3]
-    # det(M) inv(M)^T = cofactor matrix: the inverse transpose without a division, so flat scales survive.
-    columns = linear.T
-    cofactor = np.stack(
-        [np.cross(columns[1], columns[2]), np.cross(columns[2], columns[0]), np.cross(columns[0], columns[1])],
-        axis=1,
+def _intern(local: LocalMesh, unique: dict[bytes, LocalMesh]) -> tuple[LocalMesh, bytes]:
+    """One LocalMesh for all that evaluate to the same content."""
+    digest = local.digest()
+    return unique.setdefault(digest, local), digest
+
+
+def _note_sharing(shared: Shared, findings: Findings) -> None:
+    names = sorted({item.name for item in (shared.lead, *shared.others)} - {shared.lead.name})
+    also = f"; they carry its object id, {len(names)} other object(s) too: {', '.join(names[:3])}" if names else ""
+    findings.add(
+        "approximated",
+        "instances beyond the budget",
+        f"{len(shared.others) + 1:,} instances share one place in the scene's atlas{also}",
+        object=shared.lead.name,
     )
-    mirrored = np.linalg.det(linear) < 0
-    normals = local.normals.astype(np.float64) @ (-cofactor if mirrored else cofactor).T
-    order = np.arange(len(positions)).reshape(-1, 3)
-    if mirrored:
-        order = order[:, [0, 2, 1]]
-    corners = positions[order]
-    with np.errstate(invalid="ignore", over="ignore"):
-        edges = corners - np.roll(corners, 1, axis=1)
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area = np.linalg.norm(cross, axis=1)
-        longest = (edges**2).sum(-1).max(-1) if len(edges) else np.zeros(0)
-        finite = np.isfinite(corners).all((1, 2)) & np.isfinite(corners.astype(np.float32)).all((1, 2))
-        solid = area > DEGENERATE * longest
-    keep = finite & solid
-    repairs["non_finite_triangles"] += int((~finite).sum())
-    repairs["degenerate_triangles"] += int((finite & ~solid).sum())
-    order = order[keep]
-    flat = order.ravel()
-    normals, replaced = _unit_normals(normals[flat], cross[keep] / area[keep, None])
-    repairs["normals_replaced"] += replaced
-    uv_layers = {layer: uv[flat] for layer, uv in local.uv_layers.items()}
-    for uv in uv_layers.values():
-        bad = ~np.isfinite(uv)
-        repairs["uv_replaced"] += int(bad.any(1).sum())
-        uv[bad] = 0
-    return FrozenMesh(
-        name=name,
-        object_name=name,
-        object_id=0,
-        positions=positions[flat].astype(np.float32),
-        normals=normals.astype(np.float32),
-        material_index=np.ascontiguousarray(local.material_index[keep], np.int32),
-        materials=list(local.materials),
-        uv_layers=uv_layers,
-        active_uv=local.active_uv,
-        atlas=np.zeros((len(flat), 2), np.float32),
-    )
-
-
-def _unit_normals(normals: np.ndarray, face: np.ndarray) -> tuple[np.ndarray, int]:
-    """Unit corner normals [3T, 3]; zero or non-finite ones become the face normal [T, 3]. And their count."""
-    length = np.linalg.norm(normals, axis=1)
-    bad = ~np.isfinite(length) | (length == 0)
-    unit = normals / np.where(bad, 1, length)[:, None]
-    unit[bad] = np.repeat(face, 3, axis=0)[bad]
-    return unit, int(bad.sum())
 
 
 def _unique(name: str, taken: set[str]) -> str:
     """A file-safe name not yet in ``taken`` (compared without case: some file systems ignore it)."""
-    stem = re.sub(r"[^A-Za-z0-9_.-]", "_", name).lstrip(".") or "object"
+    stem = re.sub(r"[^A-Za-z0-9_.-]", "_", name).lstrip(".")[:LONGEST_STEM] or "object"
     candidate, number = stem, 1
     while candidate.lower() in taken:
         candidate = f"{stem}_{number:04d}"

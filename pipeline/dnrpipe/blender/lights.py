@@ -16,11 +16,20 @@ import numpy as np
 
 from . import xmltree
 from .findings import Findings
-from .sockets import resolve
-from .textures import TextureStore
+from .sockets import Scope, resolve
+from .textures import ImageReader, Textured, TextureStore
+from .values import Evaluator
 
 FAR_DISC = 100.0
 """Distance of a soft sun's disc, in radii of the scene."""
+WIDEST_SPOT = math.radians(85)
+"""Half angle up to which a spot's falloff fits into an image of its cross-section."""
+NEAR = 0.03
+"""Radius of a lamp, in radii of the scene, from which on its soft falloff is computed."""
+NARROWEST = math.radians(0.5)
+"""Half of the smallest spread of an area lamp."""
+POINT_RADIUS = 1e-3
+"""Radius, in radii of the scene, of a sphere that stands for a point."""
 SPOT_TEXELS = 513
 """Side of the image that carries a spot's cross-section."""
 
@@ -74,19 +83,36 @@ def export_lights(
         strength = _strength(light, obj.name, findings)
         if not np.any(strength > 0):
             continue
+        if (why := _unplaceable(light, matrix)) is not None:
+            findings.add("ignored", f"{light.type.lower()} lamp", f"{why}: left out", object=obj.name)
+            continue
         _note_ignored(obj, light, findings)
         identity = ids.take("light", obj.name)
         if light.type == "POINT":
-            element = _point(light, matrix, strength, identity)
+            element = _point(light, matrix, strength, identity, radius)
         elif light.type == "SUN":
             element = _sun(light, matrix, strength, identity, center, radius)
         elif light.type == "SPOT":
-            element = _spot(light, matrix, strength, identity, obj.name, store, findings)
+            element = _spot(light, matrix, strength, identity, obj.name, store, findings, radius)
         else:
-            element = _area(light, matrix, strength, identity, obj.name, findings)
+            element = _area(light, matrix, strength, identity)
         root.append(element)
         count += 1
     return count
+
+
+def _unplaceable(light: Any, matrix: np.ndarray) -> str | None:
+    """Why a lamp cannot shine from where it is, or None."""
+    if not np.isfinite(matrix).all():
+        return "its place is not finite (NaN, infinite)"
+    lengths = np.linalg.norm(matrix[:3, :3], axis=0)
+    if light.type in {"SUN", "SPOT"} and not lengths[2] > 0:
+        return "its scale is 0: it has no direction"
+    if light.type == "AREA":
+        height = light.size_y if light.shape in {"RECTANGLE", "ELLIPSE"} else light.size
+        if not (light.size * lengths[0] > 0 and height * lengths[1] > 0):
+            return "its area is 0, which gives no light in Cycles either"
+    return None
 
 
 def _strength(light: Any, name: str, findings: Findings) -> np.ndarray:
@@ -101,7 +127,7 @@ def _strength(light: Any, name: str, findings: Findings) -> np.ndarray:
 
 
 def _node_colour(tree: bpy.types.NodeTree, name: str, findings: Findings) -> np.ndarray:
-    """Constant Emission colour x strength of a lamp's node tree; other nodes are a finding."""
+    """Emission colour x strength of a lamp's node tree; what varies becomes its mean, with a finding."""
     output = tree.get_output_node("CYCLES")
     source = resolve(output.inputs["Surface"]) if output else None
     if source is None or not source.linked:
@@ -109,21 +135,32 @@ def _node_colour(tree: bpy.types.NodeTree, name: str, findings: Findings) -> np.
     if source.node.type != "EMISSION":
         findings.add("approximated", "lamp nodes", "only an Emission node is understood", object=name)
         return np.ones(3)
-    total = np.ones(3)
-    for socket_name in ("Color", "Strength"):
-        value = resolve(source.node.inputs[socket_name], source.scope)
-        constant = value.linked and value.node.type in {"RGB", "VALUE"}
-        default = value.node.outputs[0].default_value if constant else value.default
-        if value.linked and not constant:
-            findings.add(
-                "approximated",
-                f"lamp node {value.node.bl_label}",
-                f"not converted: 1 stands for the textured {socket_name.lower()}",
-                object=name,
-            )
-            continue
-        total = total * (np.array(default[:3]) if socket_name == "Color" else float(default))
-    return total
+    trial = Findings()
+    evaluator = Evaluator(None, ImageReader(trial), trial)
+    colour = evaluator.colour(source.node.inputs["Color"], source.scope).mean
+    strength = _falloff(source.node.inputs["Strength"], source.scope, name, findings)
+    if strength is None:
+        strength = evaluator.scalar(source.node.inputs["Strength"], source.scope).scalar
+    for finding in trial.to_list():
+        findings.add(finding["kind"], f"lamp's {finding['feature']}", finding["note"], object=name)
+    if isinstance(evaluator.colour(source.node.inputs["Color"], source.scope), Textured):
+        findings.add("approximated", "textured lamp", "its mean colour shines in all directions", object=name)
+    return np.asarray(colour, dtype=np.float64) * strength
+
+
+def _falloff(socket: Any, scope: Scope, name: str, findings: Findings) -> float | None:
+    """Strength of a Light Falloff node (its quadratic output is how light falls off anyway); None for other nodes."""
+    source = resolve(socket, scope)
+    if not source.linked or source.node.type != "LIGHT_FALLOFF":
+        return None
+    if source.socket.name != "Quadratic":
+        findings.add(
+            "approximated",
+            f"{source.socket.name.lower()} light falloff",
+            "falls off with the square of the distance",
+            object=name,
+        )
+    return float(source.node.inputs["Strength"].default_value)
 
 
 def _note_ignored(obj: Any, light: Any, findings: Findings) -> None:
@@ -136,18 +173,12 @@ def _note_ignored(obj: Any, light: Any, findings: Findings) -> None:
     linking = getattr(obj, "light_linking", None)
     if linking is not None and (linking.receiver_collection or linking.blocker_collection):
         findings.add("ignored", "light linking", "the lamp lights everything", object=obj.name)
-    if light.type == "POINT" and light.shadow_soft_size > 1e-5 and light.use_soft_falloff:
-        findings.add(
-            "approximated", "soft falloff", "a true sphere: some percent off close to the lamp", object=obj.name
-        )
-    if light.type != "SUN" and not light.normalize:
-        findings.add("approximated", "lamp power not normalised", "converted through its area", object=obj.name)
 
 
-def _point(light: Any, matrix: np.ndarray, power: np.ndarray, identity: str) -> ET.Element:
+def _point(light: Any, matrix: np.ndarray, power: np.ndarray, identity: str, scene_radius: float) -> ET.Element:
     """Point lamp -> ``point``, I = P / (4 pi), or, with a radius, an emitting ``sphere``, L = P / (4 pi^2 r^2).
 
-    The sphere's intensity is L pi r^2, the same.
+    The sphere's intensity is L pi r^2, the same. Soft falloff: emitter ``dnr_lamp``, where the radius matters.
     """
     radius = float(light.shadow_soft_size)
     position = matrix[:3, 3]
@@ -159,9 +190,19 @@ def _point(light: Any, matrix: np.ndarray, power: np.ndarray, identity: str) -> 
     element = xmltree.plugin("shape", "sphere", id=identity)
     _position(element, "center", position)
     xmltree.number(element, "radius", radius)
-    area = 4 * math.pi * radius**2 if light.normalize else 4.0
-    _emit(element, power / (math.pi * area))
+    area = 4 * math.pi * radius**2 if light.normalize else 1.0
+    if _softens(light, scene_radius):
+        emitter = _emit(element, power / (math.pi * area), "dnr_lamp")
+        xmltree.text(emitter, "profile", "point")
+        xmltree.number(emitter, "soft", radius)
+    else:
+        _emit(element, power / (math.pi * area))
     return element
+
+
+def _softens(light: Any, scene_radius: float) -> bool:
+    """Whether soft falloff makes a difference at distances of about a scene's radius (r^2 / d^2 above 0.1%)."""
+    return bool(light.use_soft_falloff) and light.shadow_soft_size > NEAR * scene_radius
 
 
 def _sun(
@@ -178,6 +219,17 @@ def _sun(
         xmltree.vector(element, "direction", towards)
         xmltree.rgb(element, "irradiance", irradiance)
         return element
+    return far_disc(towards, 2 * half, irradiance, identity, center, radius)
+
+
+def far_disc(
+    towards: np.ndarray, angle: float, irradiance: np.ndarray, identity: str, center: np.ndarray, radius: float
+) -> ET.Element:
+    """Emitting ``disk`` far away: light travels along ``towards`` (unit, [3]) from a disc of ``angle`` radians.
+
+    Radiance E / (pi sin^2(angle / 2)), E the irradiance [3] of a surface that faces it. center, radius: of the scene.
+    """
+    half = angle / 2
     distance = FAR_DISC * max(radius, 1e-3)
     placed = np.eye(4)
     placed[:3, :3] = _frame(towards) * (distance * math.tan(half))
@@ -196,20 +248,36 @@ def _spot(
     name: str,
     store: TextureStore,
     findings: Findings,
+    scene_radius: float,
 ) -> ET.Element:
-    """Spot -> ``spot`` whose cross-section image carries Cycles' falloff (Mitsuba's own is 0.117 off).
+    """Spot without radius -> ``spot`` whose cross-section image carries Cycles' falloff (Mitsuba's own is 0.117 off).
 
     Cycles: smoothstep((cos t - cos h) / ((1 - cos h) blend)), h half the cone. On axis I = P / (4 pi).
+    With a radius r, or too wide for an image (then r is tiny): a ``sphere`` of L = P / (4 pi^2 r^2) whose emitter
+    ``dnr_lamp`` has that falloff.
     """
-    if light.shadow_soft_size > 1e-5:
-        findings.add("approximated", "spot radius", "a point: its shadows are sharp", object=name)
     if light.use_square:
         findings.add("ignored", "square spot", "its cone is round, as in Cycles", object=name)
+    scales = np.linalg.norm(matrix[:3, :3], axis=0)
+    if np.ptp(scales) > 1e-3 * scales.max():
+        findings.add("approximated", "stretched spot", "its cone is round", object=name)
     half = 0.5 * float(light.spot_size)
-    if half > math.radians(85):
-        findings.add("approximated", "spot wider than 170 degrees", "cut at 170 degrees", object=name)
-        half = math.radians(85)
     direction = -_unit(matrix[:3, 2])
+    radius = float(light.shadow_soft_size)
+    if radius > 1e-5 or half > WIDEST_SPOT:
+        radius = radius if radius > 1e-5 else POINT_RADIUS * scene_radius
+        area = 4 * math.pi * radius**2 if light.normalize or light.shadow_soft_size <= 1e-5 else 1.0
+        element = xmltree.plugin("shape", "sphere", id=identity)
+        _position(element, "center", matrix[:3, 3])
+        xmltree.number(element, "radius", radius)
+        emitter = _emit(element, power / (math.pi * area), "dnr_lamp")
+        xmltree.text(emitter, "profile", "spot")
+        xmltree.vector(emitter, "axis", direction)
+        xmltree.number(emitter, "cutoff", math.cos(half))
+        xmltree.number(emitter, "span", max((1 - math.cos(half)) * float(light.spot_blend), 1e-4))
+        if _softens(light, scene_radius):
+            xmltree.number(emitter, "soft", radius)
+        return element
     placed = np.eye(4)
     placed[:3, :3] = _frame(direction)
     placed[:3, 3] = matrix[:3, 3]
@@ -238,17 +306,12 @@ def spot_section(half: float, blend: float) -> np.ndarray:
     return np.repeat((t * t * (3 - 2 * t))[..., None], 3, axis=2).astype(np.float32)
 
 
-def _area(
-    light: Any, matrix: np.ndarray, power: np.ndarray, identity: str, name: str, findings: Findings
-) -> ET.Element:
-    """Area lamp -> emitting ``rectangle`` or ``disk``; radiance P / (pi A), A with the object's scale."""
-    if light.spread < math.pi - 1e-3:
-        findings.add(
-            "approximated",
-            f"area lamp spread {math.degrees(light.spread):.0f} degrees",
-            "emits over the whole half space: wider and, on axis, darker",
-            object=name,
-        )
+def _area(light: Any, matrix: np.ndarray, power: np.ndarray, identity: str) -> ET.Element:
+    """Area lamp -> emitting ``rectangle`` or ``disk``; radiance P / (pi A), A with the object's scale.
+
+    A spread below 180 degrees: emitter ``dnr_lamp``, radiance times (tan h - tan t) / (tan h - h), h half the spread,
+    t the angle to the normal.
+    """
     round_ = light.shape in {"DISK", "ELLIPSE"}
     size_x = float(light.size)
     size_y = float(light.size_y) if light.shape in {"RECTANGLE", "ELLIPSE"} else size_x
@@ -262,14 +325,21 @@ def _area(
     area = float(np.linalg.norm(np.cross(placed[:3, 0], placed[:3, 1]))) * (math.pi if round_ else 4.0)
     element = xmltree.plugin("shape", "disk" if round_ else "rectangle", id=identity)
     xmltree.matrix(element, "to_world", placed)
-    _emit(element, power / (math.pi * (area if light.normalize else 1.0)))
+    half = max(0.5 * float(light.spread), NARROWEST)
+    wide = half > math.pi / 2 - 1e-3
+    emitter = _emit(element, power / (math.pi * (area if light.normalize else 1.0)), "area" if wide else "dnr_lamp")
+    if not wide:
+        xmltree.text(emitter, "profile", "spread")
+        xmltree.number(emitter, "tangent", math.tan(half))
+        xmltree.number(emitter, "scale", 1 / (math.tan(half) - half))
     return element
 
 
-def _emit(shape: ET.Element, radiance: np.ndarray) -> None:
-    emitter = xmltree.plugin("emitter", "area")
+def _emit(shape: ET.Element, radiance: np.ndarray, kind: str = "area") -> ET.Element:
+    emitter = xmltree.plugin("emitter", kind)
     xmltree.rgb(emitter, "radiance", radiance)
     shape.append(emitter)
+    return emitter
 
 
 def _position(element: ET.Element, name: str, value: np.ndarray) -> None:

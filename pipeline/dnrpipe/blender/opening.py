@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,9 +10,15 @@ import bpy
 
 from dnrpipe.errors import UserError
 
+from .mending import mend_shaders
+from .missing import missing_files, missing_warnings, strict_refusal
+from .names import repair_names
+from .scripts import script_warnings
+
 BLEND_MAGIC = (b"BLENDER", b"\x28\xb5\x2f\xfd", b"\x1f\x8b")  # plain, zstd, gzip
-GEOMETRY_TYPES = {"MESH", "CURVE", "SURFACE", "META", "FONT"}
-SHAPELESS_IMAGES = {"GENERATED", "VIEWER"}  # sources without a file
+BLEND_SUFFIX = re.compile(r"\.blend\d*", re.IGNORECASE)  # .blend1 and so on are Blender's backups
+OWN_SCENES = "dnrpipe."  # scenes of a source.blend that is converted once more
+UNNODED = "Versioning: Use Nodes was removed"  # Blender 5's label on nodes it made for materials without any
 
 
 def _import_gltf(path: str) -> None:
@@ -32,14 +38,17 @@ IMPORTERS: dict[str, Callable[[str], object]] = {
 }
 
 
-def open_scene(path: str | Path) -> list[str]:
+def open_scene(path: str | Path, *, strict: bool = False) -> list[str]:
     """Make ``path`` the open file of this process and return warnings for the user.
 
     Scripts embedded in the file (text blocks, Python drivers) are never executed. Mesh formats are
-    imported into an empty scene; they bring no light.
+    imported into an empty scene. Of several scenes the active one is taken, or the first with objects.
+
+    Args:
+        strict: refuse a file that refers to missing images, libraries, fonts, volumes or caches.
 
     Raises:
-        UserError: no such file, unknown format, damaged file, or no renderable mesh.
+        UserError: no such file, unknown format, damaged file, no objects; ``strict`` and something is missing.
     """
     path = Path(path).resolve()
     if path.is_dir():
@@ -48,15 +57,24 @@ def open_scene(path: str | Path) -> list[str]:
         raise UserError(f"{path}: no such file")
     suffix = path.suffix.lower()
     if suffix in IMPORTERS:
-        return _import(path, suffix)
-    if suffix != ".blend":
+        _import(path, suffix)
+        warnings = []
+    elif BLEND_SUFFIX.fullmatch(suffix) or _looks_like_blend(path):
+        warnings = open_blend(path)
+    else:
         known = ", ".join([".blend", *IMPORTERS])
         raise UserError(f"{path}: cannot read '{suffix or path.name}' files; known are {known}")
-    return open_blend(path)
+    warnings += repair_names()
+    warnings += mend_shaders()
+    warnings += _choose_scene(path)
+    missing = missing_files()
+    if strict and missing:
+        raise UserError(f"{path}: {strict_refusal(missing)}")
+    return warnings + missing_warnings(missing) + script_warnings()
 
 
-def open_blend(path: Path, *, require_geometry: bool = True) -> list[str]:
-    """Open a .blend file. See :func:`open_scene`."""
+def open_blend(path: Path) -> list[str]:
+    """Open a .blend file of any Blender; warnings on versions. Raises UserError when it is not one, or damaged."""
     with path.open("rb") as file:
         head = file.read(7)
     if not head:
@@ -67,91 +85,94 @@ def open_blend(path: Path, *, require_geometry: bool = True) -> list[str]:
         bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False, use_scripts=False)
     except RuntimeError as error:
         reason = " ".join(str(error).removeprefix("Error: ").split())
+        if "Big Endian" in reason:
+            raise UserError(
+                f"{path}: saved on a big-endian machine, which Blender {_version(bpy.app.version)} no longer reads;"
+                " save it from Blender 4.5 or older"
+            ) from None
         raise UserError(f"{path}: damaged or truncated .blend; save it from Blender again ({reason})") from None
+    return _version_warnings()
+
+
+def _looks_like_blend(path: Path) -> bool:
+    """Whether a file of another suffix is an uncompressed .blend."""
+    with path.open("rb") as file:
+        return file.read(7) == BLEND_MAGIC[0]
+
+
+def _version(numbers: tuple[int, ...]) -> str:
+    return ".".join(map(str, numbers[:2]))
+
+
+def _version_warnings() -> list[str]:
+    saved, here = tuple(bpy.data.version), bpy.app.version
+    if saved[:2] > here[:2]:
+        return [
+            f"saved by Blender {_version(saved)}, read by {_version(here)}: some data may be lost; compare the picture"
+        ]
     warnings = []
-    if bpy.data.version[:2] > bpy.app.version[:2]:
-        saved = ".".join(map(str, bpy.data.version[:2]))
-        here = ".".join(map(str, bpy.app.version[:2]))
-        warnings.append(f"saved by Blender {saved}, read by {here}: some data may be lost; compare the picture")
-    warnings += missing_files()
-    if require_geometry:
-        require_renderable(path)
+    if saved < (2, 50):
+        warnings.append(f"saved by Blender {_version(saved)}: Blender {_version(here)} reads no animation of it")
+    if saved < (2, 80):
+        plain = [m for m in bpy.data.materials if m.users and m.node_tree and _unnoded(m.node_tree)]
+        if plain:
+            warnings.append(
+                f"saved by Blender {_version(saved)}: of {len(plain)} material(s) of Blender Internal only the colour"
+                " remains, as in Blender itself"
+            )
     return warnings
 
 
-def _import(path: Path, suffix: str) -> list[str]:
+def _unnoded(tree: bpy.types.NodeTree) -> bool:
+    return any(node.type == "FRAME" and node.label == UNNODED for node in tree.nodes)
+
+
+def _import(path: Path, suffix: str) -> None:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     try:
         IMPORTERS[suffix](str(path))
-    except RuntimeError as error:
-        reason = " ".join(str(error).removeprefix("Error: ").split())
+    except (RuntimeError, ValueError, KeyError, IndexError, OSError) as error:  # the glTF importer is Python
+        reason = " ".join(str(error).removeprefix("Error: ").split())[:200]
         raise UserError(f"{path}: cannot be imported as {suffix[1:].upper()} ({reason})") from None
-    require_renderable(path)
-    return [*_neutral_light(path), *missing_files()]
+    if not bpy.context.scene.objects:
+        raise UserError(f"{path}: nothing was imported from it; is it a valid {suffix[1:].upper()} file?")
 
 
-def _neutral_light(path: Path) -> list[str]:
-    """Mesh formats bring no world and often no lamp: a white world of strength 1 then, said to the user."""
-    scene = bpy.context.scene
-    if scene.world is not None or any(o.type == "LIGHT" for o in scene.objects):
-        return []
-    world = bpy.data.worlds.new("neutral")
-    world.use_nodes = True
-    background = next(node for node in world.node_tree.nodes if node.type == "BACKGROUND")
-    background.inputs["Color"].default_value = (1.0, 1.0, 1.0, 1.0)
-    background.inputs["Strength"].default_value = 1.0
-    scene.world = world
-    return [f"{path.name} brings no light: a white world of strength 1 lights it"]
+def _choose_scene(path: Path) -> list[str]:
+    """Stay in the active scene; if it has no objects, go to the first one that has."""
+    for scene in [s for s in bpy.data.scenes if s.name.startswith(OWN_SCENES)]:
+        if len(bpy.data.scenes) > 1:
+            bpy.data.scenes.remove(scene)
+    scenes = list(bpy.data.scenes)
+    active = bpy.context.scene
+    filled = [scene for scene in scenes if _may_show(scene)]
+    if not filled:
+        raise UserError(
+            f"{path}: {_scene_list(scenes)} no object with a surface{_loose_objects()};"
+            " open a file with at least one visible object"
+        )
+    if active not in filled:
+        bpy.context.window.scene = filled[0]
+        return [f"the active scene '{active.name}' has no objects to show: scene '{filled[0].name}' is converted"]
+    if len(scenes) > 1:
+        names = ", ".join(f"'{scene.name}'" for scene in scenes[:5])
+        return [f"the file has {len(scenes)} scenes ({names}): the active one, '{active.name}', is converted"]
+    return []
 
 
-def external_files(path: Path) -> list[Path]:
-    """Files beside ``path`` that the open scene was read from: images, libraries, .mtl and glTF buffers."""
-    found = [
-        Path(bpy.path.abspath(image.filepath, library=image.library))
-        for image in bpy.data.images
-        if image.filepath and not image.packed_file
-    ]
-    found += [Path(bpy.path.abspath(library.filepath)) for library in bpy.data.libraries]
-    if path.suffix.lower() == ".obj":
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-        found += [path.parent / line.split(maxsplit=1)[1].strip() for line in lines if line.startswith("mtllib ")]
-    elif path.suffix.lower() == ".gltf":
-        buffers = json.loads(path.read_text(encoding="utf-8")).get("buffers", [])
-        found += [path.parent / b["uri"] for b in buffers if "uri" in b and not b["uri"].startswith("data:")]
-    return sorted({file.resolve() for file in found if file.is_file()})
+def _scene_list(scenes: list[bpy.types.Scene]) -> str:
+    return f"scene '{scenes[0].name}' has" if len(scenes) == 1 else f"none of its {len(scenes)} scenes has"
 
 
-def require_renderable(path: Path) -> None:
-    """Raise UserError when the active scene has nothing that could be frozen."""
-    scene = bpy.context.scene
-    shapes = [o for o in scene.objects if o.type in GEOMETRY_TYPES or o.instance_type == "COLLECTION"]
-    if not shapes:
-        raise UserError(f"{path}: scene '{scene.name}' has no mesh; open a file with at least one visible object")
-    if all(o.hide_render for o in shapes):
-        raise UserError(f"{path}: every object of scene '{scene.name}' is hidden in renders; enable one")
+def _loose_objects() -> str:
+    """A hint for files of assets: objects that lie in no scene."""
+    count = sum(obj.type == "MESH" and not obj.users_scene for obj in bpy.data.objects)
+    return f" ({count} mesh objects lie in no scene)" if count else ""
 
 
-def missing_files() -> list[str]:
-    """One warning per image, library or font of the open file that is not on disk."""
-    warnings = []
-    for image in bpy.data.images:
-        if image.packed_file or image.packed_files or image.source in SHAPELESS_IMAGES or not image.filepath:
-            continue
-        file = Path(bpy.path.abspath(image.filepath, library=image.library))
-        if image.source == "TILED":
-            tiles = image.tiles
-            number = str(tiles[0].number) if tiles else "1001"
-            file = Path(str(file).replace("<UDIM>", number))
-        if not file.is_file():
-            warnings.append(f"image '{image.name}': {file} is missing; it renders magenta")
-    for library in bpy.data.libraries:
-        file = Path(bpy.path.abspath(library.filepath))
-        if not library.packed_file and not file.is_file():
-            warnings.append(f"linked library {file} is missing; its objects are absent")
-    for font in bpy.data.fonts:
-        if font.filepath in ("", "<builtin>") or font.packed_file:
-            continue
-        file = Path(bpy.path.abspath(font.filepath, library=font.library))
-        if not file.is_file():
-            warnings.append(f"font '{font.name}': {file} is missing; its text changes shape")
-    return warnings
+def _may_show(scene: bpy.types.Scene) -> bool:
+    """Whether any object, of the background set too, could give a surface: it carries geometry, or instances some."""
+    bodiless = {"EMPTY", "CAMERA", "LIGHT", "LIGHT_PROBE", "SPEAKER", "ARMATURE", "LATTICE"}
+    if any(obj.type not in bodiless or obj.instance_type == "COLLECTION" for obj in scene.objects):
+        return True
+    return scene.background_set is not None and _may_show(scene.background_set)

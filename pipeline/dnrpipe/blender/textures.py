@@ -48,12 +48,21 @@ class Placement:
 
     uv: name of the UV layer, None for the mesh's render-active one.
     to_uv: 3x3 affine map from that layer's coordinates to image coordinates, row-major.
+    region: the texels are those of this material's region of the scene atlas, [N, 1, C] (see :mod:`.bake_regions`).
+    corners: the texels are a colour attribute's values at the material's stacked corners, [M, 1, C].
     """
 
     uv: str | None = None
     to_uv: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     filter: Literal["bilinear", "nearest"] = "bilinear"
     wrap: Literal["repeat", "clamp", "mirror"] = "repeat"
+    region: str | None = None
+    corners: str | None = None
+
+    @property
+    def plain(self) -> bool:
+        """An image of its own, placed by a UV layer."""
+        return self.region is None and self.corners is None
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,13 +201,9 @@ class ImageReader:
         if space == "sRGB":
             return codes, True
         if not (image.colorspace_settings.is_data or space.startswith("Linear Rec.709")):
-            self.findings.add(
-                "approximated",
-                f"colour space '{space}' of image '{image.name}'",
-                "read as sRGB",
-                material=material,
-            )
-            return codes, True
+            from .colour_spaces import decode
+
+            return decode(codes, space), False
         return codes, False
 
 
@@ -227,7 +232,8 @@ class TextureStore:
     def element(self, value: Textured, name: str, label: str, *, raw: bool = False) -> ET.Element:
         """``<texture type="bitmap">`` for ``value`` (Mitsuba plugin doc: bitmap).
 
-        label: readable start of the file name. raw: the texels are data, not colour (no range check).
+        The value must be an image of its own (``placement.plain``). label: readable start of the file name. raw: the
+        texels are data, not colour (no range check).
         """
         element = xmltree.plugin("texture", "bitmap", name=name)
         xmltree.text(element, "filename", self.save(value.texels, value.srgb, label))

@@ -1,49 +1,62 @@
 """Values of shader sockets: constants, image textures, and colour arithmetic on them.
 
-Nodes that only depend on images of one placement are evaluated texel by texel, exactly. Everything else
-(procedural textures, view-dependent nodes) becomes its average, with a finding: never silently.
+Nodes that only depend on images of one placement are evaluated texel by texel, exactly; a plain colour attribute is
+kept at the corners. Everything else is baked by Cycles over the scene atlas (:mod:`.bakes`). What cannot be baked
+becomes its average. Both with a finding: never silently.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from mathutils import Euler
 
+from .averages import procedural_mean
+from .bakes import BakeBook, Kind
+from .blackbody import blackbody_colour
 from .color_nodes import OPERATIONS
+from .corner_colours import ACTIVE_COLOUR, colour_corners, is_uv_layer
+from .filtering import finer
 from .findings import Findings
+from .placing import image_placement
+from .sheets import on_region
 from .sockets import Scope, Source, find_input, resolve
 from .textures import Constant, ImageReader, Placement, Textured, Value, constant
+from .view_dependent import fresnel_node, layer_weight_facing, layer_weight_fresnel
 
-FRESNEL_AVERAGE = 0.09
-"""Cosine-weighted mean of the dielectric Fresnel term at IOR 1.45-1.5 (0.085-0.092)."""
 LIGHT_PATH_DEFAULTS = {"Is Camera Ray": 1.0}
 """Light Path outputs taken as constants: a directly seen surface; all other outputs are 0."""
-EXTENSIONS = {"REPEAT": "repeat", "EXTEND": "clamp", "CLIP": "clamp", "MIRROR": "mirror"}
+
+
+class Inexact(Exception):
+    """A value that textures and constants cannot hold exactly: (feature, what is used where it is not baked)."""
 
 
 @dataclass
 class Evaluator:
-    """Evaluates sockets of one material."""
+    """Evaluates sockets of one material.
+
+    material: its full name, None outside of materials. book: where baked values come from; None: averages only.
+    exact: raise Inexact rather than taking an average (used inside).
+    """
 
     material: str | None
     images: ImageReader
     findings: Findings
-    vertex_colour: Callable[[str], tuple[float, float, float] | None]
+    book: BakeBook | None = None
+    exact: bool = False
 
     def colour(self, socket: Any, scope: Scope = ()) -> Value:
         """Value of a colour socket; textures have 3 channels."""
-        value = self._value(socket, scope)
+        value = self._evaluated(socket, scope, "colour")
         if isinstance(value, Textured) and value.texels.shape[2] == 1:
-            return Textured(np.repeat(value.texels, 3, axis=2), value.srgb, value.placement)
+            return replace(value, texels=np.repeat(value.texels, 3, axis=2))
         return value
 
     def scalar(self, socket: Any, scope: Scope = ()) -> Value:
         """Value of a scalar socket; textures have 1 channel (a colour is converted to luminance)."""
-        value = self._value(socket, scope)
+        value = self._evaluated(socket, scope, "scalar")
         return value.grey() if isinstance(value, Textured) else constant(value.scalar)
 
     def number(self, socket: Any, scope: Scope = ()) -> float:
@@ -52,6 +65,49 @@ class Evaluator:
         if isinstance(value, Textured):
             self.note("approximated", f"texture on '{socket.name}'", "the mean is used")
         return value.scalar
+
+    def normal(self, socket: Any, scope: Scope = ()) -> Textured | None:
+        """World-space normals that a Normal input receives, n * 0.5 + 0.5, baked; None where that cannot be."""
+        source = resolve(socket, scope)
+        if self.book is None or self.material is None or not source.linked:
+            return None
+        return self.book.value(self.material, "normal", source, socket.name, self.findings)
+
+    def plain(self, socket: Any, scope: Scope = ()) -> Value | None:
+        """Value of a socket that plain images and constants hold exactly; None for any other: nothing is baked."""
+        try:
+            value = replace(self, exact=True)._value(socket, scope)
+        except Inexact:
+            return None
+        return None if isinstance(value, Textured) and not value.placement.plain else value
+
+    def flat(self, value: Textured) -> Textured:
+        """The same value over the material's region of the scene atlas (see :func:`.sheets.on_region`)."""
+        if self.book is None or self.material is None:
+            return value
+        self.book.used_atlas = True
+        return on_region(self.book.atlas, self.material, value)
+
+    def _evaluated(self, socket: Any, scope: Scope, kind: Kind) -> Value:
+        """The value: exactly where that is possible, else baked, else averaged."""
+        if self.book is None or self.material is None:
+            return self._value(socket, scope)
+        trial = replace(self, findings=Findings(), exact=True)
+        try:
+            value = trial._value(socket, scope)
+            if kind == "scalar" and isinstance(value, Textured) and value.placement.corners is not None:
+                raise Inexact("colour attribute as a number", "its mean over the mesh is used")
+        except Inexact:
+            baked = self.book.value(self.material, kind, resolve(socket, scope), socket.name, self.findings)
+            return self._value(socket, scope) if baked is None else baked
+        self.findings.merge(trial.findings)
+        return value
+
+    def _inexact(self, feature: str, text: str) -> None:
+        """Say that ``text`` is done about ``feature``; or raise, for the value to be baked instead."""
+        if self.exact:
+            raise Inexact(feature, text)
+        self.note("approximated", feature, text)
 
     def note(self, kind: Any, feature: str, text: str) -> None:
         """Record a finding for this material."""
@@ -72,26 +128,35 @@ class Evaluator:
             return self._image(source)
         if kind in {"VERTEX_COLOR", "ATTRIBUTE"}:
             return self._attribute(source)
-        if kind == "FRESNEL":
-            self.note("approximated", "Fresnel node", f"view-dependent; the mean {FRESNEL_AVERAGE} is used")
-            return constant(FRESNEL_AVERAGE)
-        if kind == "LAYER_WEIGHT":
-            average = 0.5 if source.socket.name == "Facing" else FRESNEL_AVERAGE
-            self.note("approximated", "Layer Weight node", f"view-dependent; the mean {average} is used")
-            return constant(average)
+        if kind == "BLACKBODY":
+            temperature = self._value(find_input(node, "Temperature"), source.scope)
+            if isinstance(temperature, Constant):
+                return constant(blackbody_colour(temperature.scalar))
+        if kind in {"FRESNEL", "LAYER_WEIGHT"}:
+            return self._view_dependent(source)
         if kind == "LIGHT_PATH":
             fixed = LIGHT_PATH_DEFAULTS.get(source.socket.name, 0.0)
             self.note("approximated", f"Light Path '{source.socket.name}'", f"taken as {fixed:g} for every ray")
             return constant(fixed)
         if kind in OPERATIONS:
             return self._operation(source)
-        average = self._procedural_mean(source)
-        self.note(
-            "approximated",
-            f"{node.bl_label} node",
-            f"not an image: its average ({', '.join(f'{v:.3g}' for v in average.rgb)}) is used",
-        )
+        if self.exact:
+            raise Inexact(f"{node.bl_label} node", "its average is used")
+        average = procedural_mean(source, self._value)
+        means = ", ".join(f"{v:.3g}" for v in average.rgb)
+        self.note("approximated", f"{node.bl_label} node", f"not an image: its average ({means}) is used")
         return average
+
+    def _view_dependent(self, source: Source) -> Value:
+        """Fresnel or Layer Weight node as a table over the angle of view (:mod:`.view_dependent`)."""
+        node = source.node
+        normal = find_input(node, "Normal")
+        if normal is not None and resolve(normal, source.scope).linked:
+            self.note("approximated", f"{node.bl_label} node's Normal input", "the surface's own normal is used")
+        if node.type == "FRESNEL":
+            return fresnel_node(self.number(find_input(node, "IOR"), source.scope))
+        blend = self.number(find_input(node, "Blend"), source.scope)
+        return layer_weight_facing(blend) if source.socket.name == "Facing" else layer_weight_fresnel(blend)
 
     # ------------------------------------------------------------ arithmetic
 
@@ -102,6 +167,8 @@ class Evaluator:
         sockets = [find_input(source.node, *aliases) for aliases in names]
         values = [constant(0.0) if s is None else self._value(s, source.scope) for s in sockets]
         textured = [value for value in values if isinstance(value, Textured)]
+        if any(value.placement.corners is not None for value in textured):
+            self._inexact("colour attribute in colour arithmetic", "the operation is done at the corners")
         lead = max(textured, key=lambda value: value.texels.size, default=None)
         arrays: list[np.ndarray] = []
         for value in values:
@@ -115,15 +182,12 @@ class Evaluator:
                 arrays.append(np.broadcast_to(value.linear(), (*value.texels.shape[:2], 3)))
             else:
                 if isinstance(value, Textured):
-                    self.note(
-                        "approximated",
-                        f"{source.node.bl_label} node",
-                        "combines images of different size or placement: the mean of the smaller is used",
-                    )
+                    feature = f"{source.node.bl_label} node"
+                    self._inexact(feature, "combines images of different size or placement: the mean of one is used")
                 arrays.append(value.mean.reshape(1, 1, 3))
         result = operation.evaluate(source.node, source.socket, arrays)
         if result is None:
-            self.note("approximated", f"{source.node.bl_label} node", "this mode is not converted: first input used")
+            self._inexact(f"{source.node.bl_label} node", "this mode is not converted: first input used")
             result = arrays[operation.fallback(source.node)]
         result = np.asarray(result, dtype=np.float32)
         if lead is None:
@@ -139,6 +203,8 @@ class Evaluator:
         if node.image is None:
             self.note("missing", "Image Texture node", "no image chosen; magenta stands for it")
             return constant((1.0, 0.0, 1.0))
+        if self.exact and node.image.source in {"TILED", "MOVIE", "SEQUENCE"} and _is_split(node.image):
+            raise Inexact(f"{node.image.source.lower()} image", "one tile or frame is used")
         texels, srgb = self.images.read(node.image, self.material)
         placement = self._placement(node, source.scope)
         mode = node.image.alpha_mode
@@ -152,106 +218,108 @@ class Evaluator:
         else:
             colour = texels[..., :3]
             # Cycles multiplies by alpha unless the node's Alpha output is in use (it then un-multiplies).
-            alpha_used = any(output.name == "Alpha" and output.is_linked for output in node.outputs)
-            if mode in {"STRAIGHT", "PREMUL"} and not alpha_used and texels.dtype == np.uint8:
+            if mode in {"STRAIGHT", "PREMUL"} and not _alpha_in_use(node) and texels.dtype == np.uint8:
                 weight = texels[..., 3:].astype(np.float32) / 255
                 if weight.min() < 1:
                     colour = np.round(colour * weight).astype(np.uint8)
             value = Textured(np.ascontiguousarray(colour), srgb, placement or Placement())
-        return constant(value.mean) if placement is None else value
+        if placement is None:
+            return constant(value.mean)
+        if node.interpolation == "Closest":
+            return value
+        kernel = "linear" if node.interpolation == "Linear" else "cubic"
+        resampled, coded = finer(value.texels, value.srgb, placement.wrap, kernel)
+        return replace(value, texels=resampled, srgb=coded)
 
     def _placement(self, node: Any, scope: Scope) -> Placement | None:
         """Placement of an Image Texture node, or None when its coordinates are not an affine map of a UV layer."""
-        if node.projection != "FLAT":
-            self.note("approximated", f"{node.projection.lower()} image projection", "the image's mean is used")
+        placement = image_placement(node, scope, self._affine, self._inexact)
+        if placement is not None and placement.uv is not None and self._is_active(placement.uv):
+            placement = replace(placement, uv=None)
+        if placement is not None and placement.uv is not None and self._is_other_attribute(placement.uv):
+            self._inexact(f"image placed by attribute '{placement.uv}'", "not a UV layer: the image's mean is used")
             return None
-        found = self.coordinates(find_input(node, "Vector"), scope)
-        if found is None:
-            return None
-        uv, affine = found
-        if node.interpolation in {"Cubic", "Smart"}:
-            self.note("approximated", "cubic image interpolation", "bilinear is used")
-        if node.extension == "CLIP":
-            self.note("approximated", "image extension Clip", "edge texels are repeated")
-        return Placement(
-            uv=uv,
-            to_uv=tuple(tuple(float(v) for v in row) for row in affine),
-            filter="nearest" if node.interpolation == "Closest" else "bilinear",
-            wrap=EXTENSIONS[node.extension],  # type: ignore[arg-type]
-        )
+        if placement is None or node.extension != "CLIP" or self._stays_inside(placement):
+            return placement
+        self._inexact("image extension Clip", "edge texels are repeated")
+        return placement
 
-    def coordinates(self, socket: Any, scope: Scope) -> tuple[str | None, np.ndarray] | None:
-        """UV layer and 3x3 affine map that an image's Vector input stands for; None (and a finding) if neither."""
-        source = resolve(socket, scope)
-        node = source.node
-        if not source.linked:
-            # An unlinked Vector means the render-active UV layer, also inside a group.
-            return None, np.eye(3)
-        if node.type == "UVMAP" or (node.type == "TEX_COORD" and source.socket.name == "UV"):
-            return (node.uv_map or None) if node.type == "UVMAP" else None, np.eye(3)
-        if node.type == "ATTRIBUTE" and source.socket.name == "Vector":
-            return node.attribute_name or None, np.eye(3)
-        if node.type == "MAPPING":
-            below = self.coordinates(find_input(node, "Vector"), source.scope)
-            affine = self._mapping(node, source.scope)
-            if below is None or affine is None:
-                return None
-            return below[0], affine @ below[1]
-        what = f"'{source.socket.name}' coordinates" if node.type == "TEX_COORD" else f"{node.bl_label} node"
-        self.note("approximated", f"image placed by {what}", "not a UV layer: the image's mean is used")
-        return None
+    def _is_active(self, layer: str) -> bool:
+        """Whether a named UV layer is the active one on all of the material's surface."""
+        parts = [] if self.book is None or self.material is None else self.book.atlas.parts(self.material)
+        return bool(parts) and all(part.mesh.active_uv == layer for part in parts)
 
-    def _mapping(self, node: Any, scope: Scope) -> np.ndarray | None:
-        """Mapping node as a planar affine map (Blender manual: Mapping; z of a UV is 0)."""
-        parts = {}
-        for name in ("Location", "Rotation", "Scale"):
-            socket = find_input(node, name)
-            value = constant((0, 0, 0)) if socket is None else self._value(socket, scope)
-            if isinstance(value, Textured):
-                self.note("approximated", "textured Mapping node", "the mean is used")
-            parts[name] = value.mean.astype(np.float64)
-        rotation = np.array(Euler(parts["Rotation"]).to_matrix(), dtype=np.float64)
-        size = parts["Scale"]
-        if node.vector_type == "TEXTURE":
-            if (np.abs(size) < 1e-12).any():
-                return None
-            linear = np.diag(1 / size) @ rotation.T
-            shift = -(linear @ parts["Location"])
-        elif node.vector_type in {"POINT", "VECTOR"}:
-            linear = rotation @ np.diag(size)
-            shift = parts["Location"] if node.vector_type == "POINT" else np.zeros(3)
-        else:
-            self.note("approximated", "Mapping node of type Normal", "the image's mean is used")
-            return None
-        affine = np.eye(3)
-        affine[:2, :2] = linear[:2, :2]
-        affine[:2, 2] = shift[:2]
-        return affine
+    def _is_other_attribute(self, name: str) -> bool:
+        """Whether ``name`` is a mesh attribute, but no UV layer."""
+        parts = [] if self.book is None or self.material is None else self.book.atlas.parts(self.material)
+        layers = any(name in part.mesh.uv_layers for part in parts)
+        return not layers and any(name in part.mesh.colors for part in parts)
 
-    # ------------------------------------------------------------ averages
+    def _affine(self, socket: Any, scope: Scope) -> np.ndarray:
+        """Mean of a vector socket of a Mapping node."""
+        value = self._value(socket, scope)
+        if isinstance(value, Textured):
+            self._inexact("textured Mapping node", "the mean is used")
+        return value.mean.astype(np.float64)
+
+    def _stays_inside(self, placement: Placement) -> bool:
+        """Whether the material's surface uses nothing beyond the image's edges."""
+        if self.book is None or self.material is None:
+            return False
+        affine = np.asarray(placement.to_uv)
+        for part in self.book.atlas.parts(self.material):
+            layer = part.mesh.uv_layers.get(placement.uv or part.mesh.active_uv or "")
+            if layer is not None:
+                uv = layer[part.corners] @ affine[:2, :2].T + affine[:2, 2]
+                if uv.min(initial=0) < -1e-4 or uv.max(initial=1) > 1 + 1e-4:
+                    return False
+        return True
+
+    # ------------------------------------------------------------ attributes
 
     def _attribute(self, source: Source) -> Value:
+        """Colour attribute: its values at the mesh's corners, which Mitsuba interpolates as Cycles does."""
         node = source.node
-        name = node.layer_name if node.type == "VERTEX_COLOR" else node.attribute_name
-        if source.socket.name == "Alpha":
-            return constant(1.0)
-        average = self.vertex_colour(name)
-        if average is None:
+        named = node.type == "VERTEX_COLOR"
+        name = node.layer_name if named else node.attribute_name
+        if not named and node.attribute_type != "GEOMETRY":
+            self._inexact(f"attribute '{name}' of the {node.attribute_type.lower()}", "black is used")
+            return constant(0.0)
+        values = None if self.book is None or self.material is None else colour_corners(self.book, self.material, name)
+        if values is None:
+            if self.exact and self.book is not None and is_uv_layer(self.book, self.material or "", name):
+                raise Inexact(f"UV layer '{name}' as a colour", "black is used")
             self.note("missing", f"attribute '{name}'", "not found on the mesh: black, as Cycles renders it")
             return constant(0.0)
-        self.note("approximated", f"colour attribute '{name}'", "its mean over the mesh is used")
-        return constant(average)
+        if source.socket.name == "Fac":
+            self._inexact(f"attribute '{name}' as a number", "its mean over the surface is used")
+            return constant(values[:, :3].mean())
+        part = values[:, 3:] if source.socket.name == "Alpha" else values[:, :3]
+        if np.ptp(part, axis=0).max(initial=0.0) < 1e-6:
+            return constant(part[0] if part.shape[1] == 3 else float(part[0, 0]))
+        if part.shape[1] == 1:
+            self._inexact(f"alpha of attribute '{name}'", "its mean is used")
+            return constant(float(part.mean()))
+        return Textured(np.ascontiguousarray(part[:, None, :]), False, Placement(corners=name or ACTIVE_COLOUR))
 
-    def _procedural_mean(self, source: Source) -> Constant:
-        """Average of a texture node's output over space, as well as it is known."""
-        node = source.node
-        if node.type in {"TEX_CHECKER", "TEX_BRICK"} and source.socket.name == "Color":
-            pair = [find_input(node, "Color1"), find_input(node, "Color2")]
-            means = [self._value(socket, source.scope).mean for socket in pair if socket is not None]
-            return constant(np.mean(means, axis=0))
-        if node.type == "BLACKBODY" or node.type == "WAVELENGTH":
-            return constant(1.0)
-        if source.socket.type in {"RGBA", "VECTOR", "VALUE"} and node.type.startswith("TEX_"):
-            return constant(0.5)
-        own = next((s for s in node.inputs if s.type in {"RGBA", "VALUE"} and s.enabled), None)
-        return constant(0.5) if own is None else constant(self._value(own, source.scope).mean)
+
+def _is_split(image: Any) -> bool:
+    """Whether an image has several tiles or frames."""
+    return image.source != "TILED" or [tile.number for tile in image.tiles] != [1001]
+
+
+def _alpha_in_use(node: Any) -> bool:
+    """Whether the Alpha output of an Image Texture node, or of a node like it, is linked.
+
+    Cycles merges nodes that compute the same: what counts is the merged node.
+    """
+
+    def content(other: Any) -> tuple[Any, ...]:
+        links = [(link.from_node.name, link.from_socket.identifier) for link in other.inputs[0].links]
+        return other.image, other.interpolation, other.projection, other.extension, links
+
+    return any(
+        other.outputs["Alpha"].is_linked
+        for other in node.id_data.nodes
+        if other.type == "TEX_IMAGE" and not other.mute and content(other) == content(node)
+    )

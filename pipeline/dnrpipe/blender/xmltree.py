@@ -8,10 +8,13 @@ from collections.abc import Iterable
 
 import numpy as np
 
+LONGEST_NAME = 80
+"""Characters: file systems allow 255 bytes in a file name, and several names may be joined."""
+
 
 def safe_name(name: str) -> str:
-    """``name`` with everything but letters, digits, '_' and '-' replaced: for ids and file names."""
-    return re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_") or "unnamed"
+    """``name`` with everything but letters, digits, '_' and '-' replaced, and cut: for ids and file names."""
+    return re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_")[:LONGEST_NAME] or "unnamed"
 
 
 class Ids:
@@ -77,9 +80,9 @@ def vector(parent: ET.Element, name: str, value: Iterable[float]) -> None:
     ET.SubElement(parent, "vector", {"name": name, "x": x, "y": y, "z": z})
 
 
-def reference(parent: ET.Element, id: str) -> None:
+def reference(parent: ET.Element, id: str, name: str | None = None) -> None:
     """``<ref>`` to an element defined earlier."""
-    ET.SubElement(parent, "ref", {"id": id})
+    ET.SubElement(parent, "ref", {"id": id} if name is None else {"id": id, "name": name})
 
 
 def _text(value: float) -> str:

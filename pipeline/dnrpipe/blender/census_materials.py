@@ -1,0 +1,147 @@
+"""What one material's node tree implies for light transport. Only nodes that reach the active output count."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+from .sockets import find_input, resolve, surface_source, walk
+
+PROCEDURAL = {
+    "TEX_BRICK",
+    "TEX_CHECKER",
+    "TEX_GABOR",
+    "TEX_GRADIENT",
+    "TEX_MAGIC",
+    "TEX_MUSGRAVE",
+    "TEX_NOISE",
+    "TEX_VORONOI",
+    "TEX_WAVE",
+    "TEX_WHITE_NOISE",
+}
+"""Texture nodes without image."""
+VIEW_DEPENDENT = {"FRESNEL", "LAYER_WEIGHT", "LIGHT_PATH", "CAMERA", "AMBIENT_OCCLUSION"}
+VOLUME_NODES = {"VOLUME_ABSORPTION", "VOLUME_SCATTER", "PRINCIPLED_VOLUME", "VOLUME_COEFFICIENTS"}
+TRANSMISSIVE = {"BSDF_GLASS", "BSDF_REFRACTION", "BSDF_TRANSLUCENT"}
+REFRACTIVE = {"BSDF_GLASS", "BSDF_REFRACTION"}
+GLOSSY = {
+    "BSDF_GLASS",
+    "BSDF_REFRACTION",
+    "BSDF_GLOSSY",
+    "BSDF_METALLIC",
+    "BSDF_HAIR",
+    "BSDF_HAIR_PRINCIPLED",
+    "EEVEE_SPECULAR",
+}
+HAIR = {"BSDF_HAIR", "BSDF_HAIR_PRINCIPLED"}
+NOT_REFLECTING = {"EMISSION", "HOLDOUT", "BACKGROUND", "BSDF_TRANSPARENT", "MIX_SHADER", "ADD_SHADER", *VOLUME_NODES}
+STRUCTURE = {"GROUP", "GROUP_INPUT", "REROUTE"}
+
+
+def describe_material(material: Any) -> dict[str, Any]:
+    """JSON-able facts of one material.
+
+    min_roughness: smallest roughness of its mirror-like lobes, 0 to 1; None when it has none or it is an image
+    (then roughness_linked). ior: largest index of refraction of a transmitting lobe, or None.
+    """
+    tree = material.node_tree
+    nodes = list(_reachable(tree))
+    kinds = {node.type for node in nodes}
+    principled = [node for node in nodes if node.type == "BSDF_PRINCIPLED"]
+    glossy = [node for node in nodes if node.type in GLOSSY] + [node for node in principled if _specular(node)]
+    refracting = [n for n in nodes if n.type in REFRACTIVE] + [
+        n for n in principled if _active(n, "Transmission Weight", "Transmission")
+    ]
+    rough = [_roughness(node) for node in glossy]
+    return {
+        "bsdfs": sorted({node.bl_label for node in nodes if _is_shader(node)}),
+        "nodes": dict(sorted(Counter(node.bl_label for node in nodes).items())),
+        "procedural": sorted(node.bl_label for node in nodes if node.type in PROCEDURAL),
+        "reflects": tree is None or any(_is_shader(n) and n.type not in NOT_REFLECTING for n in nodes),
+        "glossy": bool(glossy),
+        "transparent": "BSDF_TRANSPARENT" in kinds or any(_active(n, "Alpha", off=1.0) for n in principled),
+        "transmissive": bool(kinds & TRANSMISSIVE) or bool(refracting),
+        "refractive": bool(refracting),
+        "ior": max((_number(n, 1.45, "IOR") for n in refracting), default=None),
+        "emissive": any(_emits(n) for n in nodes if n.type in {"EMISSION", "BSDF_PRINCIPLED"}),
+        "subsurface": "SUBSURFACE_SCATTERING" in kinds
+        or any(_active(n, "Subsurface Weight", "Subsurface") for n in principled),
+        "metallic": bool(kinds & {"BSDF_GLOSSY", "BSDF_METALLIC"}) or any(_active(n, "Metallic") for n in principled),
+        "normal_map": "NORMAL_MAP" in kinds,
+        "bump": "BUMP" in kinds,
+        "volume": bool(kinds & VOLUME_NODES) or surface_source(tree, "Volume") is not None,
+        "displacement": surface_source(tree, "Displacement") is not None,
+        "thin_film": any(_active(n, "Thin Film Thickness") for n in nodes),
+        "hair": bool(kinds & HAIR),
+        "view_dependent": sorted({node.bl_label for node in nodes if node.type in VIEW_DEPENDENT}),
+        "min_roughness": min((value for value in rough if value is not None), default=None),
+        "roughness_linked": any(value is None for value in rough),
+    }
+
+
+def _reachable(tree: Any) -> Iterator[Any]:
+    """Nodes that the active output depends on, those inside groups included, each once.
+
+    A group counts whole: which of its outputs is used is not followed.
+    """
+    output = None if tree is None else tree.get_output_node("CYCLES")
+    todo, seen, groups = ([] if output is None else [output]), set(), set()
+    while todo:
+        node = todo.pop()
+        if node.as_pointer() in seen:
+            continue
+        seen.add(node.as_pointer())
+        yield node
+        if node.type == "GROUP":
+            yield from walk(node.node_tree, groups)
+        todo += [link.from_node for socket in node.inputs for link in socket.links if not link.is_muted]
+
+
+def _is_shader(node: Any) -> bool:
+    return any(socket.type == "SHADER" for socket in node.outputs) and node.type not in STRUCTURE
+
+
+def _active(node: Any, *names: str, off: float = 0.0) -> bool:
+    """Whether a scalar input is linked or differs from the value that switches the feature off."""
+    socket = find_input(node, *names)
+    if socket is None:
+        return False
+    source = resolve(socket)
+    return source.linked or abs(float(source.default) - off) > 1e-6
+
+
+def _specular(node: Any) -> bool:
+    """Whether a Principled BSDF has a mirror-like lobe: base, metal, glass or coat."""
+    features = (("Metallic",), ("Transmission Weight", "Transmission"), ("Coat Weight", "Clearcoat"))
+    return _active(node, "Specular IOR Level", "Specular") or any(_active(node, *names) for names in features)
+
+
+def _emits(node: Any) -> bool:
+    strength = ("Strength",) if node.type == "EMISSION" else ("Emission Strength",)
+    colour = find_input(node, *(("Color",) if node.type == "EMISSION" else ("Emission Color", "Emission")))
+    if colour is None or (find_input(node, *strength) is not None and not _active(node, *strength)):
+        return False
+    source = resolve(colour)
+    return source.linked or any(v > 0 for v in list(source.default)[:3])
+
+
+def _roughness(node: Any) -> float | None:
+    """Roughness of a lobe, of its coat where that is smoother; None where it is linked."""
+    values = []
+    names: list[tuple[str, ...]] = [("Roughness",)]
+    if _active(node, "Coat Weight", "Clearcoat"):
+        names.append(("Coat Roughness", "Clearcoat Roughness"))
+    for name in names:
+        socket = find_input(node, *name)
+        source = None if socket is None else resolve(socket)
+        if source is not None and source.linked:
+            return None
+        values.append(0.0 if source is None else float(source.default))
+    return min(values)
+
+
+def _number(node: Any, default: float, *names: str) -> float:
+    socket = find_input(node, *names)
+    source = None if socket is None else resolve(socket)
+    return default if source is None or source.linked else float(source.default)

@@ -1,0 +1,35 @@
+"""Image colour spaces other than sRGB and linear Rec.709: decoded by Blender's own OpenColorIO."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from .textures import write_colour_exr
+
+
+def decode(texels: np.ndarray, space: str) -> np.ndarray:
+    """RGBA [H, W, 4], uint8 codes in colour space ``space``, as float32 in the scene's linear space.
+
+    Blender converts float files from their colour space when it loads them, so the codes take that way. Alpha is
+    data and stays.
+    """
+    rgb = texels[..., :3].astype(np.float32) / 255
+    with tempfile.TemporaryDirectory(prefix="dnrpipe-") as folder:
+        path = Path(folder) / "codes.exr"
+        write_colour_exr(path, rgb)
+        image = bpy.data.images.load(str(path))
+        try:
+            image.colorspace_settings.name = space
+            flat = np.empty(len(image.pixels), np.float32)
+            image.pixels.foreach_get(flat)
+        finally:
+            bpy.data.images.remove(image)
+    height, width = texels.shape[:2]
+    # Files are written in array order, bottom row first; Blender takes the first row of a file for the top.
+    decoded = flat.reshape(height, width, -1)[::-1, :, :3]
+    alpha = texels[..., 3:].astype(np.float32) / 255
+    return np.concatenate([decoded, alpha], axis=2)

@@ -1,0 +1,33 @@
+"""Worker of `dnrpipe inspect`: open, freeze, count, and convert into a folder that nobody keeps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from dnrpipe.effects_bundle import bundle_facts
+
+from .census import take_census
+from .export import export_bundle
+from .loading import load_scene
+from .rehearsal import BakeOptions, convert_materials, place_atlas
+
+
+class Worker:
+    """Inspects one scene per task: ``source`` (file), ``folder`` (scratch for the converted bundle), ``bake_size``."""
+
+    def __init__(self, common: dict[str, Any]) -> None:
+        del common
+
+    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
+        loaded = load_scene(Path(task["source"]))
+        folder = Path(task["folder"])
+        folder.mkdir(parents=True)
+        meshes, findings = loaded.frozen.meshes, loaded.findings
+        place_atlas(meshes, folder)
+        census = take_census(loaded.scene, findings, meshes)
+        # What would be baked is in the findings; placeholders stand for it in the bundle.
+        converter = convert_materials(meshes, folder, findings, BakeOptions(folder / "bakes", int(task["bake_size"])))
+        export_bundle(meshes, folder, findings, converter)
+        census["findings"] = findings.to_list()
+        return {"census": census, "bundle": bundle_facts(folder / "scene.xml"), "warnings": loaded.warnings}

@@ -1,0 +1,113 @@
+"""One evaluated mesh in object space, as unindexed triangles with everything that renders use of it."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+
+import bpy
+import numpy as np
+
+from .frozen import UNIT_TEXTURE_SPACE
+from .named_attributes import named_attributes
+
+UV_STEPS = 2**20  # artist's UVs are rounded to multiples of 1 / UV_STEPS
+
+TextureSpace = tuple[tuple[float, float, float], tuple[float, float, float]]
+
+
+@dataclass
+class LocalMesh:
+    """Unindexed triangles in object space; arrays as in :class:`~.frozen.FrozenMesh`."""
+
+    positions: np.ndarray
+    normals: np.ndarray
+    material_index: np.ndarray
+    materials: list[str | None]
+    uv_layers: dict[str, np.ndarray] = field(default_factory=dict)
+    active_uv: str | None = None
+    colors: dict[str, np.ndarray] = field(default_factory=dict)
+    active_color: str | None = None
+    texture_space: TextureSpace = UNIT_TEXTURE_SPACE
+    strands: bool = False
+
+    def digest(self) -> bytes:
+        """Hash of all content: equal for meshes that evaluate to the same geometry with the same materials."""
+        state = hashlib.blake2b(digest_size=16)
+        for array in (self.positions, self.normals, self.material_index, *self.uv_layers.values()):
+            state.update(np.ascontiguousarray(array).data)
+        for array in self.colors.values():
+            state.update(array.data)
+        names = (self.materials, list(self.uv_layers), self.active_uv, list(self.colors), self.active_color)
+        state.update(repr((names, self.texture_space)).encode())
+        return state.digest()
+
+
+def read_local(obj: bpy.types.Object) -> LocalMesh | None:
+    """The mesh of an evaluated object; None for a metaball that is drawn with another one of its family."""
+    mesh = obj.to_mesh()
+    if mesh is None:
+        return None
+    try:
+        mesh.calc_loop_triangles()
+        count = len(mesh.loop_triangles)
+        loops = np.empty(3 * count, np.int32)
+        polygons = np.empty(count, np.int32)
+        mesh.loop_triangles.foreach_get("loops", loops)
+        mesh.loop_triangles.foreach_get("polygon_index", polygons)
+        corner_vertex = np.empty(len(mesh.loops), np.int32)
+        mesh.loops.foreach_get("vertex_index", corner_vertex)
+        vertices = np.empty((len(mesh.vertices), 3), np.float32)
+        mesh.vertices.foreach_get("co", vertices.ravel())
+        normals = np.empty((len(mesh.loops), 3), np.float32)
+        mesh.corner_normals.foreach_get("vector", normals.ravel())
+        slot = np.empty(len(mesh.polygons), np.int32)
+        mesh.polygons.foreach_get("material_index", slot)
+        uv_layers = {}
+        active = None
+        for layer in mesh.uv_layers:
+            uv = np.empty((len(mesh.loops), 2), np.float32)
+            layer.uv.foreach_get("vector", uv.ravel())
+            # Modifiers give the last bits of interpolated UVs either way from run to run: a texel's 1/256 at 4096².
+            uv_layers[layer.name] = (np.round(uv * UV_STEPS) / np.float32(UV_STEPS))[loops]
+            if layer.active_render:
+                active = layer.name
+        materials = slot_names(obj)
+        colors = _colors(mesh, corner_vertex, loops)
+        known = set(uv_layers) | set(colors)
+        return LocalMesh(
+            positions=vertices[corner_vertex[loops]],
+            normals=normals[loops],
+            # Renderers use the last slot for indices beyond it.
+            material_index=np.clip(slot[polygons], 0, len(materials) - 1),
+            materials=materials,
+            uv_layers=uv_layers,
+            active_uv=active,
+            colors=colors | named_attributes(obj, mesh, known, corner_vertex, loops, polygons),
+            active_color=mesh.attributes.default_color_name or None,
+            texture_space=(_triple(mesh.texspace_location), _triple(mesh.texspace_size)),
+        )
+    finally:
+        obj.to_mesh_clear()
+
+
+def slot_names(obj: bpy.types.Object) -> list[str | None]:
+    """Material names by slot, never empty; None is an empty slot."""
+    return [slot.material.name_full if slot.material else None for slot in obj.material_slots] or [None]
+
+
+def _colors(mesh: bpy.types.Mesh, corner_vertex: np.ndarray, loops: np.ndarray) -> dict[str, np.ndarray]:
+    """Colour attributes per triangle corner, float32 [3T, 4], linear: Blender decodes byte colours itself."""
+    result = {}
+    for attribute in mesh.color_attributes:
+        if attribute.domain not in {"POINT", "CORNER"}:
+            continue  # Blender itself shows no others as colours
+        values = np.empty((len(attribute.data), 4), np.float32)
+        attribute.data.foreach_get("color", values.ravel())
+        result[attribute.name] = values[corner_vertex[loops] if attribute.domain == "POINT" else loops]
+    return result
+
+
+def _triple(vector: bpy.types.bpy_prop_array) -> tuple[float, float, float]:
+    x, y, z = vector
+    return float(x), float(y), float(z)
