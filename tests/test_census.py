@@ -10,8 +10,14 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
+from dnrpipe.blender.camera import describe  # noqa: E402
 from dnrpipe.blender.census import take_census  # noqa: E402
 from dnrpipe.blender.findings import Findings  # noqa: E402
+from dnrpipe.blender.geometry import freeze_scene  # noqa: E402
+
+
+def _census(scene: Any) -> dict[str, Any]:
+    return take_census(scene, Findings(), freeze_scene(scene).meshes)
 
 
 @pytest.fixture
@@ -52,7 +58,7 @@ def scene(tmp_path: Path) -> Any:
 
 
 def test_counts_instances_triangles_and_lamps(scene: Any) -> None:
-    report = take_census(scene, Findings())
+    report = _census(scene)
     assert report["instances"] == 4
     assert report["triangles"] == 3 * 12 + 2
     assert report["objects"] == {"EMPTY": 3, "LIGHT": 1, "MESH": 1}
@@ -62,12 +68,60 @@ def test_counts_instances_triangles_and_lamps(scene: Any) -> None:
 
 
 def test_lists_features_by_material(scene: Any) -> None:
-    report = take_census(scene, Findings())
+    report = _census(scene)
     assert report["transmission"] == ["Glass"]
     assert report["emission"] == report["procedural_textures"] == ["Noisy"]
     assert report["subsurface"] == report["volumes"] == report["hair"] == report["transparency"] == []
     assert report["materials"]["Glass"]["bsdfs"] == ["Principled BSDF"]
     assert report["materials"]["Glass"]["min_roughness"] == pytest.approx(0.02)
+
+
+def test_only_nodes_that_reach_the_output_count(scene: Any) -> None:
+    tree = bpy.data.materials["Noisy"].node_tree
+    tree.nodes.new("ShaderNodeBsdfGlass")  # linked to nothing
+    tree.nodes.new("ShaderNodeVolumeScatter")
+    entry = _census(scene)["materials"]["Noisy"]
+    assert not entry["refractive"] and not entry["volume"] and "Glass BSDF" not in entry["nodes"]
+    assert entry["glossy"] and entry["min_roughness"] == pytest.approx(0.5) and entry["objects"] == ["Plane"]
+
+
+def test_says_what_effects_need_to_know(scene: Any) -> None:
+    report = _census(scene)
+    glass = report["materials"]["Glass"]
+    assert glass["refractive"] and glass["ior"] == pytest.approx(1.5) and glass["objects"] == ["Cube"]
+    assert not glass["thin_film"] and not glass["roughness_linked"]
+    principled = bpy.data.materials["Glass"].node_tree.nodes["Principled BSDF"]
+    principled.inputs["Thin Film Thickness"].default_value = 300
+    noise = bpy.data.materials["Glass"].node_tree.nodes.new("ShaderNodeTexNoise")
+    bpy.data.materials["Glass"].node_tree.links.new(noise.outputs["Fac"], principled.inputs["Roughness"])
+    glass = _census(scene)["materials"]["Glass"]
+    assert glass["thin_film"] and glass["roughness_linked"] and glass["min_roughness"] is None
+
+
+def test_cameras_with_depth_of_field_and_moving_objects_are_named(scene: Any) -> None:
+    camera = bpy.data.objects.new("Close-up", bpy.data.cameras.new("Close-up"))
+    scene.collection.objects.link(camera)
+    camera.data.dof.use_dof, camera.data.dof.aperture_fstop = True, 2.0
+    camera.data.dof.focus_object = bpy.data.objects["Plane"]
+    camera.location = (0, 0, 5)
+    bpy.context.view_layer.update()
+    bpy.data.objects["Plane"].keyframe_insert("location", frame=1)
+    scene.render.use_motion_blur = True
+    findings = Findings()
+    report = take_census(scene, findings, freeze_scene(scene).meshes)
+    assert report["depth_of_field"] == ["Close-up"] and report["motion"] == ["Plane"]
+    assert [(f["kind"], f["object"]) for f in findings.to_list()] == [("ignored", "Plane")]
+    lens = describe(camera)["dof"]
+    assert lens == {"aperture_radius": pytest.approx(50 / 4000), "focus_distance": pytest.approx(5.0)}
+
+
+def test_a_dark_world_gives_no_light(scene: Any) -> None:
+    world = bpy.data.worlds.new("Night")
+    world.use_nodes = True
+    scene.world = world
+    assert _census(scene)["world"]["emits"]
+    world.node_tree.nodes["Background"].inputs["Strength"].default_value = 0.0
+    assert not _census(scene)["world"]["emits"]
 
 
 def test_missing_image_is_a_finding(scene: Any, tmp_path: Path) -> None:
@@ -77,7 +131,7 @@ def test_missing_image_is_a_finding(scene: Any, tmp_path: Path) -> None:
     image.use_fake_user = True
     path.unlink()
     findings = Findings()
-    report = take_census(scene, findings)
+    report = take_census(scene, findings, freeze_scene(scene).meshes)
     assert [entry["name"] for entry in report["images"] if entry["missing"]] == ["lost.png"]
     assert report["findings"] == findings.to_list()
     assert findings.to_list()[0]["kind"] == "missing"

@@ -220,3 +220,48 @@ def test_a_read_only_workspace_is_one_line(tiny_disk: Path) -> None:
     (tiny_disk / "a.blend").write_bytes(b"BLENDER-v300")
     subprocess.run(["mount", "-o", "remount,ro", str(tiny_disk)], check=True)
     _refused(_run("prepare", "a.blend", folder=tiny_disk), "cannot be written", "-w")
+
+
+@pytest.fixture(scope="module")
+def patchy_blend(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene with a lost image on a matt cube, a lamp and hair."""
+    path = tmp_path_factory.mktemp("patchy") / "patchy.blend"
+    code = f"""
+import bpy
+bpy.ops.wm.read_factory_settings()
+material = bpy.data.objects["Cube"].data.materials[0]
+image = material.node_tree.nodes.new("ShaderNodeTexImage")
+image.image = bpy.data.images.new("lost", 4, 4)
+image.image.source = "FILE"
+image.image.filepath = "/nowhere/lost.png"
+material.node_tree.links.new(image.outputs[0], material.node_tree.nodes["Principled BSDF"].inputs["Base Color"])
+bpy.ops.wm.save_as_mainfile(filepath={str(path)!r})
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=120)
+    return path
+
+
+def test_inspect_says_what_is_there_and_what_is_missing(patchy_blend: Path) -> None:
+    folder = patchy_blend.parent
+    before = sorted(folder.iterdir())
+    done = _run("inspect", patchy_blend.name, "--json", folder=folder)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["census"]["materials"]["Material"]["objects"] == ["Cube"]
+    assert found["exact"]["lights"] == ["Light"] and found["exact"]["materials"] == []
+    assert any("lost" in row["feature"] for row in found["findings"]["missing"])
+    assert {e["name"] for e in found["effects"] if e["on"]} >= {"indirect", "view-dependence"}
+    assert sorted(folder.iterdir()) == before
+    text = _run("inspect", patchy_blend.name, folder=folder).stdout
+    assert "'Light'" in text and "lost" in text and "indirect light" in text
+
+
+def test_strict_refuses_what_is_missing_and_leaves_nothing(patchy_blend: Path) -> None:
+    done = _run("prepare", patchy_blend.name, "--strict", folder=patchy_blend.parent)
+    _refused(done, "lost", "--strict")
+    assert not (patchy_blend.parent / "patchy.dnr").exists()
+
+
+def test_effects_refuses_a_name_that_is_none_and_a_workspace_without_scene(workspace: Workspace) -> None:
+    _refused(_run("effects", "--disable", "fog", folder=workspace.root), "fog", "volumes")
+    _refused(_run("effects", folder=workspace.root), "prepare has not run")

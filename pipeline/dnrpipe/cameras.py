@@ -59,6 +59,23 @@ def make_cameras(summary: dict[str, Any], settings: CameraSettings) -> dict[str,
     return split_views(read_camera_file(Path(source), settings), settings)
 
 
+def view_lenses(summary: dict[str, Any], settings: CameraSettings) -> dict[str, dict[str, float]]:
+    """Lenses of the views whose camera in the scene has depth of field, by view name.
+
+    {"aperture_radius", "focus_distance"} in scene units. Only the scene's own cameras have lenses; domes, spheres
+    and camera files are pinholes.
+    """
+    if settings.source == "scene":
+        cameras = [c for c in summary["cameras"] if c["type"] == "PERSP"]
+        named = unique_names([_scene_view(camera, settings) for camera in cameras])
+    elif settings.source == "animation":
+        cameras = [f for f in summary["animation"] if f.get("type", "PERSP") == "PERSP"]
+        named = [_scene_view(frame, settings) for frame in cameras]
+    else:
+        return {}
+    return {view.name: camera["dof"] for view, camera in zip(named, cameras, strict=True) if camera.get("dof")}
+
+
 def read_camera_file(path: Path, settings: CameraSettings) -> list[View]:
     """Views of a NeRF ``transforms.json`` that the whole pipeline can use.
 

@@ -12,9 +12,11 @@ from typing import Any
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import SPLITS, View, read_cameras, write_cameras
 
+from .baking import FOLDER, bake
 from .cameras import depth_range, make_cameras
 from .console import Console
 from .costs import CostRecord
+from .effects_store import keep_plan, plan_of
 from .errors import UserError
 from .executors import Retry, run_tasks
 from .scene_files import read_frame, read_json, read_summary, scene_fingerprint
@@ -23,6 +25,8 @@ from .stages import Outcome
 from .tasks import run_view_tasks, view_record, worker_count
 from .workspace import Workspace, digest
 
+MAX_BAKE_ROUNDS = 4
+"""Values whose need shows only after others are baked take further rounds; two are the rule."""
 PASSES_VERSION = 1
 # Evaluation needs G-buffers of test views only; their rasterised colour would never be read.
 RASTERISED = ("train", "val")
@@ -30,9 +34,9 @@ RASTERISED = ("train", "val")
 
 def run(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
     """Do what is missing: convert the scene, place the cameras, render the passes."""
-    summary = _convert(workspace, console, run_id)
+    summary, views = scene_and_views(workspace, settings, console, run_id)
+    _plan_effects(workspace, settings, console)
     scene_print = scene_fingerprint(workspace)
-    views = _place_cameras(workspace, settings, summary)
     engine, reason = _raster_engine(workspace, settings, console)
     tasks = [
         pass_task(workspace, settings, view, split, scene_print, engine, raster=split in RASTERISED)
@@ -73,6 +77,22 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
             "triangles": summary["triangles"],
         },
     )
+
+
+def _plan_effects(workspace: Workspace, settings: Settings, console: Console) -> None:
+    """Write the effect plan, as far as it is known without its pilot, and say what is on."""
+    plan = plan_of(workspace, settings)
+    keep_plan(workspace, plan)
+    named = [effect.title for effect in plan.effects if effect.on and effect.part == "light"]
+    console.say(f"effects: {', '.join(named) or 'none'} (`dnrpipe effects` says why)")
+
+
+def scene_and_views(
+    workspace: Workspace, settings: Settings, console: Console, run_id: str
+) -> tuple[dict[str, Any], dict[str, list[View]]]:
+    """Convert the scene and place the cameras, where that is not done: (summary, views by split). No passes."""
+    summary = _convert(workspace, settings, console, run_id)
+    return summary, _place_cameras(workspace, settings, summary)
 
 
 def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
@@ -127,11 +147,14 @@ def pass_common(workspace: Workspace, settings: Settings, engine: str) -> dict[s
     }
 
 
-def _convert(workspace: Workspace, console: Console, run_id: str) -> dict[str, Any]:
+def _convert(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> dict[str, Any]:
     """Open the scene in a worker and write ``scene/``, whole or not at all."""
     marker = workspace.scene / "prepared.json"
     if marker.exists() and read_json(marker)["fingerprint"] == scene_fingerprint(workspace):
-        return read_summary(workspace)
+        summary = read_summary(workspace)
+        if summary["bake_size"] in (None, settings.passes.bake_size):
+            _refuse_if_strict(Path(workspace.manifest.source.path), workspace.scene, settings)
+            return summary
     source = Path(workspace.manifest.source.path)
     if not source.is_file():
         raise UserError(f"{source}: the scene file is gone; run `dnrpipe prepare SCENE` with its new place")
@@ -140,7 +163,8 @@ def _convert(workspace: Workspace, console: Console, run_id: str) -> dict[str, A
     fresh = workspace.root / "scene.new"
     if fresh.exists():
         shutil.rmtree(fresh)
-    _run_conversion(source, fresh, workspace, console)
+    _run_conversion(source, fresh, workspace, settings, console)
+    _refuse_if_strict(source, fresh, settings)
     # The old scene stays until the new one is whole; killed in between, the next run converts again.
     if workspace.scene.exists():
         shutil.rmtree(workspace.scene)
@@ -164,25 +188,59 @@ def _convert(workspace: Workspace, console: Console, run_id: str) -> dict[str, A
     return summary
 
 
-def _run_conversion(source: Path, folder: Path, workspace: Workspace, console: Console) -> None:
-    """The worker's outcome, as UserError where it failed."""
-    task = {"source": str(source), "scene_dir": str(folder)}
+def _run_conversion(source: Path, folder: Path, workspace: Workspace, settings: Settings, console: Console) -> None:
+    """Convert; where the worker asks for bakes, bake them and convert again."""
+    size, refused = settings.passes.bake_size, list[str]()
+    for _ in range(MAX_BAKE_ROUNDS):
+        options = {"folder": str(workspace.root / FOLDER), "size": size, "refused": refused}
+        task = {"source": str(source), "scene_dir": str(folder), "strict": settings.strict, "bakes": options}
+        pending = _attempt(source, task, workspace, console).get("bakes")
+        if pending is None:
+            return
+        refused += bake(workspace, console, source, folder / "geometry.npz", pending, size, settings.passes.workers)
+    raise RuntimeError(f"{source}: the same textures are to be baked again and again")
+
+
+def _attempt(source: Path, task: dict[str, Any], workspace: Workspace, console: Console) -> dict[str, Any]:
+    """The worker's result, or what went wrong as a UserError."""
+    result: dict[str, Any] = {}
     with console.bar("scene", 1) as bar:
         for outcome in run_tasks("dnrpipe.blender.prepare", {}, [task], workers=1, log=workspace.log("prepare")):
             if isinstance(outcome, Retry):
                 continue
             if outcome.errno == errno.ENOSPC:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), task["scene_dir"])
             if outcome.died:
                 raise UserError(f"{source}: Blender could not open it ({outcome.error}): damaged or truncated?")
             if outcome.result is None:
                 raise UserError(str(outcome.error))
+            result = outcome.result
             bar.advance()
+    return result
+
+
+def _refuse_if_strict(source: Path, scene_dir: Path, settings: Settings) -> None:
+    """With ``--strict``: raise UserError that names all that is missing or was left out."""
+    if not settings.strict:
+        return
+    found = [f for f in read_json(scene_dir / "census.json")["findings"] if f["kind"] in ("missing", "ignored")]
+    if found:
+        names = [
+            f"{f['kind']} {f['feature']} ('{f['object'] or f['material']}')"
+            if f["object"] or f["material"]
+            else f"{f['kind']} {f['feature']}"
+            for f in found
+        ]
+        raise UserError(f"{source}: {', '.join(names)}; mend the scene, or leave out --strict (--set strict=false)")
 
 
 def _show_findings(workspace: Workspace, console: Console) -> None:
     """Whatever was not converted exactly is said by name, once, in the terminal; all of it is in census.json."""
     census = read_json(workspace.scene / "census.json")
+    baked = [finding for finding in census["findings"] if finding["kind"] == "baked" and finding["material"]]
+    if baked:
+        count = len({finding["material"] for finding in baked})
+        console.say(f"  baked: {len(baked)} procedural value(s) of {count} material(s); census.json names them")
     for finding in census["findings"]:
         if finding["kind"] in ("approximated", "ignored", "missing"):
             names = [f"object '{finding['object']}'"] if finding["object"] else []

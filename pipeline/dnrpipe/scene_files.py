@@ -14,7 +14,7 @@ from dnrtrain.contract import SceneFrame
 from .errors import UserError
 from .workspace import Workspace, digest, file_sha256
 
-SCENE_VERSION = 3  # raise when the conversion or the G-buffer scene changes what it writes
+SCENE_VERSION = 4  # raise when the conversion or the G-buffer scene changes what it writes
 
 
 def read_json(path: Path) -> Any:
@@ -47,11 +47,12 @@ def scene_fingerprint(workspace: Workspace) -> str:
     A file that is gone counts as it was: a workspace lives without its sources.
     """
     summary = workspace.scene / "summary.json"
-    recorded: dict[str, str] = read_json(summary).get("external", {}) if summary.exists() else {}
+    content = read_json(summary) if summary.exists() else {}
+    recorded: dict[str, str] = content.get("external", {})
     current = {name: _sha256_now(Path(name)) if Path(name).is_file() else sha for name, sha in recorded.items()}
     # Without their folders: moving a scene with its textures changes nothing.
     files = sorted((Path(name).name, sha) for name, sha in current.items())
-    return digest([SCENE_VERSION, workspace.manifest.source.sha256, files])
+    return digest([SCENE_VERSION, workspace.manifest.source.sha256, files, content.get("bake_size")])
 
 
 def _sha256_now(path: Path) -> str:

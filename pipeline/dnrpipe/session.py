@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,8 +20,16 @@ if TYPE_CHECKING:
 class Session:
     """One locked workspace with its settings, for the length of a command."""
 
-    def __init__(self, command: str, options: dict[str, Any], scene: Path | None, overrides: dict[str, Any]) -> None:
+    def __init__(
+        self,
+        command: str,
+        options: dict[str, Any],
+        scene: Path | None,
+        overrides: dict[str, Any],
+        late: Callable[[Settings], dict[str, Any]] | None = None,
+    ) -> None:
         self.command, self.options, self.scene, self.overrides = command, options, scene, overrides
+        self.late = late  # overrides that depend on the settings in force
         self.stack = ExitStack()
         self.answers: dict[str, Any] = {}
         self.before: Manifest | None = None
@@ -61,6 +70,9 @@ class Session:
             self.workspace = Workspace.open(root)
             self.before = self.workspace.manifest.model_copy(deep=True)
         self.settings: Settings = resolve_settings(self.workspace, overrides, preset)
+        if self.late is not None:
+            overrides = merge(overrides, self.late(self.settings))
+            self.settings = resolve_settings(self.workspace, overrides, preset)
         manifest = self.workspace.manifest
         self._check(self.settings, self.workspace)
         manifest.preset = preset or manifest.preset

@@ -11,12 +11,13 @@ import os
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError
 
 from dnrtrain.settings import LossWeights, ModelSettings, Step1Settings, Step2Settings, Strict
 
+from .effects import EffectName
 from .errors import UserError
 
 ENVIRONMENT_PREFIX = "DNRPIPE_"
@@ -45,6 +46,9 @@ class PassSettings(Strict):
     raster: Literal["auto", "eevee", "workbench", "cycles-direct"] = "auto"
     raster_samples: int = Field(default=4, ge=1, le=4096)
     coverage_samples: int = Field(default=64, ge=1, le=4096, description="samples of the coverage pass")
+    bake_size: int = Field(
+        default=2048, ge=64, le=16384, description="texels of the side of the atlas that procedural textures bake into"
+    )
     workers: int = Field(default=0, ge=0, description="0 = one per core")
 
 
@@ -53,10 +57,25 @@ class RaytraceSettings(Strict):
 
     spp: int = Field(default=256, ge=1, le=1_000_000)
     evaluation_spp: int = Field(default=512, ge=1, le=1_000_000, description="samples of held-out references")
-    max_depth: int = Field(default=12, ge=1, le=10_000, description="path vertices; 2 = direct light")
+    max_depth: Annotated[int, Field(ge=1, le=10_000)] | Literal["auto"] = Field(
+        default="auto", description="path vertices, 2 = direct light; auto: as deep as the scene needs, by a pilot"
+    )
     variant: Literal["auto", "cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb"] = "auto"
     seed: int = Field(default=0, ge=0)
     workers: int = Field(default=0, ge=0, description="0 = one per core")
+
+
+class EffectSettings(Strict):
+    """Which effects are simulated where the plan (`dnrpipe effects`) decides otherwise, and how deep paths go."""
+
+    enable: tuple[EffectName, ...] = Field(
+        default=(), description="effects to simulate although nothing calls for them"
+    )
+    disable: tuple[EffectName, ...] = Field(default=(), description="effects to leave out; wins over enable")
+    tolerance: float = Field(
+        default=0.005, gt=0, le=1, description="light that the path depth may miss, as a share of the mean radiance"
+    )
+    pixel_tolerance: float = Field(default=0.02, gt=0, le=1, description="the same at the 99th percentile pixel")
 
 
 class SelectSettings(Strict):
@@ -79,11 +98,13 @@ class Settings(Strict):
     """Everything that decides what a run computes."""
 
     preset: str = "draft"
+    strict: bool = Field(default=False, description="refuse scenes with missing files or anything ignored")
     cameras: CameraSettings = CameraSettings()
     passes: PassSettings = PassSettings()
     model: ModelSettings = ModelSettings()
     select: SelectSettings = SelectSettings()
     raytrace: RaytraceSettings = RaytraceSettings()
+    effects: EffectSettings = EffectSettings()
     finetune: FinetuneSettings = FinetuneSettings()
     device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="torch device")
 
@@ -92,6 +113,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     # Minutes on two CPU cores.
     "draft": {
         "cameras": {"train": 40, "val": 4, "test": 12, "width": 128, "height": 128},
+        "passes": {"bake_size": 1024},
         "raytrace": {"spp": 128, "evaluation_spp": 256},
         "model": {"texture_size": 128, "width": 24, "depth": 3, "aggregator": "residual"},
         "select": {"step1": {"epochs": 12, "texture_rate_scale": 10.0}},
@@ -105,7 +127,10 @@ PRESETS: dict[str, dict[str, Any]] = {
         "finetune": {"step2": {"epochs": 60, "texture_rate_scale": 10.0, "photometric": "l1", "perceptual_crop": 192}},
     },
     # The paper's numbers: every other default of the models above is the paper's.
-    "paper": {"select": {"step1": {"reward_scale": "raw", "q_target": "plain"}}},
+    "paper": {
+        "select": {"step1": {"reward_scale": "raw", "q_target": "plain"}},
+        "effects": {"enable": ["view-dependence", "depth", "normal"]},
+    },
 }
 
 

@@ -19,6 +19,7 @@ from typing import Any
 
 from . import __version__
 from .console import Console, clock
+from .effects import NEURAL
 from .errors import UserError
 from .scene_files import scene_fingerprint
 from .settings import Settings
@@ -53,6 +54,18 @@ class Stage:
     version: int = 1
 
 
+def _light(settings: Settings) -> dict[str, Any]:
+    """Effect settings that decide what is ray-traced."""
+    chosen = settings.effects.model_dump()
+    return chosen | {key: sorted(set(chosen[key]) - NEURAL) for key in ("enable", "disable")}
+
+
+def _neural(settings: Settings) -> dict[str, list[str]]:
+    """Effect settings that decide what the neural renderer is made of."""
+    chosen = settings.effects
+    return {key: sorted(set(getattr(chosen, key)) & NEURAL) for key in ("enable", "disable")}
+
+
 STAGES: dict[str, Stage] = {
     stage.name: stage
     for stage in (
@@ -74,7 +87,7 @@ STAGES: dict[str, Stage] = {
             needs=("prepare",),
             reads=("passes", "cameras"),
             writes=("selection.json", "checkpoints/step1"),
-            settings=lambda s: [s.model.model_dump(), s.select.model_dump()],
+            settings=lambda s: [s.model.model_dump(), s.select.model_dump(), _neural(s)],
             run="dnrpipe.training:run_select",
             progress="dnrpipe.training:select_progress",
         ),
@@ -85,7 +98,7 @@ STAGES: dict[str, Stage] = {
             needs=("prepare", "select"),
             reads=("scene", "selection.json"),
             writes=("raytraced/train",),
-            settings=lambda s: s.raytrace.model_dump(exclude={"workers", "evaluation_spp", "variant"}),
+            settings=lambda s: [s.raytrace.model_dump(exclude={"workers", "evaluation_spp", "variant"}), _light(s)],
             run="dnrpipe.trace:run",
             progress="dnrpipe.trace:progress",
         ),
@@ -96,7 +109,7 @@ STAGES: dict[str, Stage] = {
             needs=("select", "raytrace"),
             reads=("passes", "raytraced/train", "checkpoints/step1"),
             writes=("checkpoints/step2",),
-            settings=lambda s: [s.model.model_dump(), s.finetune.model_dump()],
+            settings=lambda s: [s.model.model_dump(), s.finetune.model_dump(), _neural(s)],
             run="dnrpipe.training:run_finetune",
             progress="dnrpipe.training:finetune_progress",
         ),
@@ -107,7 +120,7 @@ STAGES: dict[str, Stage] = {
             needs=("finetune",),
             reads=("passes/test", "checkpoints/step2"),
             writes=("raytraced/test", "evaluation"),
-            settings=lambda s: s.raytrace.model_dump(exclude={"workers", "spp", "variant"}),
+            settings=lambda s: [s.raytrace.model_dump(exclude={"workers", "spp", "variant"}), _light(s)],
             run="dnrpipe.evaluate:run",
             progress="dnrpipe.evaluate:progress",
         ),

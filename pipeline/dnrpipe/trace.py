@@ -11,8 +11,8 @@ from dnrtrain.exr import read_metadata
 
 from .console import Console
 from .costs import CostRecord
+from .effects_store import lenses, resolve_plan, trace_config, variant_for
 from .prepare import split_views
-from .raytrace.variants import choose_variant
 from .scene_files import scene_fingerprint
 from .settings import Settings
 from .stages import Outcome
@@ -20,7 +20,7 @@ from .tasks import is_made, run_view_tasks, view_record, worker_count
 from .training import read_selection
 from .workspace import Workspace, digest
 
-TRACE_VERSION = 1
+TRACE_VERSION = 2
 
 
 def run(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
@@ -65,24 +65,30 @@ def trace_views(
     purpose: str,
 ) -> list[dict[str, Any]]:
     """Path-trace ``views`` into ``raytraced/<split>``; views already there are kept. Returns all tasks."""
-    bundle = scene_fingerprint(workspace)
+    scene_print = scene_fingerprint(workspace)
+    plan = resolve_plan(workspace, settings, console, run_id, stage)
+    known = lenses(workspace, settings) if plan.on("depth-of-field") else {}
     tasks = [
         {
             "view": view.model_dump(mode="json"),
             "output": str(workspace.raytraced(split, view.name)),
             "spp": spp,
-            "max_depth": settings.raytrace.max_depth,
+            "integrator": plan.integrator,
+            "max_depth": plan.max_depth,
+            "lens": known.get(view.name),
             "seed": view_seed(settings.raytrace.seed, split, view.name),
         }
         for view in views
     ]
+    light = [sorted(plan.left_out), plan.on("spectral")]
     for task in tasks:
-        decisive = {key: task[key] for key in ("view", "spp", "max_depth", "seed")}
-        task["fingerprint"] = digest([TRACE_VERSION, bundle, decisive])
+        decisive = {key: task[key] for key in ("view", "spp", "integrator", "max_depth", "lens", "seed")}
+        task["fingerprint"] = digest([TRACE_VERSION, scene_print, decisive, light])
     if all(is_made(task) for task in tasks):
         return tasks
-    choice = choose_variant(settings.raytrace.variant)
-    console.say(f"ray tracing with Mitsuba {choice.variant}")
+    choice = variant_for(plan, settings)
+    config = trace_config(workspace, plan, choice.variant)
+    console.say(f"ray tracing with Mitsuba {choice.variant}, {plan.integrator}, depth {plan.max_depth}")
     workers = 1 if choice.variant.startswith("cuda") else worker_count(settings.raytrace.workers)
 
     def book(task: dict[str, Any], result: dict[str, Any], count: int) -> CostRecord:
@@ -99,7 +105,7 @@ def trace_views(
     run_view_tasks(
         "ray tracing" if split == "train" else "ray tracing test views",
         "dnrpipe.raytrace.tracer",
-        {"bundle": str(workspace.scene / "scene.xml"), "variant": choice.variant, "threads": 1},
+        {"bundle": config["bundle"], "variant": choice.variant, "threads": 1},
         tasks,
         workspace=workspace,
         console=console,

@@ -14,6 +14,7 @@ from dnrtrain.events import EpochEnd, Event, Note, Selected
 
 from .console import Bar, Console
 from .costs import CostRecord
+from .effects_store import plan_of
 from .errors import UserError
 from .prepare import split_views
 from .scene_files import read_frame
@@ -43,7 +44,7 @@ def run_select(workspace: Workspace, settings: Settings, console: Console, run_i
         dataset,
         val,
         np.stack([view.position for view in views["train"]]),
-        settings.model,
+        plan_of(workspace, settings).model(settings.model),
         settings.select.step1,
         policy=settings.select.policy,
         budget=settings.select.budget,
@@ -87,7 +88,7 @@ def run_finetune(workspace: Workspace, settings: Settings, console: Console, run
         dataset,
         None,
         workspace.checkpoints("step1"),
-        settings.model,
+        plan_of(workspace, settings).model(settings.model),
         settings.finetune.step2,
         seed=settings.finetune.seed,
         device=torch_device(settings),

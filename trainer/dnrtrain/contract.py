@@ -189,8 +189,8 @@ def unique_names(views: Sequence[View]) -> list[View]:
 
 
 def file_name(text: str) -> str:
-    """``text`` as a view's name: letters, digits, dot, dash and underscore of ASCII; others become "_"."""
-    return re.sub(r"[^A-Za-z0-9_.-]", "_", text) or "_"
+    """``text`` as a view's name: letters, digits, dot, dash and underscore of ASCII, 80 at most; others become "_"."""
+    return re.sub(r"[^A-Za-z0-9_.-]", "_", text)[:80] or "_"
 
 
 def _parse_frame(frame: Any, shared: dict[str, Any], index: int, size: tuple[int, int] | None) -> View:

@@ -1,0 +1,94 @@
+"""The command line: a thin click command per stage. Heavy imports happen inside commands.
+
+Exit codes: 0 done; 1 some views failed; 2 bad input (one line says what, where, what to do); 130 Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+
+import click
+
+from .. import __version__
+from . import information, pictures, scene, stages
+
+
+class _Group(click.Group):
+    """Lists commands in pipeline order, not alphabetically."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self.commands)
+
+
+@click.group(cls=_Group, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="dnrpipe")
+def cli() -> None:
+    """Turn a .blend file into a fast neural renderer, ray-tracing only the views that matter.
+
+    \b
+    Examples:
+      dnrpipe run scene.blend --budget 25      # everything, one command
+      dnrpipe prepare scene.blend              # or stage by stage:
+      dnrpipe select --budget 25
+      dnrpipe raytrace-selected
+      dnrpipe finetune
+      dnrpipe evaluate && dnrpipe report
+
+    Commands find their workspace (scene.dnr) by -w, by DNRPIPE_WORKSPACE, by standing in it, or as the only
+    *.dnr here. Interrupted commands go on where they stopped when run again.
+    """
+
+
+for _command in (
+    scene.inspect,
+    stages.prepare,
+    scene.effects,
+    stages.select,
+    stages.raytrace_selected,
+    stages.finetune,
+    stages.evaluate,
+    pictures.render,
+    pictures.report,
+    stages.run,
+    information.status,
+    information.costs,
+    information.doctor,
+    information.weights,
+):
+    cli.add_command(_command)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point: runs the command and turns every expected failure into one line and an exit code."""
+    code = _main(arguments)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is written; a late Ctrl-C must not spoil the exit code
+    sys.exit(code)
+
+
+def _main(arguments: list[str] | None) -> int:
+    from ..interrupts import interrupt_as_keyboard
+
+    try:
+        with interrupt_as_keyboard():
+            cli.main(args=arguments, standalone_mode=False, prog_name="dnrpipe")
+    except click.exceptions.Exit as error:
+        return error.exit_code
+    except (KeyboardInterrupt, click.Abort):
+        return _fail("interrupted; run the same command to go on where it stopped", 130)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # a reader such as `head` left: no noise at exit
+    except Exception as error:
+        from ..failures import explain
+
+        explained = explain(error)
+        if explained is None:
+            raise
+        return _fail(*explained)
+    return 0
+
+
+def _fail(message: str, code: int) -> int:
+    print(f"dnrpipe: error: {message}" if code != 130 else f"dnrpipe: {message}", file=sys.stderr, flush=True)
+    return code

@@ -1,0 +1,136 @@
+"""Commands that look and tell: status, costs, doctor, weights."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import click
+
+from ..errors import UserError
+
+
+@click.command()
+@click.option("-w", "--workspace", metavar="DIR", help="The workspace folder (scene.dnr).")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def status(workspace: str | None, as_json: bool) -> None:
+    """Show what is done, partial, stale or missing, and the next command.
+
+    \b
+    Examples:
+      dnrpipe status
+      dnrpipe status --json
+    """
+    from .. import stages
+    from ..console import clock
+    from ..session import resolve_settings
+    from ..workspace import Workspace, find_workspace
+
+    found = Workspace.open(find_workspace(workspace))
+    rows = stages.status(found, resolve_settings(found, {}, None))
+    if as_json:
+        click.echo(json.dumps({"workspace": str(found.root), "stages": rows}, indent=2))
+        return
+    click.echo(f"{found.root}  (from {found.manifest.source.path})")
+    for row in rows:
+        took = clock(row["seconds"]) if row["seconds"] is not None else "-"
+        click.echo(
+            f"  {row['state']:8} {row['command']:18} {row['present']:>4}/{row['wanted']:<4} {took:>7}  {row['does']}"
+        )
+    due = next((row for row in rows if row["state"] != "done"), None)
+    click.echo(f"next: dnrpipe {due['command']}" if due else "next: dnrpipe render --orbit 60, or dnrpipe report")
+
+
+@click.command()
+@click.option("-w", "--workspace", metavar="DIR", help="The workspace folder (scene.dnr).")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def costs(workspace: str | None, as_json: bool) -> None:
+    """Sum the ledger: where the time went.
+
+    \b
+    Examples:
+      dnrpipe costs
+      dnrpipe costs --json | jq .
+    """
+    from ..costs import summarise
+    from ..workspace import Workspace, find_workspace
+
+    found = Workspace.open(find_workspace(workspace))
+    prepared = found.manifest.stages.get("prepare")
+    chosen = found.manifest.stages.get("raytrace")
+    summary = summarise(
+        found.ledger.read(),
+        n_candidates=prepared.detail["views"]["train"] if prepared else None,
+        only={f"train/{name}" for name in chosen.detail["views"]} if chosen else None,
+        torn_lines=found.ledger.torn_lines(),
+    )
+    click.echo(json.dumps(summary, indent=2) if as_json else _costs_table(summary))
+
+
+def _costs_table(summary: dict[str, Any]) -> str:
+    from ..console import clock
+
+    lines = [f"{'stage':10} {'for':12} {'units':>6} {'wall':>8} {'cpu':>8}"]
+    for stage, purposes in summary["by_stage_and_purpose"].items():
+        for purpose, part in purposes.items():
+            lines.append(
+                f"{stage:10} {purpose:12} {part['records']:>6} {clock(part['wall_seconds']):>8}"
+                f" {clock(part['cpu_seconds']):>8}"
+            )
+    whole = summary["total"]
+    lines.append(
+        f"{'total':23} {whole['records']:>6} {clock(whole['wall_seconds']):>8} {clock(whole['cpu_seconds']):>8}"
+    )
+    tracing = summary["tracing_all"]
+    if tracing:
+        lines.append(
+            f"ray-traced {tracing['views']} of {tracing['candidates']} candidates in"
+            f" {tracing['actual_seconds']:.1f} s; all would have cost {tracing['all_seconds']:.1f} s"
+        )
+    return "\n".join(lines)
+
+
+@click.command()
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def doctor(as_json: bool) -> None:
+    """Check this machine: Blender, EEVEE, Mitsuba variants, torch, weights, disk.
+
+    \b
+    Examples:
+      dnrpipe doctor
+      dnrpipe doctor --json
+    """
+    from ..doctor import examine
+
+    checks = examine()
+    if as_json:
+        click.echo(json.dumps(checks, indent=2))
+    else:
+        for check in checks:
+            click.echo(f"{check['state']:5} {check['name']:18} {check['text']}")
+    if any(check["state"] == "fail" for check in checks):
+        raise SystemExit(1)
+
+
+@click.command()
+@click.option("--offline", is_flag=True, help="Only check what is cached.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def weights(offline: bool, as_json: bool) -> None:
+    """Fetch the VGG16, AlexNet and LPIPS weights into the cache (~/.cache/dnrpipe or DNRPIPE_CACHE).
+
+    Needed for the perceptual loss and LPIPS. Without them, training says so and drops both.
+
+    \b
+    Examples:
+      dnrpipe weights
+      dnrpipe weights --offline
+    """
+    from dnrtrain.weights import WeightsMissing, ensure_weights
+
+    try:
+        found = ensure_weights(offline=offline)
+    except WeightsMissing as error:
+        raise UserError(str(error)) from None
+    click.echo(
+        json.dumps(found, indent=2, default=str) if as_json else "\n".join(f"{k}: {v}" for k, v in found.items())
+    )

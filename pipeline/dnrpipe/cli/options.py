@@ -1,0 +1,119 @@
+"""Options that several commands share, and what they mean as settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ..errors import UserError
+
+if TYPE_CHECKING:
+    from ..session import Session
+    from ..settings import Settings
+
+
+def common(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Options every stage has."""
+    for option in reversed(
+        [
+            click.option("-w", "--workspace", metavar="DIR", help="The workspace folder (scene.dnr)."),
+            click.option("--preset", metavar="NAME", help="draft (default), standard or paper."),
+            click.option(
+                "--set",
+                "assignments",
+                multiple=True,
+                metavar="KEY=VALUE",
+                help="Any setting, e.g. --set finetune.step2.epochs=20. Repeatable; remembered.",
+            ),
+            click.option("--force", is_flag=True, help="Do it again, reusing nothing."),
+            click.option("--json", "as_json", is_flag=True, help="Print one JSON value; messages to stderr."),
+            click.option("-q", "--quiet", is_flag=True, help="Warnings and errors only."),
+        ]
+    ):
+        function = option(function)
+    return function
+
+
+CAMERA_OPTIONS = [
+    click.option(
+        "--cameras",
+        metavar="SOURCE",
+        help="dome (default), sphere, scene, animation, or a NeRF transforms.json.",
+    ),
+    click.option("--views", type=int, metavar="N", help="Number of candidate views."),
+    click.option("--resolution", type=int, metavar="PIXELS", help="Square image size."),
+    click.option("--raster", type=click.Choice(["auto", "eevee", "workbench", "cycles-direct"])),
+]
+SELECT_OPTIONS = [
+    click.option("--budget", type=int, metavar="M", help="Views to ray-trace (default 25)."),
+    click.option("--policy", type=click.Choice(["rl", "random", "farthest"]), help="How to choose them."),
+]
+
+
+STRICT = click.option(
+    "--strict", is_flag=True, help="Refuse a scene with missing files or anything ignored. Remembered."
+)
+
+
+def strict_override(strict: bool) -> dict[str, Any]:
+    """``--strict`` as settings."""
+    return {"strict": True} if strict else {}
+
+
+def options(options: list[Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        for option in reversed(options):
+            function = option(function)
+        return function
+
+    return decorate
+
+
+def open_session(
+    command: str,
+    options: dict[str, Any],
+    *,
+    scene: Path | None = None,
+    overrides: dict[str, Any] | None = None,
+    late: Callable[[Settings], dict[str, Any]] | None = None,
+) -> Session:
+    """The command's hold on its workspace. ``late``: overrides that depend on the settings as they are."""
+    from ..session import Session
+
+    return Session(command, options, scene, overrides or {}, late)
+
+
+def camera_overrides(options: dict[str, Any]) -> dict[str, Any]:
+    cameras: dict[str, Any] = {}
+    source = options.pop("cameras")
+    if source is not None:
+        from ..cameras import KEYWORDS
+
+        if source not in KEYWORDS and not Path(source).is_file():
+            raise UserError(f"--cameras {source}: neither {', '.join(KEYWORDS)} nor a camera file")
+        if source in KEYWORDS:
+            cameras |= {"source": source, "source_sha256": ""}
+        else:
+            from ..workspace import file_sha256
+
+            cameras |= {"source": str(Path(source).resolve()), "source_sha256": file_sha256(Path(source))}
+    views, resolution, raster = options.pop("views"), options.pop("resolution"), options.pop("raster")
+    if views is not None:
+        cameras["train"] = views
+    if resolution is not None:
+        cameras |= {"width": resolution, "height": resolution}
+    overrides: dict[str, Any] = {"cameras": cameras} if cameras else {}
+    if raster is not None:
+        overrides["passes"] = {"raster": raster}
+    return overrides
+
+
+def select_overrides(options: dict[str, Any]) -> dict[str, Any]:
+    chosen = {key: options.pop(key) for key in ("budget", "policy")}
+    if chosen["budget"] is not None and chosen["budget"] < 1:
+        raise UserError(f"--budget {chosen['budget']}: must be at least 1 view")
+    given = {key: value for key, value in chosen.items() if value is not None}
+    return {"select": given} if given else {}

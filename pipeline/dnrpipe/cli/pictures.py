@@ -1,0 +1,58 @@
+"""What the finished renderer is for: novel views, and the report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ..errors import UserError
+from .options import common, open_session
+
+
+@click.command()
+@click.option("--orbit", type=click.IntRange(1, 100_000), metavar="N", help="N frames of a turntable (default 60).")
+@click.option("--elevation", type=click.FloatRange(-89, 89), default=25.0, show_default=True, metavar="DEGREES")
+@click.option("--cameras", "camera_file", type=click.Path(path_type=Path), help="A NeRF transforms.json instead.")
+@click.option("--frames", type=click.Choice(["png", "exr", "both"]), default="png", show_default=True)
+@click.option("--movie", type=click.Choice(["mp4", "webp", "none"]), default="mp4", show_default=True)
+@click.option(
+    "--resolution", type=click.IntRange(8, 16384), metavar="PIXELS", help="Square size of the orbit's frames."
+)
+@common
+def render(
+    orbit: int | None,
+    elevation: float,
+    camera_file: Path | None,
+    frames: str,
+    movie: str,
+    resolution: int | None,
+    **options: Any,
+) -> None:
+    """Render novel views with the neural renderer: frames and a movie in renders/.
+
+    \b
+    Examples:
+      dnrpipe render --orbit 60
+      dnrpipe render --orbit 120 --movie webp --frames both
+      dnrpipe render --cameras transforms_path.json
+    """
+    if orbit is not None and camera_file is not None:
+        raise UserError("render: give --orbit or --cameras, not both")
+    with open_session("render", options) as session:
+        session.render(orbit or 60, elevation, camera_file, frames, movie, resolution)
+
+
+@click.command()
+@common
+def report(**options: Any) -> None:
+    """Write one self-contained HTML report: pictures, quality, and what it cost in time.
+
+    \b
+    Examples:
+      dnrpipe report
+      dnrpipe report -w scene.dnr --json
+    """
+    with open_session("report", options) as session:
+        session.report()

@@ -1,0 +1,129 @@
+"""One command per stage of the pipeline, and `run` for all of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .options import (
+    CAMERA_OPTIONS,
+    SELECT_OPTIONS,
+    STRICT,
+    camera_overrides,
+    common,
+    open_session,
+    options,
+    select_overrides,
+    strict_override,
+)
+
+
+@click.command()
+@click.argument("scene", type=click.Path(path_type=Path), required=False)
+@STRICT
+@options(CAMERA_OPTIONS)
+@common
+def prepare(scene: Path | None, strict: bool, **options: Any) -> None:
+    """Convert a scene and render the cheap passes of all candidate views.
+
+    SCENE is a .blend, .obj, .gltf, .glb, .fbx, .ply or .stl file. Makes ./SCENE.dnr (or -w DIR) with the
+    census, a Mitsuba bundle, cameras, and per view a G-buffer (UV, depth, normal) and rasterised colour.
+    Embedded scripts are never executed. Without SCENE, goes on with the workspace's own scene.
+
+    \b
+    Examples:
+      dnrpipe prepare scene.blend
+      dnrpipe prepare scene.blend --preset standard --resolution 512
+      dnrpipe prepare scene.blend --cameras transforms_train.json
+      dnrpipe prepare scene.blend --strict
+    """
+    overrides = {**camera_overrides(options), **strict_override(strict)}
+    with open_session("prepare", options, scene=scene, overrides=overrides) as session:
+        session.stages("prepare")
+
+
+@click.command()
+@options(SELECT_OPTIONS)
+@common
+def select(**options: Any) -> None:
+    """Step 1: train the coarse neural renderer and choose the views to ray-trace.
+
+    \b
+    Examples:
+      dnrpipe select --budget 25
+      dnrpipe select --budget 10 --policy farthest
+    """
+    with open_session("select", options, overrides=select_overrides(options)) as session:
+        session.stages("select")
+
+
+@click.command("raytrace-selected")
+@click.option("--spp", type=int, metavar="N", help="Samples per pixel.")
+@common
+def raytrace_selected(spp: int | None, **options: Any) -> None:
+    """Path-trace the selected views with Mitsuba, and no others.
+
+    \b
+    Examples:
+      dnrpipe raytrace-selected
+      dnrpipe raytrace-selected --spp 512
+    """
+    overrides: dict[str, Any] = {"raytrace": {"spp": spp}} if spp is not None else {}
+    with open_session("raytrace-selected", options, overrides=overrides) as session:
+        session.stages("raytrace")
+
+
+@click.command()
+@click.option("--epochs", type=int, metavar="N", help="Passes over the selected views.")
+@common
+def finetune(epochs: int | None, **options: Any) -> None:
+    """Step 2: fine-tune the neural renderer on the ray-traced views with six losses.
+
+    \b
+    Examples:
+      dnrpipe finetune
+      dnrpipe finetune --epochs 100 --set finetune.step2.augment=false
+    """
+    overrides: dict[str, Any] = {"finetune": {"step2": {"epochs": epochs}}} if epochs is not None else {}
+    with open_session("finetune", options, overrides=overrides) as session:
+        session.stages("finetune")
+
+
+@click.command()
+@common
+def evaluate(**options: Any) -> None:
+    """Measure on held-out test views, ray-traced on demand and booked as evaluation cost.
+
+    \b
+    Examples:
+      dnrpipe evaluate
+      dnrpipe evaluate --json | jq .evaluate.mean.psnr
+    """
+    with open_session("evaluate", options) as session:
+        session.stages("evaluate")
+
+
+@click.command()
+@click.argument("scene", type=click.Path(path_type=Path), required=False)
+@STRICT
+@options([*CAMERA_OPTIONS, *SELECT_OPTIONS])
+@common
+def run(scene: Path | None, strict: bool, **options: Any) -> None:
+    """All stages: prepare, select, raytrace-selected, finetune, evaluate, report.
+
+    Does only what is missing or out of date.
+
+    \b
+    Examples:
+      dnrpipe run scene.blend --budget 25
+      dnrpipe run scene.blend --preset paper
+    """
+    from ..settings import merge
+
+    overrides = merge(camera_overrides(options), select_overrides(options))
+    overrides |= strict_override(strict)
+    with open_session("run", options, scene=scene, overrides=overrides) as session:
+        session.stages("prepare", "select", "raytrace", "finetune", "evaluate")
+        session.report()

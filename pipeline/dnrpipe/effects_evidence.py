@@ -1,0 +1,190 @@
+"""What in a scene calls for an effect, in words that name it. Pure functions of census and bundle facts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+SHARP = 0.25
+"""Roughness up to which metal and glass throw caustics that a viewer would notice."""
+LISTED = 4  # names spelt out in one sentence
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """called_for: the scene needs it. present: the converted scene holds it. words: what names it."""
+
+    called_for: bool
+    present: bool
+    words: tuple[str, ...] = ()
+
+
+NOTHING: dict[str, str] = {
+    "indirect": "no surface reflects light",
+    "refraction": "no material refracts",
+    "caustics": "no sharp metal or glass beside a surface that shows its caustics",
+    "volumes": "no media",
+    "subsurface": "no material scatters below its surface",
+    "alpha": "no material is transparent or cut out",
+    "environment": "the world is dark",
+    "area-lights": "no lamp with a surface",
+    "point-lights": "no point, spot or sun lamp without size",
+    "glow": "no material emits",
+    "hair": "no strands",
+    "depth-of-field": "no camera in use has it",
+    "spectral": "nothing in the converted scene depends on the wavelength",
+    "motion": "the scene does not ask for it",
+    "view-dependence": "all surfaces look the same from every side",
+    "depth": "all surfaces look the same from every side: their place in the atlas says all",
+    "normal": "all surfaces look the same from every side: their place in the atlas says all",
+}
+
+
+def gather(
+    census: Mapping[str, Any], bundle: Mapping[str, Sequence[str]], lenses: Sequence[str]
+) -> dict[Any, Evidence]:
+    """Evidence by effect name."""
+    materials: Mapping[str, Mapping[str, Any]] = census.get("materials", {})
+    result = {
+        "indirect": _indirect(census, materials),
+        "refraction": _held(bundle, "refraction", _where(materials, lambda m: m["refractive"], _with_ior)),
+        "caustics": _caustics(materials, bundle),
+        "volumes": _held(bundle, "volumes", _volumes(census, materials)),
+        "subsurface": _held(bundle, "subsurface", _where(materials, lambda m: m["subsurface"])),
+        "alpha": _held(bundle, "alpha", _where(materials, lambda m: m["transparent"])),
+        "environment": _held(bundle, "environment", _world(census.get("world"))),
+        "area-lights": _held(bundle, "area-lights", _lamps(census, sized=True)),
+        "point-lights": _held(bundle, "point-lights", _lamps(census, sized=False)),
+        "glow": _held(bundle, "glow", _where(materials, lambda m: m["emissive"])),
+        "hair": _held(bundle, "hair", tuple(f"'{name}'" for name in census.get("hair", ()))),
+        "depth-of-field": _lenses(census, lenses),
+        "spectral": _spectral(materials),
+        "motion": _motion(census),
+    }
+    shiny = [f"'{n}'" for n, m in materials.items() if m["glossy"] or m["transmissive"] or m["view_dependent"]]
+    glossy = (f"{len(shiny)} materials are not matt: {_list(shiny)}",) if shiny else ()
+    result["view-dependence"] = Evidence(bool(glossy), True, glossy)
+    shared = census.get("instances", 0) > census.get("meshes", census.get("instances", 0))
+    extra = (("instances share one place in the atlas",) if shared else ()) + glossy
+    result["depth"] = result["normal"] = Evidence(bool(extra), True, extra)
+    return result
+
+
+def _held(bundle: Mapping[str, Sequence[str]], name: str, words: tuple[str, ...]) -> Evidence:
+    """An effect that is on where the bundle holds it."""
+    held = tuple(bundle.get(name, ()))
+    if held:
+        return Evidence(True, True, words or (_list([f"'{identity}'" for identity in held]),))
+    if words:
+        return Evidence(False, False, ("not in the converted scene, see `dnrpipe inspect`", *words))
+    return Evidence(False, False)
+
+
+def _where(
+    materials: Mapping[str, Mapping[str, Any]],
+    wanted: Callable[[Mapping[str, Any]], Any],
+    detail: Callable[[Mapping[str, Any]], str] = lambda entry: "",
+) -> tuple[str, ...]:
+    """A sentence for each material that fits: its name, what is special, the objects that show it."""
+    words = []
+    for name, entry in materials.items():
+        if not wanted(entry):
+            continue
+        said = [part for part in (detail(entry), _on(entry)) if part]
+        words.append(f"material '{name}'" + (f" ({'; '.join(said)})" if said else ""))
+    return tuple(words)
+
+
+def _on(entry: Mapping[str, Any]) -> str:
+    objects = entry.get("objects", ())
+    return f"on {_list([repr(name) for name in objects])}" if objects else ""
+
+
+def _list(names: Sequence[str]) -> str:
+    more = len(names) - LISTED
+    return ", ".join(names[:LISTED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _with_ior(entry: Mapping[str, Any]) -> str:
+    return f"index {entry['ior']:.3g}" if entry.get("ior") else ""
+
+
+def _with_roughness(entry: Mapping[str, Any]) -> str:
+    return "roughness by image" if entry["min_roughness"] is None else f"roughness {entry['min_roughness']:.2g}"
+
+
+def _indirect(census: Mapping[str, Any], materials: Mapping[str, Mapping[str, Any]]) -> Evidence:
+    names = [name for name, entry in materials.items() if entry["reflects"]]
+    count = len(names) + bool(census.get("default_material"))
+    if not count:
+        return Evidence(False, False)
+    passing = [name for name, entry in materials.items() if entry["transparent"] or entry["transmissive"]]
+    words = f"{count} material{'s' if count > 1 else ''} reflect light"
+    if passing:
+        words += f"; {_list([repr(name) for name in passing])} let it pass"
+    return Evidence(True, True, (words,))
+
+
+def _caustics(materials: Mapping[str, Mapping[str, Any]], bundle: Mapping[str, Sequence[str]]) -> Evidence:
+    def throws(entry: Mapping[str, Any]) -> bool:
+        sharp = entry["roughness_linked"] or (entry["min_roughness"] is not None and entry["min_roughness"] <= SHARP)
+        return bool(sharp and (entry["metallic"] or entry["refractive"]))
+
+    def shows(entry: Mapping[str, Any]) -> bool:
+        mirror = entry["metallic"] or entry["refractive"]
+        return bool(entry["reflects"] and not (mirror and throws(entry)))
+
+    words = _where(materials, throws, _with_roughness)
+    if not words or not any(shows(entry) for entry in materials.values()):
+        return Evidence(False, False)
+    # Mitsuba's path tracer for media has no way to leave them out.
+    return Evidence(True, not bundle.get("volumes"), words)
+
+
+def _volumes(census: Mapping[str, Any], materials: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:
+    words = list(_where(materials, lambda m: m["volume"]))
+    words += [f"'{name}'" for name in census.get("volumes", ()) if name not in materials]
+    world = census.get("world")
+    if world and world.get("volume"):
+        words.append(f"world '{world['name']}'")
+    return tuple(words)
+
+
+def _world(world: Mapping[str, Any] | None) -> tuple[str, ...]:
+    if not world or not world.get("emits", True):
+        return ()
+    what = {"hdri": f"image '{world.get('image')}'", "sky": "sky", "color": "plain colour"}.get(world["kind"], "nodes")
+    return (f"world '{world['name']}' ({what})",)
+
+
+def _lamps(census: Mapping[str, Any], *, sized: bool) -> tuple[str, ...]:
+    words = []
+    for lamp in census.get("lights", ()):
+        size = lamp["size"]
+        largest = max(size) if isinstance(size, list | tuple) else size
+        if lamp["power"] and (largest > 0) == sized:
+            words.append(f"{lamp['type'].lower()} lamp '{lamp['name']}'")
+    return (_list(words),) if words else ()
+
+
+def _lenses(census: Mapping[str, Any], lenses: Sequence[str]) -> Evidence:
+    if lenses:
+        return Evidence(True, True, (f"camera {_list([repr(name) for name in lenses])}",))
+    unused = census.get("depth_of_field", ())
+    if not unused:
+        return Evidence(False, False)
+    named = _list([repr(name) for name in unused])
+    return Evidence(False, False, (f"camera {named} has it, but the views in use are not its own",))
+
+
+def _spectral(materials: Mapping[str, Mapping[str, Any]]) -> Evidence:
+    films = _where(materials, lambda m: m["thin_film"])
+    return Evidence(False, False, ("not in the converted scene, see `dnrpipe inspect`", *films) if films else ())
+
+
+def _motion(census: Mapping[str, Any]) -> Evidence:
+    moving = census.get("motion", ())
+    if not moving:
+        return Evidence(False, False)
+    return Evidence(False, False, (f"asked for, but the scene is frozen: {_list([repr(n) for n in moving])}",))

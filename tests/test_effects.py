@@ -1,0 +1,325 @@
+"""The effect plan: what turns an effect on, with which evidence, and what the user may override. Pure functions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dnrpipe.cameras import view_lenses
+from dnrpipe.effects import FORCEABLE, LAMPS, NAMES, NEURAL, DepthPilot, DepthStep, EffectPlan, plan_effects
+from dnrpipe.effects_bundle import bundle_facts, write_without
+from dnrpipe.effects_command import override_settings, table
+from dnrpipe.effects_statistics import difference, enough, remaining, significance
+from dnrpipe.errors import UserError
+from dnrpipe.raytrace.sensors import _centred
+from dnrpipe.settings import CameraSettings, Settings, resolve
+from dnrtrain.settings import ModelSettings
+
+MATT: dict[str, Any] = {
+    "reflects": True,
+    "glossy": False,
+    "transparent": False,
+    "transmissive": False,
+    "refractive": False,
+    "ior": None,
+    "emissive": False,
+    "subsurface": False,
+    "metallic": False,
+    "volume": False,
+    "thin_film": False,
+    "view_dependent": [],
+    "min_roughness": None,
+    "roughness_linked": False,
+    "objects": ["Floor"],
+}
+GLASS = MATT | {
+    "glossy": True,
+    "transmissive": True,
+    "refractive": True,
+    "ior": 1.5,
+    "min_roughness": 0.0,
+    "objects": ["Ball"],
+}
+
+
+def census(**changes: Any) -> dict[str, Any]:
+    base = {"materials": {"Chalk": MATT}, "lights": [], "world": None, "instances": 1, "meshes": 1, "triangles": 12}
+    return base | changes
+
+
+def pilot(depth: int) -> DepthPilot:
+    steps = tuple(
+        DepthStep(depth=d, mean=0.1 / d**2 if d < depth else 0.001, mean_error=0, pixel=0) for d in (2, depth)
+    )
+    return DepthPilot(
+        fingerprint="f",
+        max_depth=depth,
+        reference_depth=64,
+        tolerance=0.005,
+        pixel_tolerance=0.02,
+        views=4,
+        resolution=96,
+        spp=16,
+        seconds=1.0,
+        steps=steps,
+    )
+
+
+def on(plan: EffectPlan) -> set[str]:
+    return {effect.name for effect in plan.effects if effect.on}
+
+
+def test_a_matt_scene_calls_for_indirect_light_alone() -> None:
+    plan = plan_effects(census(), {})
+    assert on(plan) == {"indirect"}
+    assert plan.max_depth is None and plan.integrator == "path"
+    assert all(effect.evidence and all(effect.evidence) for effect in plan.effects)
+
+
+def test_the_pilot_decides_depth_and_indirect_light() -> None:
+    deep = plan_effects(census(), {}, pilot=pilot(6))
+    assert (deep.integrator, deep.max_depth, deep.depth_by) == ("path", 6, "pilot")
+    shallow = plan_effects(census(), {}, pilot=pilot(2))
+    assert (shallow.integrator, shallow.max_depth) == ("direct", 2) and not shallow.on("indirect")
+    fixed = plan_effects(census(), {}, max_depth=9, pilot=pilot(2))
+    assert (fixed.max_depth, fixed.depth_by) == (9, "settings")
+    black = plan_effects(census(materials={"Lamp": MATT | {"reflects": False, "emissive": True}}), {"glow": ["a"]})
+    assert (black.integrator, black.max_depth, black.depth_by) == ("direct", 2, "scene")
+    assert on(black) == {"glow"}
+
+
+def test_evidence_names_material_object_lamp_and_camera() -> None:
+    lamps = [
+        {"name": "Bulb", "type": "POINT", "power": 10.0, "size": 0.1},
+        {"name": "Spark", "type": "SPOT", "power": 5.0, "size": 0.0},
+        {"name": "Off", "type": "POINT", "power": 0.0, "size": 0.1},
+    ]
+    world = {"name": "Sky", "kind": "sky", "emits": True}
+    held = {"refraction": ["mat-Glass"], "environment": ["w"], "area-lights": ["l1"], "point-lights": ["l2"]}
+    plan = plan_effects(
+        census(materials={"Chalk": MATT, "Glass": GLASS}, lights=lamps, world=world), held, lenses=("Close-up",)
+    )
+    wanted = {"refraction": ["'Glass'", "'Ball'", "1.5"], "caustics": ["'Glass'"], "environment": ["'Sky'"]}
+    wanted |= {"area-lights": ["'Bulb'"], "point-lights": ["'Spark'"], "depth-of-field": ["'Close-up'"]}
+    wanted |= {"view-dependence": ["'Glass'"], "depth": ["'Glass'"], "normal": ["'Glass'"]}
+    assert on(plan) == {"indirect", *wanted}
+    for name, words in wanted.items():
+        text = " ".join(plan.effect(name).evidence)  # type: ignore[arg-type]
+        assert all(word in text for word in words), (name, text)
+        assert "Off" not in text
+
+
+def test_what_the_converted_scene_does_not_hold_is_off_and_says_so() -> None:
+    plan = plan_effects(census(materials={"Fog": MATT | {"volume": True}}, hair=["Fur"]), {})
+    assert not plan.on("volumes") and not plan.on("hair")
+    assert "inspect" in plan.effect("volumes").evidence[0] and "'Fog'" in plan.effect("volumes").evidence[1]
+
+
+def test_integrator_follows_the_plan() -> None:
+    glass = census(materials={"Chalk": MATT, "Glass": GLASS})
+    assert plan_effects(glass, {"volumes": ["m"]}).integrator == "volpath"
+    assert plan_effects(glass, {}, disable=["caustics"]).integrator == "path-without-caustics"
+    # `direct` stops at null surfaces: cut-outs keep `path`.
+    assert plan_effects(census(), {"alpha": ["m"]}, max_depth=2).integrator == "path"
+    # Shadow rays of `path` stop at cut-outs: a lamp's light would not come through.
+    assert plan_effects(census(), {"alpha": ["m"], "point-lights": ["m"]}).integrator == "volpath"
+    assert plan_effects(census(), {"null": ["m"]}, max_depth=2).integrator == "path"
+    kept = plan_effects(glass, {"volumes": ["m"]}, disable=["caustics"])
+    assert kept.on("caustics") and kept.integrator == "volpath"
+
+
+def test_instances_that_share_a_place_keep_depth_and_normal() -> None:
+    plan = plan_effects(census(instances=50, meshes=2), {})
+    assert plan.on("depth") and plan.on("normal") and not plan.on("view-dependence")
+
+
+def test_the_neural_renderer_loses_what_is_off_and_gains_nothing() -> None:
+    plain = plan_effects(census(), {})
+    model = plain.model(ModelSettings())
+    assert (model.modalities, model.spherical_harmonics) == ("uv", False)
+    shiny = plan_effects(census(materials={"Glass": GLASS}), {"refraction": ["m"]})
+    assert shiny.model(ModelSettings()) == ModelSettings()
+    own = ModelSettings(modalities="uv+normal", spherical_harmonics=False)
+    assert shiny.model(own) == own
+
+
+BUNDLE_NAMES = ("refraction", "volumes", "subsurface", "alpha", "environment", "area-lights", "point-lights", "glow")
+
+
+@settings(deadline=None, max_examples=150)
+@given(
+    st.sets(st.sampled_from(BUNDLE_NAMES)),
+    st.sets(st.sampled_from(NAMES)),
+    st.sets(st.sampled_from(NAMES)),
+    st.sampled_from(["auto", 1, 2, 7]),
+    st.one_of(st.none(), st.sampled_from([2, 4, 12])),
+)
+def test_overrides_are_obeyed_or_have_nothing_to_act_on(
+    held: set[str], enable: set[Any], disable: set[Any], depth: Any, piloted: int | None
+) -> None:
+    scene = census(materials={"Chalk": MATT, "Glass": GLASS})
+    bundle = {name: ["x"] for name in held}
+    arguments: dict[str, Any] = {"max_depth": depth, "pilot": None if piloted is None else pilot(piloted)}
+    plan = plan_effects(scene, bundle, enable=sorted(enable), disable=sorted(disable), **arguments)
+    assert plan == plan_effects(scene, bundle, enable=sorted(enable), disable=sorted(disable), **arguments)
+    assert EffectPlan.model_validate_json(plan.model_dump_json()) == plan
+    for effect in plan.effects:
+        if effect.name in disable and effect.on:
+            assert not effect.present  # there is no way to leave it out
+        elif effect.name in enable - disable and not effect.on:
+            assert not effect.present or (effect.name == "indirect" and depth in (1, 2))
+            assert effect.name not in FORCEABLE - {"indirect"}
+    assert set(plan.left_out) <= set(disable) and not set(plan.left_out) & NEURAL
+    behind_cutouts = plan.on("alpha") and any(plan.on(name) for name in LAMPS)
+    bare = behind_cutouts and plan.integrator != "path-without-caustics"
+    assert (plan.integrator == "volpath") == (plan.on("volumes") or bare)
+    if plan.max_depth is None:
+        assert depth == "auto" and piloted is None
+    table(plan)
+
+
+def test_flags_replace_each_other_and_unknown_names_are_refused() -> None:
+    before = resolve(None, {"effects": {"enable": ["volumes"], "disable": ["caustics"]}}, environment={})
+    change = override_settings(("caustics",), ("volumes",), ())
+    assert change(before)["effects"] == {"enable": ["caustics"], "disable": ["volumes"]}
+    assert override_settings((), (), ("volumes",))(before)["effects"]["enable"] == []
+    assert override_settings((), (), ())(before) == {}
+    with pytest.raises(UserError, match="no effect 'vollumes'"):
+        override_settings(("vollumes",), (), ())
+    with pytest.raises(UserError, match="give one of them"):
+        override_settings(("glow",), ("glow",), ())
+    with pytest.raises(UserError, match="effects"):
+        resolve(None, {"effects": {"disable": ["fog"]}}, environment={})
+
+
+def test_an_override_makes_stale_only_what_it_touches() -> None:
+    from dnrpipe.stages import STAGES
+
+    def told(stage: str, **effects: Any) -> Any:
+        return STAGES[stage].settings(resolve(None, {"effects": effects}, environment={}))
+
+    for stage, touched in (("select", False), ("finetune", False), ("raytrace", True), ("evaluate", True)):
+        assert (told(stage, disable=["caustics"]) != told(stage)) == touched
+        assert (told(stage, disable=["normal"]) != told(stage)) != touched
+    assert told("raytrace", tolerance=0.01) != told("raytrace")
+
+
+def test_the_help_names_every_effect() -> None:
+    from dnrpipe.cli.scene import effects
+
+    named = " ".join((effects.help or "").split()).partition("Names: ")[2].partition(".")[0]
+    assert tuple(named.split(", ")) == NAMES
+
+
+def test_max_depth_is_auto_or_a_number() -> None:
+    assert Settings().raytrace.max_depth == "auto"
+    assert resolve(None, {"raytrace": {"max_depth": 5}}, environment={}).raytrace.max_depth == 5
+    for bad in (0, "deep"):
+        with pytest.raises(UserError, match="max_depth"):
+            resolve(None, {"raytrace": {"max_depth": bad}}, environment={})
+
+
+BUNDLE = """<scene version="3.0.0">
+  <emitter type="constant" id="world"/>
+  <emitter type="directional" id="light-sun"/>
+  <bsdf type="roughdielectric" id="mat-glass"><float name="alpha" value="0.1"/></bsdf>
+  <bsdf type="mask" id="mat-leaf"><float name="opacity" value="0.5"/>
+    <bsdf type="twosided"><bsdf type="diffuse"/></bsdf></bsdf>
+  <bsdf type="principled" id="mat-skin">
+    <float name="flatness" value="0.5"/><float name="spec_trans" value="0.0"/></bsdf>
+  <shape type="rectangle" id="light-area"><emitter type="area"/></shape>
+  <shape type="sphere" id="mesh-bulb"><emitter type="area"/><ref id="mat-glass"/></shape>
+  <shape type="shapegroup" id="group-fur"><shape type="ply" id="hair-fur"/></shape>
+  <shape type="instance"><ref id="group-fur"/></shape>
+  <shape type="sphere" id="mesh-cloud"><medium type="homogeneous" name="interior"/></shape>
+</scene>"""
+HELD = {
+    "refraction": ["mat-glass"],
+    "alpha": ["mat-leaf"],
+    "subsurface": ["mat-skin"],
+    "volumes": ["homogeneous"],
+    "environment": ["world"],
+    "point-lights": ["light-sun"],
+    "area-lights": ["light-area"],
+    "glow": ["mesh-bulb"],
+    "hair": ["hair-fur"],
+}
+
+
+def test_bundle_facts_find_every_effect(tmp_path: Path) -> None:
+    (tmp_path / "scene.xml").write_text(BUNDLE)
+    assert bundle_facts(tmp_path / "scene.xml") == HELD
+    (tmp_path / "torn.xml").write_text("<scene")
+    with pytest.raises(UserError, match="damaged"):
+        bundle_facts(tmp_path / "torn.xml")
+
+
+@pytest.mark.parametrize("name", sorted(set(HELD) - {"volumes"}))
+def test_leaving_one_effect_out_keeps_the_others(tmp_path: Path, name: str) -> None:
+    (tmp_path / "scene.xml").write_text(BUNDLE)
+    write_without(tmp_path / "scene.xml", [name], tmp_path / "less.xml")
+    assert bundle_facts(tmp_path / "less.xml") == {key: ids for key, ids in HELD.items() if key != name}
+    assert ("group-fur" in (tmp_path / "less.xml").read_text()) == (name != "hair")
+
+
+def _deep_and_missing(
+    rng: np.random.Generator, share: float, noise: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    whole = np.full((4, 2, 64, 64, 3), 0.5)
+    missing = share * whole * (1 + noise * rng.normal(size=whole.shape))
+    return missing, whole, np.ones(whole.shape[:-1])
+
+
+def test_remaining_light_is_measured_without_the_noise_choosing_itself() -> None:
+    rng = np.random.default_rng(0)
+    step = remaining(4, *_deep_and_missing(rng, 0.01, 5.0))
+    assert step.mean == pytest.approx(0.01, rel=0.1)
+    assert abs(step.mean - 0.01) < 4 * step.mean_error
+    # The largest 2% of noisy blocks would be 3 times too high had they been chosen by what is measured.
+    assert step.pixel == pytest.approx(0.01, rel=0.5)
+    assert not enough(step, 0.005, 0.02) and enough(step, 0.02, 0.02)
+
+
+def test_the_worst_pixels_decide_too() -> None:
+    missing, whole, cover = _deep_and_missing(np.random.default_rng(1), 0.0, 0.0)
+    missing[:, :, :12, :12] = 0.1
+    step = remaining(4, missing, whole, cover)
+    assert step.mean == pytest.approx(0.2 * 12 * 12 / 64**2) and step.pixel == pytest.approx(0.2)
+    assert not enough(step, 0.5, 0.02)
+
+
+def test_black_pictures_miss_nothing() -> None:
+    zero = np.zeros((2, 2, 16, 16, 3))
+    step = remaining(2, zero, zero, np.zeros(zero.shape[:-1]))
+    assert (step.mean, step.mean_error, step.pixel) == (0, 0, 0)
+
+
+def test_difference_is_free_of_noise() -> None:
+    rng = np.random.default_rng(2)
+    shape = (4, 2, 64, 64, 3)
+    truth = np.full(shape, 0.4)
+    noisy = [truth + rng.normal(0, 0.05, shape) for _ in range(2)]
+    assert difference(*noisy).mean < 0.004 and abs(significance(*noisy)) < 4
+    shifted = noisy[0] + 0.02
+    assert difference(shifted, noisy[1]).mean == pytest.approx(0.02, rel=0.1) and significance(shifted, noisy[1]) > 10
+
+
+def test_only_the_scenes_own_cameras_have_lenses() -> None:
+    camera = {"name": "Main", "type": "PERSP", "lens": 50.0, "sensor_width": 36.0, "sensor_height": 24.0}
+    camera |= {"sensor_fit": "AUTO", "shift_x": 0.0, "shift_y": 0.0, "c2w": np.eye(4).tolist()}
+    lens = {"aperture_radius": 0.01, "focus_distance": 3.0}
+    summary = {"cameras": [camera | {"dof": lens}, camera | {"dof": None}], "animation": []}
+    assert view_lenses(summary, CameraSettings(source="scene")) == {"Main": lens}
+    assert view_lenses(summary, CameraSettings()) == {}
+
+
+@given(st.integers(8, 400), st.integers(-100, 900))
+def test_a_film_about_the_principal_point_holds_the_picture(size: int, twice: int) -> None:
+    width, offset = _centred(size, twice / 2)
+    assert width / 2 - offset == twice / 2
+    assert offset >= 0 and offset + size <= width
