@@ -9,7 +9,7 @@ APT     := libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1 li
 APT_DEV := chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system browser demo test lint types imports docs docs-check bench clean
+.PHONY: help setup system browser demo test lint types imports docs docs-check bench bench-effects fidelity scenes clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -53,8 +53,17 @@ docs: $(STAMP)  ## regenerate the CLI reference from --help
 docs-check: $(STAMP)
 	$(BIN)/python tools/cli_reference.py --check docs/cli.md
 
+bench-effects: setup  ## the effect plan against "everything on", on the benchmark scenes
+	$(BIN)/python tools/bench_effects.py
+
 bench: setup  ## time the parts that the README speaks of
 	$(BIN)/python tools/bench.py
 
+fidelity: setup  ## Cycles against our conversion, one feature a scene: docs/fidelity.md
+	$(BIN)/python -m tools.fidelity --docs docs --jobs $$(nproc)
+
+scenes: setup  ## the example scenes by Cycles and by us, side by side: docs/scenes.md
+	$(BIN)/python -m tools.fidelity.gallery
+
 clean:  ## remove what make made
-	rm -rf $(VENV) $(DEMO) .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(DEMO) .pytest_cache .ruff_cache .hypothesis .cache
