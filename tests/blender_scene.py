@@ -16,14 +16,14 @@ import bpy
 import mathutils
 import numpy as np
 
-from dnrpipe.blender.atlas import build_atlas
 from dnrpipe.blender.cameras import camera_animation, scene_cameras
-from dnrpipe.blender.frozen import save_geometry
-from dnrpipe.blender.gbuffer_scene import add_gbuffer_scene
-from dnrpipe.blender.geometry import freeze_scene
-from dnrpipe.blender.light import ensure_light, has_light
-from dnrpipe.blender.opening import open_scene
-from dnrpipe.blender.packing import pack_everything, save_blend
+from dnrpipe.blender.geometry.atlas import build_atlas
+from dnrpipe.blender.geometry.freeze import freeze_scene
+from dnrpipe.blender.geometry.frozen import save_geometry
+from dnrpipe.blender.passes.gbuffer_scene import add_gbuffer_scene
+from dnrpipe.blender.reading.light import ensure_light, has_light
+from dnrpipe.blender.reading.opening import open_scene
+from dnrpipe.blender.reading.packing import pack_everything, save_blend
 from dnrtrain.atomic import write_json
 
 

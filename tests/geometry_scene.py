@@ -89,11 +89,11 @@ def build() -> None:
 def prepare(folder: Path) -> None:
     import bpy
 
-    from dnrpipe.blender.atlas import build_atlas
-    from dnrpipe.blender.export import export_bundle
-    from dnrpipe.blender.gbuffer_scene import add_gbuffer_scene
-    from dnrpipe.blender.geometry import freeze_scene
-    from dnrpipe.blender.packing import save_blend
+    from dnrpipe.blender.bundle.export import export_bundle
+    from dnrpipe.blender.geometry.atlas import build_atlas
+    from dnrpipe.blender.geometry.freeze import freeze_scene
+    from dnrpipe.blender.passes.gbuffer_scene import add_gbuffer_scene
+    from dnrpipe.blender.reading.packing import save_blend
 
     build()
     frozen = freeze_scene(bpy.context.scene)
@@ -119,7 +119,7 @@ def view() -> dict[str, Any]:
 
 
 def passes(folder: Path) -> None:
-    from dnrpipe.blender.passes import Worker
+    from dnrpipe.blender.passes.worker import Worker
 
     worker = Worker(
         {

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from dnrpipe.blender.frozen import load_geometry
+from dnrpipe.blender.geometry.frozen import load_geometry
 from dnrtrain.contract import View
 
 

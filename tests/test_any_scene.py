@@ -14,14 +14,14 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 from dnrpipe.blender.findings import Findings  # noqa: E402
-from dnrpipe.blender.framing import framing_pose  # noqa: E402
-from dnrpipe.blender.light import studio_radiance  # noqa: E402
-from dnrpipe.blender.loading import load_scene  # noqa: E402
-from dnrpipe.blender.missing import missing_files  # noqa: E402
-from dnrpipe.blender.names import find_material  # noqa: E402
-from dnrpipe.blender.opening import open_scene  # noqa: E402
-from dnrpipe.blender.packing import pack_everything, save_blend  # noqa: E402
 from dnrpipe.blender.prepare import prepare  # noqa: E402
+from dnrpipe.blender.reading.framing import framing_pose  # noqa: E402
+from dnrpipe.blender.reading.light import studio_radiance  # noqa: E402
+from dnrpipe.blender.reading.loading import load_scene  # noqa: E402
+from dnrpipe.blender.reading.missing import missing_files  # noqa: E402
+from dnrpipe.blender.reading.names import find_material  # noqa: E402
+from dnrpipe.blender.reading.opening import open_scene  # noqa: E402
+from dnrpipe.blender.reading.packing import pack_everything, save_blend  # noqa: E402
 from dnrpipe.errors import UserError  # noqa: E402
 from dnrpipe.scene_files import scene_fingerprint  # noqa: E402
 

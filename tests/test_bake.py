@@ -15,18 +15,18 @@ from mathutils import Euler, Matrix  # noqa: E402
 
 from dnrpipe.baking import FOLDER, bake  # noqa: E402
 from dnrpipe.blender import bake as baking  # noqa: E402
-from dnrpipe.blender.atlas import build_atlas  # noqa: E402
-from dnrpipe.blender.bake_mesh import object_positions, object_random  # noqa: E402
-from dnrpipe.blender.bakes import BakeBook  # noqa: E402
-from dnrpipe.blender.colour_spaces import decode  # noqa: E402
-from dnrpipe.blender.filtering import finer  # noqa: E402
+from dnrpipe.blender.baking.bakes import BakeBook  # noqa: E402
+from dnrpipe.blender.baking.mesh import object_positions, object_random  # noqa: E402
 from dnrpipe.blender.findings import Findings  # noqa: E402
-from dnrpipe.blender.frozen import ATLAS_LAYER, FrozenMesh, save_geometry  # noqa: E402
-from dnrpipe.blender.geometry import freeze_scene  # noqa: E402
-from dnrpipe.blender.sheets import on_region  # noqa: E402
-from dnrpipe.blender.sockets import resolve  # noqa: E402
-from dnrpipe.blender.textures import Constant, ImageReader, Placement, Textured  # noqa: E402
-from dnrpipe.blender.values import Evaluator  # noqa: E402
+from dnrpipe.blender.geometry.atlas import build_atlas  # noqa: E402
+from dnrpipe.blender.geometry.freeze import freeze_scene  # noqa: E402
+from dnrpipe.blender.geometry.frozen import ATLAS_LAYER, FrozenMesh, save_geometry  # noqa: E402
+from dnrpipe.blender.shading.colour_spaces import decode  # noqa: E402
+from dnrpipe.blender.shading.filtering import finer  # noqa: E402
+from dnrpipe.blender.shading.sheets import on_region  # noqa: E402
+from dnrpipe.blender.shading.sockets import resolve  # noqa: E402
+from dnrpipe.blender.shading.textures import Constant, ImageReader, Placement, Textured  # noqa: E402
+from dnrpipe.blender.shading.values import Evaluator  # noqa: E402
 from dnrpipe.console import Console  # noqa: E402
 from dnrpipe.workspace import Source, Workspace  # noqa: E402
 

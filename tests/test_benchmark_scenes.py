@@ -15,7 +15,7 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 from dnrpipe.blender.cameras import camera_animation, scene_cameras  # noqa: E402
-from dnrpipe.blender.opening import open_scene  # noqa: E402
+from dnrpipe.blender.reading.opening import open_scene  # noqa: E402
 
 FOLDER = Path(__file__).resolve().parent.parent / "blender_scenes"
 BENCHMARKS = (

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dnrpipe.blender.frozen import FrozenMesh, load_geometry, save_geometry
+from dnrpipe.blender.geometry.frozen import FrozenMesh, load_geometry, save_geometry
 from dnrpipe.errors import UserError
 
 pytest.importorskip("bpy")
@@ -227,7 +227,7 @@ def test_damaged_geometry_is_refused(tmp_path: Path) -> None:
 
 
 def test_overlap_is_measured() -> None:
-    measure_atlas = pytest.importorskip("dnrpipe.blender.atlas").measure_atlas
+    measure_atlas = pytest.importorskip("dnrpipe.blender.geometry.atlas").measure_atlas
     square = np.array([[0, 0], [0.5, 0], [0.5, 0.5], [0, 0], [0.5, 0.5], [0, 0.5]], np.float32)
     positions = np.concatenate([square, np.zeros((6, 1), np.float32)], axis=1)
 

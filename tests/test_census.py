@@ -10,10 +10,10 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
-from dnrpipe.blender.camera import describe  # noqa: E402
 from dnrpipe.blender.census import take_census  # noqa: E402
 from dnrpipe.blender.findings import Findings  # noqa: E402
-from dnrpipe.blender.geometry import freeze_scene  # noqa: E402
+from dnrpipe.blender.geometry.freeze import freeze_scene  # noqa: E402
+from dnrpipe.blender.passes.camera import describe  # noqa: E402
 
 
 def _census(scene: Any) -> dict[str, Any]:

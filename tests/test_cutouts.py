@@ -64,7 +64,7 @@ def test_mask_sees_through_holes_and_what_is_not_there(scene: dict[str, Any]) ->
 
 
 def test_strands_are_a_shape_of_their_own(scene: dict[str, Any]) -> None:
-    from dnrpipe.effects_bundle import bundle_facts
+    from dnrpipe.effects.bundle import bundle_facts
 
     assert bundle_facts(scene["folder"] / "scene.xml")["hair"] == ["hair-head_0001"]
     assert "40 strands" in str(scene["report"]["findings"])

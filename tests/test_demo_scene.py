@@ -11,12 +11,12 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
+from dnrpipe.blender.bundle.display import export_display  # noqa: E402
+from dnrpipe.blender.bundle.export import bounding_sphere, export_bundle  # noqa: E402
 from dnrpipe.blender.census import take_census  # noqa: E402
-from dnrpipe.blender.display import export_display  # noqa: E402
-from dnrpipe.blender.export import bounding_sphere, export_bundle  # noqa: E402
 from dnrpipe.blender.findings import Findings  # noqa: E402
-from dnrpipe.blender.geometry import freeze_scene  # noqa: E402
-from dnrpipe.blender.opening import open_scene  # noqa: E402
+from dnrpipe.blender.geometry.freeze import freeze_scene  # noqa: E402
+from dnrpipe.blender.reading.opening import open_scene  # noqa: E402
 
 FOLDER = Path(__file__).resolve().parent.parent / "blender_scenes"
 DEMO = FOLDER / "demo.blend"

@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dnrpipe.cameras import view_lenses
-from dnrpipe.effects import FORCEABLE, LAMPS, NAMES, NEURAL, DepthPilot, DepthStep, EffectPlan, plan_effects
-from dnrpipe.effects_bundle import bundle_facts, write_without
-from dnrpipe.effects_command import override_settings, table
-from dnrpipe.effects_statistics import difference, enough, remaining, significance
+from dnrpipe.effects.bundle import bundle_facts, write_without
+from dnrpipe.effects.command import override_settings, table
+from dnrpipe.effects.plan import FORCEABLE, LAMPS, NAMES, NEURAL, DepthPilot, DepthStep, EffectPlan, plan_effects
+from dnrpipe.effects.statistics import difference, enough, remaining, significance
 from dnrpipe.errors import UserError
 from dnrpipe.raytrace.sensors import _centred
 from dnrpipe.settings import CameraSettings, Settings, resolve

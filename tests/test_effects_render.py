@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from dnrpipe.cameras import make_cameras
-from dnrpipe.effects_bundle import write_without
+from dnrpipe.effects.bundle import write_without
 from dnrpipe.executors import TaskResult, run_tasks
 from dnrpipe.raytrace.variants import choose_variant
 from dnrpipe.settings import CameraSettings

@@ -16,7 +16,7 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
-from dnrpipe.blender.display import (  # noqa: E402
+from dnrpipe.blender.bundle.display import (  # noqa: E402
     LUT_K,
     LUT_MAX,
     LUT_SIZE,
@@ -24,11 +24,11 @@ from dnrpipe.blender.display import (  # noqa: E402
     display_values,
     export_display,
 )
-from dnrpipe.blender.export import export_bundle  # noqa: E402
+from dnrpipe.blender.bundle.export import export_bundle  # noqa: E402
+from dnrpipe.blender.bundle.shapes import closure  # noqa: E402
 from dnrpipe.blender.findings import Findings  # noqa: E402
-from dnrpipe.blender.geometry import freeze_scene  # noqa: E402
-from dnrpipe.blender.shapes import closure  # noqa: E402
-from dnrpipe.blender.textures import linear_to_srgb  # noqa: E402
+from dnrpipe.blender.geometry.freeze import freeze_scene  # noqa: E402
+from dnrpipe.blender.shading.textures import linear_to_srgb  # noqa: E402
 from dnrpipe.raytrace import plugins  # noqa: E402
 from dnrpipe.raytrace.variants import choose_variant  # noqa: E402
 from dnrpipe.raytrace.visibility import camera_integrator  # noqa: E402

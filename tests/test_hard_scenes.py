@@ -13,7 +13,7 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
-from dnrpipe.blender.opening import open_scene  # noqa: E402
+from dnrpipe.blender.reading.opening import open_scene  # noqa: E402
 from dnrpipe.cameras import make_cameras  # noqa: E402
 from dnrpipe.executors import TaskResult, run_tasks  # noqa: E402
 from dnrpipe.raytrace.variants import choose_variant  # noqa: E402
@@ -151,7 +151,7 @@ def test_gbuffers_are_finite_and_scale_with_the_scene(traced: dict[str, Traced])
         common |= {"coverage_samples": 4, "threads": 1}
         task = {"view": ours.view.model_dump(mode="json"), "output": str(ours.folder / "passes.exr")}
         task |= {"raster": False, "fingerprint": "f"}
-        (numbers,) = outcomes("dnrpipe.blender.passes", common, [task], ours.folder / "log.txt")
+        (numbers,) = outcomes("dnrpipe.blender.passes.worker", common, [task], ours.folder / "log.txt")
         assert numbers["repaired"] == 0
         channels, _ = read_exr(ours.folder / "passes.exr")
         assert set(GBUFFER_CHANNELS) <= set(channels)

@@ -10,14 +10,14 @@ import pytest
 
 pytest.importorskip("bpy")
 
-from dnrpipe.blender.atlas import measure_atlas, texel_density
-from dnrpipe.blender.charts import chart_atlas, count_pieces
+from dnrpipe.blender.bundle.ply import weld, write_ply
 from dnrpipe.blender.findings import Findings
-from dnrpipe.blender.frozen import FrozenMesh, load_geometry, save_geometry
-from dnrpipe.blender.instances import Placed, copy_matrices, share_instances
-from dnrpipe.blender.local_mesh import LocalMesh
-from dnrpipe.blender.ply import weld, write_ply
-from dnrpipe.blender.simplify import fit_instances
+from dnrpipe.blender.geometry.atlas import measure_atlas, texel_density
+from dnrpipe.blender.geometry.charts import chart_atlas, count_pieces
+from dnrpipe.blender.geometry.frozen import FrozenMesh, load_geometry, save_geometry
+from dnrpipe.blender.geometry.instances import Placed, copy_matrices, share_instances
+from dnrpipe.blender.geometry.local_mesh import LocalMesh
+from dnrpipe.blender.geometry.simplify import fit_instances
 
 
 def ball(rings: int = 12) -> np.ndarray:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dnrpipe.blender import choice
+from dnrpipe.blender.passes.worker import choice
 from dnrpipe.errors import UserError
 from dnrpipe.executors import Retry, TaskResult, run_tasks
 from dnrtrain.contract import GBUFFER_CHANNELS, RASTER_CHANNELS, View
@@ -52,7 +52,7 @@ def render(scene_dir: Path, folder: Path, views: list[View], raster: str | None 
         | {"fingerprint": f"f{i}"}
         for i, v in enumerate(views)
     ]
-    module, log = "dnrpipe.blender.passes", folder / "log.txt"
+    module, log = "dnrpipe.blender.passes.worker", folder / "log.txt"
     results = []
     for outcome in run_tasks(module, settings, tasks, workers=1, log=log, timeout=200):
         assert not isinstance(outcome, Retry), (outcome.reason, log.read_text()[-2000:])
@@ -215,7 +215,7 @@ def test_raster_colour_lies_on_the_gbuffer(scene_dir: Path, tmp_path: Path, engi
 
 
 def _meshes(scene_dir: Path) -> list[Any]:
-    from dnrpipe.blender.frozen import load_geometry
+    from dnrpipe.blender.geometry.frozen import load_geometry
 
     return load_geometry(scene_dir / "geometry.npz")
 
@@ -260,7 +260,7 @@ def test_a_renderer_that_dies_is_named(scene_dir: Path, tmp_path: Path) -> None:
     view = look_at(np.zeros(3), 6, 0, 30).model_dump(mode="json")
     task = {"view": view, "output": str(tmp_path / "0.exr"), "raster": True, "fingerprint": "f"}
     no_egl = {"__EGL_VENDOR_LIBRARY_DIRS": "/nonexistent", "__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent"}
-    module, log = "dnrpipe.blender.passes", tmp_path / "log.txt"
+    module, log = "dnrpipe.blender.passes.worker", tmp_path / "log.txt"
     outcomes = list(run_tasks(module, settings, [task], workers=1, log=log, timeout=200, environment=no_egl))
     last = outcomes[-1]
     assert isinstance(last, TaskResult)

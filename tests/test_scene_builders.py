@@ -13,7 +13,7 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
-from dnrpipe.blender.opening import open_scene  # noqa: E402
+from dnrpipe.blender.reading.opening import open_scene  # noqa: E402
 
 FOLDER = Path(__file__).resolve().parent.parent / "blender_scenes"
 

@@ -242,7 +242,7 @@ def test_matches_cycles(
 
 
 def test_sun_of_a_sky_becomes_a_lamp_of_the_same_light(monkeypatch: pytest.MonkeyPatch) -> None:
-    from dnrpipe.blender import sky_sun, world_images
+    from dnrpipe.blender.lighting import sky_sun, world_images
 
     T.empty_scene()
     made = T.world()
@@ -267,8 +267,8 @@ def test_sun_of_a_sky_becomes_a_lamp_of_the_same_light(monkeypatch: pytest.Monke
 def test_light_passes_tinted_leaves_and_their_masks_keep_the_mean_opacity(tmp_path: Path) -> None:
     """Glass faked by Fresnel between Transparent and Glossy: the angle decides while tracing, the mean for alpha."""
     from dnrpipe.blender.findings import Findings
-    from dnrpipe.blender.materials import MaterialConverter
-    from dnrpipe.blender.textures import Constant, ImageReader, TextureStore
+    from dnrpipe.blender.shading.materials import MaterialConverter
+    from dnrpipe.blender.shading.textures import Constant, ImageReader, TextureStore
 
     T.empty_scene()
     made = material()
@@ -306,8 +306,8 @@ def test_lamp_nodes_become_their_colour_and_strength(tmp_path: Path) -> None:
 
 def test_hair_melanin_becomes_a_colour(tmp_path: Path) -> None:
     from dnrpipe.blender.findings import Findings
-    from dnrpipe.blender.materials import MaterialConverter
-    from dnrpipe.blender.textures import ImageReader, TextureStore
+    from dnrpipe.blender.shading.materials import MaterialConverter
+    from dnrpipe.blender.shading.textures import ImageReader, TextureStore
 
     T.empty_scene()
     shades = []

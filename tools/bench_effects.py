@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from dnrpipe.console import Console
-from dnrpipe.effects_store import pilot_views, resolve_plan, run_pilots, trace_config, variant_for
+from dnrpipe.effects.store import pilot_views, resolve_plan, run_pilots, trace_config, variant_for
 from dnrpipe.prepare import scene_and_views
 from dnrpipe.session import resolve_settings
 from dnrpipe.workspace import Source, Workspace, file_sha256

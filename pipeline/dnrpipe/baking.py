@@ -45,7 +45,7 @@ def bake(
     refused: list[str] = []
     tasks = [{"layer": layer} for layer in layers]
     with console.bar("bakes", len(tasks)) as bar:
-        outcomes = run_tasks("dnrpipe.blender.bake", common, tasks, workers=count, log=workspace.log("prepare"))
+        outcomes = run_tasks("dnrpipe.blender.baking.bake", common, tasks, workers=count, log=workspace.log("prepare"))
         try:
             for outcome in outcomes:
                 if isinstance(outcome, Retry):

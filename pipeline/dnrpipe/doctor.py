@@ -63,7 +63,7 @@ def _import_check(name: str, code: str, extra: str) -> dict[str, Any]:
 
 
 def _raster() -> dict[str, Any]:
-    from .blender.choice import choose_raster
+    from .blender.passes.choice import choose_raster
 
     try:
         engine, reason = choose_raster("auto")

@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from .effects import plan_effects
+from .effects.plan import plan_effects
 from .errors import UserError
 from .executors import Retry, run_tasks
 from .settings import PassSettings

@@ -186,7 +186,7 @@ def _gbuffers(
 
     run_view_tasks(
         "G-buffers",
-        "dnrpipe.blender.passes",
+        "dnrpipe.blender.passes.worker",
         pass_common(workspace, settings, "cycles-direct"),
         tasks,
         workspace=workspace,

@@ -16,7 +16,7 @@ from .baking import FOLDER, bake
 from .cameras import depth_range, make_cameras
 from .console import Console
 from .costs import CostRecord
-from .effects_store import keep_plan, plan_of
+from .effects.store import keep_plan, plan_of
 from .errors import UserError
 from .executors import Retry, run_tasks
 from .scene_files import read_frame, read_json, read_summary, scene_fingerprint
@@ -58,7 +58,7 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
 
     run_view_tasks(
         "passes",
-        "dnrpipe.blender.passes",
+        "dnrpipe.blender.passes.worker",
         pass_common(workspace, settings, engine),
         tasks,
         workspace=workspace,
@@ -125,7 +125,7 @@ def pass_task(
     raster: bool,
     output: Path | None = None,
 ) -> dict[str, Any]:
-    """Task of :class:`dnrpipe.blender.passes.Worker` for one view; its fingerprint names all that decides it."""
+    """Task of :class:`dnrpipe.blender.passes.worker.Worker` for one view; its fingerprint names all that decides it."""
     data = view.model_dump(mode="json")
     coverage = settings.passes.coverage_samples
     colour = [engine, settings.passes.raster_samples] if raster else None
@@ -268,7 +268,7 @@ def _place_cameras(workspace: Workspace, settings: Settings, summary: dict[str, 
 
 def _raster_engine(workspace: Workspace, settings: Settings, console: Console) -> tuple[str, str]:
     """The engine for rasterised colour, probed once per workspace: a busy machine must not change it midway."""
-    from .blender.choice import choose_raster
+    from .blender.passes.choice import choose_raster
 
     record = workspace.root / "passes" / "raster.json"
     if record.exists():

@@ -17,7 +17,7 @@ from pydantic import Field, ValidationError
 
 from dnrtrain.settings import LossWeights, ModelSettings, Step1Settings, Step2Settings, Strict
 
-from .effects import EffectName
+from .effects.plan import EffectName
 from .errors import UserError
 
 ENVIRONMENT_PREFIX = "DNRPIPE_"

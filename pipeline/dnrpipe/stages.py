@@ -19,7 +19,7 @@ from typing import Any
 
 from . import __version__
 from .console import Console, clock
-from .effects import NEURAL
+from .effects.plan import NEURAL
 from .errors import UserError
 from .scene_files import scene_fingerprint
 from .settings import Settings

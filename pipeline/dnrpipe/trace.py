@@ -11,7 +11,7 @@ from dnrtrain.exr import read_metadata
 
 from .console import Console
 from .costs import CostRecord
-from .effects_store import lenses, resolve_plan, trace_config, variant_for
+from .effects.store import lenses, resolve_plan, trace_config, variant_for
 from .prepare import split_views
 from .scene_files import scene_fingerprint
 from .settings import Settings

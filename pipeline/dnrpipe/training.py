@@ -14,7 +14,7 @@ from dnrtrain.events import EpochEnd, Event, Note, Selected
 
 from .console import Bar, Console
 from .costs import CostRecord
-from .effects_store import plan_of
+from .effects.store import plan_of
 from .errors import UserError
 from .prepare import split_views
 from .scene_files import read_frame

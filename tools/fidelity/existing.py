@@ -7,8 +7,8 @@ from typing import Any
 
 import bpy
 
-from dnrpipe.blender.opening import open_scene
-from dnrpipe.blender.rendering import render_to
+from dnrpipe.blender.passes.rendering import render_to
+from dnrpipe.blender.reading.opening import open_scene
 
 from .reference import configure_cycles
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import bpy
 
-from .camera import describe
-from .framing import usable
+from .passes.camera import describe
+from .reading.framing import usable
 
 MAX_FRAMES = 500
 

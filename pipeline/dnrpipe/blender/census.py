@@ -12,10 +12,10 @@ import numpy as np
 
 from .census_materials import describe_material
 from .findings import Findings
-from .frozen import FrozenMesh
-from .lights import visible_lights
-from .names import find_material
-from .sockets import find_input, resolve, surface_source, walk
+from .geometry.frozen import FrozenMesh
+from .lighting.lights import visible_lights
+from .reading.names import find_material
+from .shading.sockets import find_input, resolve, surface_source, walk
 
 NAMES_PER_MATERIAL = 8  # objects listed as examples for each material
 

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
-from .sockets import find_input, resolve, surface_source, walk
+from .shading.sockets import find_input, resolve, surface_source, walk
 
 PROCEDURAL = {
     "TEX_BRICK",

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from dnrpipe.effects_bundle import bundle_facts
+from dnrpipe.effects.bundle import bundle_facts
 
+from .baking.rehearsal import BakeOptions, convert_materials, place_atlas
+from .bundle.export import export_bundle
 from .census import take_census
-from .export import export_bundle
-from .loading import load_scene
-from .rehearsal import BakeOptions, convert_materials, place_atlas
+from .reading.loading import load_scene
 
 
 class Worker:

@@ -11,22 +11,22 @@ from dnrpipe.workspace import file_sha256
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import SceneFrame
 
+from .baking.rehearsal import BakeOptions, convert_materials, missing_bakes, place_atlas
+from .bundle.display import export_display
+from .bundle.export import export_bundle
 from .cameras import camera_animation, scene_cameras
 from .census import take_census
-from .display import export_display
-from .export import export_bundle
-from .frozen import save_geometry
-from .gbuffer_scene import add_gbuffer_scene
-from .loading import load_scene
-from .packing import pack_everything, save_blend
-from .rehearsal import BakeOptions, convert_materials, missing_bakes, place_atlas
+from .geometry.frozen import save_geometry
+from .passes.gbuffer_scene import add_gbuffer_scene
+from .reading.loading import load_scene
+from .reading.packing import pack_everything, save_blend
 
 
 class Worker:
     """Prepares one scene per task: ``source`` (file), ``scene_dir`` (folder to fill), ``strict`` (bool, optional).
 
-    ``bakes`` (optional): :class:`.rehearsal.BakeOptions` as a dict. Where textures have to be baked first, the
-    result is {"bakes": what :func:`.rehearsal.missing_bakes` returns} and the task is to be run again after baking.
+    ``bakes`` (optional): :class:`.baking.rehearsal.BakeOptions` as a dict. Where textures have to be baked first, the
+    result is {"bakes": what :func:`.baking.rehearsal.missing_bakes` returns} and the task is to be run again after it.
     """
 
     def __init__(self, common: dict[str, Any]) -> None:

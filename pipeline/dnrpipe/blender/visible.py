@@ -9,7 +9,7 @@ import numpy as np
 
 from dnrpipe.errors import UserError
 
-from .geometry import Frozen, freeze_scene
+from .geometry.freeze import Frozen, freeze_scene
 
 TRIES = 12  # later frames looked at when the current one is empty
 FAR = 1e6  # a coordinate beyond this many scene sizes has no precision left in float32

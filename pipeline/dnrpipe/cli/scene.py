@@ -60,7 +60,7 @@ def effects(
       dnrpipe effects --auto caustics
       dnrpipe effects --json | jq '.effects[] | select(.on) | .name'
     """
-    from ..effects_command import override_settings, show_effects
+    from ..effects.command import override_settings, show_effects
 
     with open_session("effects", options, late=override_settings(enable, disable, auto)) as session:
         show_effects(session, measure=measure)

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from dnrpipe.effects_statistics import display
+from dnrpipe.effects.statistics import display
 from dnrtrain.contract import View
 from dnrtrain.exr import write_exr
 

@@ -1,0 +1,1 @@
+"""Socket values that have no counterpart in Mitsuba -> images in the atlas."""

@@ -1,0 +1,160 @@
+"""Worker: bakes socket values of many materials into the scene atlas, one Cycles EMIT bake per task.
+
+A DIFFUSE bake would be black on metals; emission is what it is.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+
+from dnrtrain.atomic import atomic_path
+
+from ..geometry.frozen import ATLAS_LAYER, FrozenMesh, load_geometry
+from ..reading.names import find_material
+from ..reading.opening import open_scene
+from ..shading.sockets import walk
+from .mesh import MAX_OWN, add_object, needs_own_space
+from .regions import Atlas
+from .trees import Tap, TreeCopier
+
+EMPTY = -12345.0
+"""What the image holds before the bake: texels that Cycles did not reach keep it."""
+SAMPLES = 8
+"""Points in each texel: a feature finer than a texel is averaged instead of turning into blocks."""
+HALF_MAX = 65504.0
+
+
+class Worker:
+    """Bakes one layer per task: ``layer`` (list of {material, taps: [{kind, groups, node, socket, key}]}).
+
+    common: source (scene file), frame, geometry (npz), size (texels), folder (results: ``KEY.npy``, float16 or
+    float32 [N, C], a row per texel of the material's region, see :mod:`.regions`), threads.
+    """
+
+    def __init__(self, common: dict[str, Any]) -> None:
+        open_scene(Path(common["source"]))
+        bpy.context.scene.frame_set(int(common["frame"]))
+        self.meshes = load_geometry(Path(common["geometry"]))
+        self.folder = Path(common["folder"])
+        self.threads = int(common["threads"])
+        self.atlas = Atlas(self.meshes, int(common["size"]))
+
+    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
+        started = time.monotonic()
+        layer = {
+            entry["material"]: [Tap(t["kind"], tuple(t["groups"]), t["node"], t["socket"]) for t in entry["taps"]]
+            for entry in task["layer"]
+        }
+        pixels = bake_layer(self.meshes, layer, self.atlas.size, self.threads)
+        for entry in task["layer"]:
+            values = _complete(pixels, self.atlas.region(entry["material"]).texels, self.atlas.size)
+            for index, tap in enumerate(entry["taps"]):
+                kept = values[:, index : index + 1] if tap["kind"] == "scalar" else values
+                _save(self.folder / f"{tap['key']}.npy", kept)
+        return {"seconds": time.monotonic() - started}
+
+
+def bake_layer(meshes: Sequence[FrozenMesh], layer: dict[str, list[Tap]], size: int, threads: int) -> np.ndarray:
+    """Bake one emission per material; returns float32 [size², 3], EMPTY where nothing was baked."""
+    image = bpy.data.images.new("dnrpipe.bake", size, size, alpha=True, float_buffer=True)
+    image.colorspace_settings.name = "Linear Rec.709"
+    image.pixels.foreach_set(np.full(size * size * 4, EMPTY, np.float32))
+    copier = TreeCopier(image)
+    materials = {name: copier.copy(_material(name), taps) for name, taps in layer.items()}
+    dark = copier.dark()
+    scene = _scene(threads)
+    window = bpy.context.window
+    before = window.scene
+    window.scene = scene
+    try:
+        wanted = [mesh for mesh in meshes if any(name in layer for name in mesh.materials)]
+        few = [name for name in layer if sum(name in mesh.materials for mesh in wanted) <= MAX_OWN]
+        own = [mesh for mesh in wanted if needs_own_space(mesh, few)]
+        shared = [mesh for mesh in wanted if not any(mesh is other for other in own)]
+        groups = [[mesh] for mesh in own] + ([shared] if shared else [])
+        for group in groups:
+            add_object(scene, group, materials, dark, local=group is not shared)
+        if _looks_around(layer):  # ambient occlusion: the rest of the scene is there, but not baked
+            rest = [mesh for mesh in meshes if not any(mesh is other for other in wanted)]
+            if rest:
+                add_object(scene, rest, {}, dark, local=False, selected=False)
+        scene.view_layers[0].update()
+        bpy.ops.object.bake(
+            type="EMIT",
+            margin=0,
+            use_clear=False,
+            target="IMAGE_TEXTURES",
+            save_mode="INTERNAL",
+            uv_layer=ATLAS_LAYER,
+        )
+        pixels = np.empty(size * size * 4, np.float32)
+        image.pixels.foreach_get(pixels)
+    finally:
+        window.scene = before
+        bpy.data.scenes.remove(scene)
+        bpy.data.images.remove(image)
+        bpy.ops.outliner.orphans_purge(do_recursive=True)
+    return pixels.reshape(-1, 4)[:, :3]
+
+
+def _scene(threads: int) -> bpy.types.Scene:
+    scene = bpy.data.scenes.new("dnrpipe.bake")
+    scene.render.engine = "CYCLES"
+    scene.render.use_simplify = False
+    if threads:
+        scene.render.threads_mode = "FIXED"
+        scene.render.threads = threads
+    cycles = scene.cycles
+    cycles.device = "CPU"
+    cycles.samples = SAMPLES
+    cycles.use_adaptive_sampling = False
+    cycles.use_denoising = False
+    cycles.seed = 0
+    return scene
+
+
+def _material(name: str) -> bpy.types.Material:
+    found = find_material(name)
+    if found is None:
+        raise ValueError(f"material '{name}' is gone from the scene file")
+    return found
+
+
+def _looks_around(layer: dict[str, list[Tap]]) -> bool:
+    return any(node.type == "AMBIENT_OCCLUSION" for name in layer for node in walk(_material(name).node_tree))
+
+
+def _complete(pixels: np.ndarray, texels: np.ndarray, size: int) -> np.ndarray:
+    """The region's values [N, 3]; texels that Cycles did not reach (rims, slivers) take a neighbour's."""
+    values = pixels[texels].copy()
+    # Shader graphs can yield NaN; Cycles hands it through.
+    values[~np.isfinite(values)] = EMPTY
+    reached = np.asarray((values > EMPTY / 2).all(1))
+    if reached.all() or not len(values):
+        return values
+    where = np.full(size * size, -1, np.int64)
+    where[texels] = np.arange(len(texels))
+    lost = np.flatnonzero(~reached)
+    for step in (1, 2, 4, 8):
+        for shift in (1, -1, size, -size, size + 1, size - 1, 1 - size, -1 - size):
+            neighbour = np.clip(texels[lost] + step * shift, 0, size * size - 1)
+            row = where[neighbour]
+            usable = (row >= 0) & reached[row]
+            values[lost[usable]] = values[row[usable]]
+            lost = lost[~usable]
+        if not len(lost):
+            return values
+    values[lost] = values[reached].mean(0) if reached.any() else 0.0
+    return values
+
+
+def _save(path: Path, values: np.ndarray) -> None:
+    half = np.abs(values).max(initial=0.0) < HALF_MAX
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        np.save(file, np.ascontiguousarray(values, np.float16 if half else np.float32))

@@ -1,0 +1,192 @@
+"""The book of baked socket values: what is asked for, what is on disk, and what has still to be baked.
+
+A conversion walks all materials and asks the book for every value that it cannot compute itself. Where the value
+is in the folder (files named by content hash), it comes back as a texture over the material's region of the scene
+atlas. Where it is not, the walk goes on with a placeholder, the value is listed in :attr:`BakeBook.missing`, and the
+whole conversion counts as a rehearsal: bake what is missing (:mod:`.bake`), and convert again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from ..findings import Findings
+from ..geometry.frozen import ATLAS_LAYER, FrozenMesh
+from ..shading.sockets import Source
+from ..shading.textures import Placement, Textured
+from .graph import AROUND, FROM_CAMERA, PER_OBJECT, VIEW_DEPENDENT, GraphHasher, labels, upstream
+from .mesh import MAX_OWN, is_object_space, object_info
+from .regions import Atlas
+
+Kind = Literal["colour", "scalar", "normal"]
+BAKE_VERSION = 4  # raise when a bake of the same inputs would come out different
+SCALARS_PER_BAKE = 3
+
+
+@dataclass(frozen=True)
+class BakeItem:
+    """One value to bake: see :class:`.trees.Tap`; ``key`` names its file."""
+
+    material: str
+    kind: Kind
+    groups: tuple[str, ...]
+    node: str
+    socket: str
+    key: str
+
+
+@dataclass
+class BakeBook:
+    """Baked values of one conversion.
+
+    folder: the cache. refused: keys that could not be baked; they are approximated instead. used: keys that were
+    asked for. used_atlas: whether other values were resampled into the atlas.
+    """
+
+    atlas: Atlas
+    folder: Path
+    refused: frozenset[str] = frozenset()
+    missing: dict[str, BakeItem] = field(default_factory=dict)
+    used: set[str] = field(default_factory=set)
+    used_atlas: bool = False
+    _graphs: GraphHasher = field(default_factory=GraphHasher)
+    _meshes: dict[int, str] = field(default_factory=dict)
+
+    @classmethod
+    def open(cls, meshes: Sequence[FrozenMesh], folder: Path, size: int, refused: Iterable[str] = ()) -> BakeBook:
+        """The book of a frozen scene whose bakes have ``size``² texels."""
+        return cls(Atlas(meshes, size), folder, frozenset(refused))
+
+    def value(self, material: str, kind: Kind, source: Source, socket: str, findings: Findings) -> Textured | None:
+        """The value at ``source`` over the material's surface; None when it could not be baked.
+
+        Colours and normals (n * 0.5 + 0.5, world space) have three channels, scalars one. socket: the name of the
+        shader input it feeds, for the finding.
+        """
+        region = self.atlas.region(material)
+        if not len(region.texels):
+            return None
+        nodes = upstream(source)
+        key = self._key(material, kind, source, nodes)
+        if key in self.refused:
+            return None
+        self.used.add(key)
+        names = labels(nodes)
+        path = self.folder / f"{key}.npy"
+        channels = 1 if kind == "scalar" else 3
+        placement = Placement(uv=ATLAS_LAYER, wrap="clamp", region=material)
+        note = f"baked into a texture of {self.atlas.size}² texels over the whole scene: {names}"
+        findings.add("baked", f"'{socket}'", note, material=material)
+        self._warn(material, kind, nodes, findings)
+        if path.is_file():
+            values = np.load(path, allow_pickle=False)
+            if values.shape == (len(region.texels), channels):
+                return Textured(values.astype(np.float32)[:, None, :], False, placement)
+        groups = tuple(group.name for group in source.scope)
+        self.missing[key] = BakeItem(material, kind, groups, source.node.name, source.socket.identifier, key)
+        return Textured(np.full((1, 1, channels), 0.5, np.float32), False, placement)
+
+    def layers(self) -> list[list[dict[str, Any]]]:
+        """What is missing as tasks of :class:`.bake.Worker`: each bakes at most one emission per material."""
+        stacks: dict[str, list[list[BakeItem]]] = {}
+        for item in self.missing.values():
+            stack = stacks.setdefault(item.material, [])
+            last = next((group for group in stack if group[0].kind == "scalar" and len(group) < SCALARS_PER_BAKE), None)
+            if item.kind == "scalar" and last is not None:
+                last.append(item)
+            else:
+                stack.append([item])
+        depth = max((len(stack) for stack in stacks.values()), default=0)
+        return [
+            [
+                {"material": material, "taps": [_tap(item) for item in stack[level]]}
+                for material, stack in stacks.items()
+                if level < len(stack)
+            ]
+            for level in range(depth)
+        ]
+
+    def image(self, value: Textured) -> Textured:
+        """A region's texture as a full image over the atlas, margins included."""
+        assert value.placement.region is not None
+        full = self.atlas.image({value.placement.region: value.linear()})
+        return Textured(full, False, Placement(uv=ATLAS_LAYER, wrap="clamp"))
+
+    def prune(self) -> None:
+        """Remove cached bakes that this conversion did not use."""
+        for path in self.folder.glob("*.npy"):
+            if path.stem not in self.used:
+                path.unlink(missing_ok=True)
+
+    def _warn(self, material: str, kind: Kind, nodes: list[Source], findings: Findings) -> None:
+        for node in (entry.node for entry in nodes):
+            if node.type in VIEW_DEPENDENT:
+                note = f"depends on the ray, which a bake has not: {VIEW_DEPENDENT[node.type]} is used"
+                findings.add("approximated", f"{node.bl_label} node", note, material=material)
+        for entry in nodes:
+            in_use = {output.name for output in entry.node.outputs if output.is_linked}
+            if entry.node.type == "TEX_COORD":
+                for name in sorted(in_use & set(FROM_CAMERA)):
+                    note = "depends on the camera: baked once, as the scene's own camera sees it"
+                    findings.add("approximated", f"{FROM_CAMERA[name]} coordinates", note, material=material)
+            if entry.node.type == "NEW_GEOMETRY" and "Random Per Island" in in_use:
+                note = "every island has a number of its own, but not the same one as in Blender"
+                findings.add("approximated", "Random Per Island", note, material=material)
+            if entry.node.type == "ATTRIBUTE" and entry.node.attribute_type != "GEOMETRY":
+                name = f"attribute '{entry.node.attribute_name}' of the {entry.node.attribute_type.lower()}"
+                findings.add("ignored", name, "only attributes of the mesh are kept: 0 is used", material=material)
+            if entry.node.type == "SCRIPT":
+                findings.add("ignored", "Script node", "Open Shading Language is not run", material=material)
+        if len(self.atlas.parts(material)) > MAX_OWN and any(is_object_space(entry.node) for entry in nodes):
+            note = f"on more than {MAX_OWN} objects: baked as if their axes were the world's"
+            findings.add("approximated", "object-space nodes", note, material=material)
+        copied = [part.mesh.object_name for part in self.atlas.parts(material) if len(part.mesh.copies)]
+        if copied and kind == "normal":
+            note = "baked in the first instance's orientation; the others' bumps are lit as if turned like it"
+            findings.add("approximated", "bump on instances", note, object=copied[0], material=material)
+
+    def _key(self, material: str, kind: Kind, source: Source, nodes: list[Source]) -> str:
+        digest = hashlib.sha256(repr((BAKE_VERSION, self.atlas.size, kind)).encode())
+        digest.update(self._graphs.hash(source).encode())
+        types = {entry.node.type for entry in nodes}
+        parts = self.atlas.parts(material)
+        for part in parts:
+            digest.update(self._mesh(part.mesh).encode())
+            digest.update(part.triangles.tobytes())
+            if types & PER_OBJECT:
+                digest.update(repr(object_info(part.mesh)).encode())
+        if types & AROUND:
+            for mesh in self.atlas.meshes:
+                digest.update(self._mesh(mesh).encode())
+        return digest.hexdigest()[:32]
+
+    def _mesh(self, mesh: FrozenMesh) -> str:
+        if id(mesh) not in self._meshes:
+            digest = hashlib.sha256(repr((mesh.active_uv, mesh.active_color, mesh.texture_space)).encode())
+            digest.update(mesh.object_to_world.tobytes())
+            for array in (mesh.positions, mesh.normals, mesh.atlas):
+                digest.update(np.ascontiguousarray(array).data)
+            for layers in (mesh.uv_layers, mesh.colors):
+                for name, array in layers.items():
+                    if name.startswith("dnrpipe."):  # made by the conversion itself
+                        continue
+                    digest.update(name.encode())
+                    digest.update(np.ascontiguousarray(array).data)
+            self._meshes[id(mesh)] = digest.hexdigest()
+        return self._meshes[id(mesh)]
+
+
+def _tap(item: BakeItem) -> dict[str, Any]:
+    return {
+        "kind": item.kind,
+        "groups": list(item.groups),
+        "node": item.node,
+        "socket": item.socket,
+        "key": item.key,
+    }

@@ -1,0 +1,1 @@
+"""The portable Mitsuba bundle: XML, meshes, units, display transform."""

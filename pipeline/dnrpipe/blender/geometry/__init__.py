@@ -1,0 +1,1 @@
+"""The evaluated scene as triangles, and their places in the atlas."""

@@ -1,0 +1,144 @@
+"""A UV atlas for scenes too big for Blender's unwrapper: planar charts by direction, shelf-packed. Numpy only.
+
+Every triangle is projected along the axis its normal points to most (box projection); connected triangles of one
+mesh with one direction form a chart, too small ones are gathered by place. Charts keep one scale, lie on their
+bounding boxes and are packed on shelves. A million polygons take seconds where ``smart_project`` takes minutes.
+A chart that folds back over itself overlaps: measured and reported with the atlas.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..bundle.ply import weld
+from .frozen import FrozenMesh
+
+MARGIN = 1 / 1024  # of the atlas side, between charts
+SMALL_CHART = 64  # triangles; smaller ones are gathered into charts of one grid cell
+CELLS = 24  # grid cells along the longest side of a mesh
+MAX_ROUNDS = 64
+BISECTIONS = 20
+
+
+def chart_atlas(meshes: Sequence[FrozenMesh], density: np.ndarray) -> None:
+    """Fill ``mesh.atlas`` of every mesh, inside [0, 1).
+
+    density: float64 [N], per mesh, relative texels per world unit.
+    """
+    layouts, boxes, first = [], [], 0
+    for mesh, factor in zip(meshes, density, strict=True):
+        chart, plane = _charts(mesh)
+        corners = plane.reshape(-1, 3, 2) * factor
+        order = np.argsort(chart, kind="stable")
+        starts = np.flatnonzero(np.diff(chart[order], prepend=-1))
+        low = np.minimum.reduceat(corners.min(1)[order], starts, axis=0)
+        high = np.maximum.reduceat(corners.max(1)[order], starts, axis=0)
+        layouts.append((chart + first, corners - low[chart][:, None]))
+        boxes.append(high - low)
+        first += len(low)
+    sizes = np.concatenate(boxes)
+    # Upright boxes make lower shelves' waste smaller: lay every chart with its longer side along U.
+    turned = sizes[:, 1] > sizes[:, 0]
+    sizes[turned] = sizes[turned][:, ::-1]
+    scale, places = _pack(sizes)
+    for mesh, (chart, corners) in zip(meshes, layouts, strict=True):
+        swap = turned[chart]
+        corners[swap] = corners[swap][..., ::-1]
+        mesh.atlas = (corners * scale + places[chart][:, None]).reshape(-1, 2).astype(np.float32)
+
+
+def count_pieces(meshes: Sequence[FrozenMesh]) -> int:
+    """Number of connected parts of all meshes."""
+    total = 0
+    for mesh in meshes:
+        faces = weld(mesh.positions, np.zeros_like(mesh.positions), None).faces
+        total += len(np.unique(_components(faces.astype(np.int64))))
+    return total
+
+
+def _charts(mesh: FrozenMesh) -> tuple[np.ndarray, np.ndarray]:
+    """(chart of every triangle, int [T], 0 .. C-1; plane coordinates of every corner, float64 [3T, 2])."""
+    corners = mesh.positions.reshape(-1, 3, 3)
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    axis = np.argmax(np.abs(cross), axis=1)
+    side = 2 * axis + (np.take_along_axis(cross, axis[:, None], 1)[:, 0] < 0)
+    u, v = np.array([1, 2, 0])[axis], np.array([2, 0, 1])[axis]
+    rows = np.arange(len(corners))[:, None]
+    plane = np.stack([corners[rows, np.arange(3), u[:, None]], corners[rows, np.arange(3), v[:, None]]], axis=2)
+    faces = weld(mesh.positions, np.zeros_like(mesh.positions), None).faces
+    label = _components(faces.astype(np.int64) * 6 + side[:, None])
+    size = np.bincount(label)
+    small = size[label] < SMALL_CHART
+    if small.any():
+        low = mesh.positions.min(0)
+        cell = (mesh.positions.max(0) - low).max() / CELLS
+        place = np.minimum((corners.mean(1) - low) / max(float(cell), 1e-30), CELLS - 1).astype(np.int64)
+        gathered = (side * CELLS + place[:, 0]) * CELLS * CELLS + place[:, 1] * CELLS + place[:, 2]
+        label = np.where(small, len(size) + gathered, label)
+    _, chart = np.unique(label, return_inverse=True)
+    return chart, plane.reshape(-1, 2).astype(np.float64)
+
+
+def _components(keys: np.ndarray) -> np.ndarray:
+    """Component of every triangle, int [T]; triangles with a key in common [T, 3] are connected.
+
+    Labels spread as minima over keys, with pointer jumping, until nothing changes (about the logarithm of the
+    longest way); stopped after a fixed number of rounds, which leaves components in parts: harmless here.
+    """
+    _, key = np.unique(keys.ravel(), return_inverse=True)
+    key = key.reshape(-1, 3)
+    order = np.argsort(key.ravel(), kind="stable")
+    starts = np.flatnonzero(np.diff(key.ravel()[order], prepend=-1))
+    label = np.arange(len(keys))
+    for _ in range(MAX_ROUNDS):
+        lowest = np.minimum.reduceat(np.repeat(label, 3)[order], starts)
+        found = lowest[key].min(axis=1)
+        # Hook roots too: the representative learns what its members found.
+        np.minimum.at(found, label, found.copy())
+        found = found[found]
+        if (found == label).all():
+            break
+        label = found
+    return label
+
+
+def _pack(sizes: np.ndarray) -> tuple[float, np.ndarray]:
+    """Boxes [C, 2] on shelves in the unit square: (scale, lower corner of each box [C, 2]).
+
+    The largest scale that fits, by bisection. The margin shrinks with very many boxes.
+    """
+    margin = min(MARGIN, 0.25 / math.sqrt(len(sizes)))
+    order = np.argsort(-sizes[:, 1], kind="stable")
+    ordered = sizes[order]
+    high = (1 - margin) / max(float(sizes.max()), 1e-30)
+    area = float(sizes.prod(1).sum())
+    if area > 0:
+        high = min(high, math.sqrt(1 / area))
+    low, best = 0.0, _shelves(np.full_like(ordered, margin))[0]
+    for _ in range(BISECTIONS):
+        scale = (low + high) / 2
+        places, top = _shelves(ordered * scale + margin)
+        if top <= 1:
+            low, best = scale, places
+        else:
+            high = scale
+    places = np.empty_like(best)
+    places[order] = best + margin / 2
+    return low, places
+
+
+def _shelves(sizes: np.ndarray) -> tuple[np.ndarray, float]:
+    """Boxes, tallest first, in rows of width 1: (corner of each [C, 2], height of all rows)."""
+    ends = np.cumsum(sizes[:, 0])
+    places = np.empty_like(sizes)
+    first, top, used = 0, 0.0, 0.0
+    while first < len(sizes):
+        last = max(first + 1, int(np.searchsorted(ends, used + 1.0, side="right")))
+        places[first:last, 0] = ends[first:last] - sizes[first:last, 0] - used
+        places[first:last, 1] = top
+        top += float(sizes[first, 1])
+        used, first = float(ends[last - 1]), last
+    return places, top

@@ -1,0 +1,211 @@
+"""Evaluated scene -> world-space triangles, as a final render would see them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+import bpy
+import numpy as np
+
+from dnrpipe.errors import UserError
+
+from ..findings import Findings
+from .frozen import FrozenMesh
+from .instances import Placed, Shared, copy_matrices, share_instances
+from .local_mesh import LocalMesh, read_local, slot_names
+from .simplify import fit_instances
+from .strands import hair_systems, read_curves, read_points
+from .world import REPAIRS, to_world
+
+SURFACELESS = {"VOLUME", "GREASEPENCIL"}
+
+LONGEST_STEM = 80  # characters of a name in file names: systems allow 255 bytes, and several names may be joined
+MOST_IDS = 32_767  # Object.pass_index, which carries ids through Cycles, is a 16-bit number
+
+
+@dataclass
+class Frozen:
+    """What :func:`freeze` found. ``repairs`` counts dropped triangles and replaced normals, UVs and colours."""
+
+    meshes: list[FrozenMesh]
+    repairs: dict[str, int]
+    warnings: list[str]
+    findings: Findings = field(default_factory=Findings)
+
+
+class _FreezeEngine(bpy.types.RenderEngine):
+    """A render engine that draws nothing.
+
+    Blender hands a depsgraph in RENDER mode (hide_render, render levels of modifiers) to render engines
+    only; the one that scripts get from ``evaluated_depsgraph_get`` has viewport visibility.
+    """
+
+    bl_idname = "DNRPIPE_FREEZE"
+    bl_label = "dnrpipe freeze"
+    outcome: Frozen | Exception | None = None
+
+    def render(self, depsgraph: bpy.types.Depsgraph) -> None:
+        try:
+            type(self).outcome = freeze(depsgraph)
+        except Exception as error:  # Blender would print and swallow it; freeze_scene raises it again
+            type(self).outcome = error
+
+
+def render_layer(scene: bpy.types.Scene) -> bpy.types.ViewLayer:
+    """The view layer that pictures are made of: the first one that is used for rendering."""
+    return next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
+
+
+def freeze_scene(scene: bpy.types.Scene) -> Frozen:
+    """:func:`freeze` the scene at its current frame with render visibility; the scene stays as it was.
+
+    Raises:
+        UserError: nothing in the scene is visible in renders.
+    """
+    render = scene.render
+    kept = {
+        name: getattr(render, name)
+        for name in (
+            "engine",
+            "resolution_x",
+            "resolution_y",
+            "resolution_percentage",
+            "use_border",
+            "use_multiview",
+            "use_compositing",
+            "use_sequencer",
+            "use_simplify",
+        )
+    }
+    layer = render_layer(scene)
+    used = layer.use
+    camera = None
+    if scene.camera is None:  # the render operator insists on one
+        camera = bpy.data.cameras.new("dnrpipe.freeze")
+        scene.camera = bpy.data.objects.new("dnrpipe.freeze", camera)
+    bpy.utils.register_class(_FreezeEngine)
+    _FreezeEngine.outcome = None
+    try:
+        layer.use = True
+        render.engine = _FreezeEngine.bl_idname
+        render.resolution_x = render.resolution_y = 8
+        render.resolution_percentage = 100
+        render.use_border = render.use_multiview = False
+        render.use_compositing = render.use_sequencer = render.use_simplify = False
+        bpy.ops.render.render(scene=scene.name, layer=layer.name)
+        outcome = _FreezeEngine.outcome
+    finally:
+        for name, value in kept.items():
+            setattr(render, name, value)
+        layer.use = used
+        if camera is not None:
+            scene.camera = None
+            bpy.data.cameras.remove(camera)  # takes its object along
+        bpy.utils.unregister_class(_FreezeEngine)
+    if isinstance(outcome, Exception):
+        raise outcome
+    if outcome is None:
+        raise RuntimeError(f"Blender did not evaluate scene '{scene.name}' for rendering")
+    if not outcome.meshes:
+        raise UserError(
+            f"scene '{scene.name}', view layer '{layer.name}': no surface is visible in renders; "
+            "unhide an object or enable its collection"
+        )
+    fit_instances(outcome.meshes, outcome.repairs, outcome.findings)
+    return outcome
+
+
+def freeze(depsgraph: bpy.types.Depsgraph) -> Frozen:
+    """Collect every visible surface of an evaluated depsgraph, instances included, in world space.
+
+    Normals go through the inverse transpose; mirrored transforms keep counter-clockwise winding.
+    Triangles without area or with non-finite corners are dropped and counted. Every evaluated mesh is read once;
+    beyond a budget instances share it (see :mod:`~.instances`).
+    """
+    cache: dict[tuple[object, ...], tuple[LocalMesh, bytes] | None] = {}
+    unique: dict[bytes, LocalMesh] = {}
+    placed: list[Placed] = []
+    findings = Findings()
+    for instance in depsgraph.object_instances:
+        obj = instance.object
+        if not (instance.show_self or instance.show_particles):
+            continue
+        matrix = np.array(instance.matrix_world, np.float64)
+        persistent = tuple(instance.persistent_id) if instance.is_instance else ()
+        for key, read in _surfaces(obj, instance.show_self, instance.show_particles, findings):
+            if key not in cache:
+                local = read()
+                cache[key] = None if local is None or not len(local.material_index) else _intern(local, unique)
+            if (found := cache[key]) is not None:
+                placed.append(Placed(obj.name_full, persistent, matrix, *found, obj.visible_camera))
+    repairs = dict.fromkeys(REPAIRS, 0)
+    ids: dict[str, int] = {}
+    taken: set[str] = set()
+    meshes = []
+    for shared in share_instances(placed):
+        lead = shared.lead
+        mesh = to_world(lead.name, lead.matrix, lead.mesh, repairs)
+        if not mesh.triangles:
+            continue
+        mesh.object_id = ids.setdefault(lead.name, min(len(ids) + 1, MOST_IDS))
+        mesh.name = _unique(lead.name, taken)
+        mesh.camera_visible = lead.camera_visible
+        mesh.copies = copy_matrices(shared)
+        if shared.others:
+            _note_sharing(shared, findings)
+        meshes.append(mesh)
+    if len(ids) > MOST_IDS:
+        note = f"{len(ids):,} objects; from number {MOST_IDS:,} on they share one id"
+        findings.add("approximated", "object ids", note)
+    return Frozen(meshes, repairs, [], findings)
+
+
+def _surfaces(
+    obj: bpy.types.Object, show_self: bool, show_particles: bool, findings: Findings
+) -> Iterator[tuple[tuple[object, ...], Callable[[], LocalMesh | None]]]:
+    """(cache key, reader) of each surface that an instance shows."""
+    data = obj.data
+    # Curves, text, surfaces and metaballs come a second time, as the mesh they evaluate to.
+    if show_self and isinstance(data, bpy.types.Mesh):
+        # Objects that share a mesh share the evaluated one too, where no modifier makes it their own.
+        owner = obj.original.data.name_full if isinstance(obj.original.data, bpy.types.Mesh) else obj.name_full
+        yield (owner, data.as_pointer(), *slot_names(obj)), lambda: read_local(obj)
+    elif show_self and obj.type == "CURVES":
+        yield (obj.name, data.as_pointer(), "curves"), lambda: read_curves(obj, findings)
+    elif show_self and obj.type == "POINTCLOUD":
+        yield (obj.name, data.as_pointer(), "points"), lambda: read_points(obj, findings)
+    elif show_self and obj.type in SURFACELESS:
+        findings.add("ignored", f"{obj.type.lower()} object", "has no surface: left out", object=obj.name)
+    if show_particles and isinstance(data, bpy.types.Mesh):
+        for name, read in hair_systems(obj, findings):
+            yield (obj.name, data.as_pointer(), "hair", name), read
+
+
+def _intern(local: LocalMesh, unique: dict[bytes, LocalMesh]) -> tuple[LocalMesh, bytes]:
+    """One LocalMesh for all that evaluate to the same content."""
+    digest = local.digest()
+    return unique.setdefault(digest, local), digest
+
+
+def _note_sharing(shared: Shared, findings: Findings) -> None:
+    names = sorted({item.name for item in (shared.lead, *shared.others)} - {shared.lead.name})
+    also = f"; they carry its object id, {len(names)} other object(s) too: {', '.join(names[:3])}" if names else ""
+    findings.add(
+        "approximated",
+        "instances beyond the budget",
+        f"{len(shared.others) + 1:,} instances share one place in the scene's atlas{also}",
+        object=shared.lead.name,
+    )
+
+
+def _unique(name: str, taken: set[str]) -> str:
+    """A file-safe name not yet in ``taken`` (compared without case: some file systems ignore it)."""
+    stem = re.sub(r"[^A-Za-z0-9_.-]", "_", name).lstrip(".")[:LONGEST_STEM] or "object"
+    candidate, number = stem, 1
+    while candidate.lower() in taken:
+        candidate = f"{stem}_{number:04d}"
+        number += 1
+    taken.add(candidate.lower())
+    return candidate

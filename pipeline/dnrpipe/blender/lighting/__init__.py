@@ -1,0 +1,1 @@
+"""Blender's lamps and world -> Mitsuba emitters."""

@@ -1,0 +1,182 @@
+"""Blender worlds -> Mitsuba environment emitters."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from typing import Any
+
+import bpy
+import numpy as np
+
+from ..bundle import xmltree
+from ..findings import Findings
+from ..shading.sockets import find_input, resolve, surface_source, walk
+from ..shading.textures import ImageReader, TextureStore, srgb_to_linear
+from .lights import far_disc
+from .sky_sun import find_sun, measure, without_disc
+from .world_images import SIZE, render_equirect
+from .world_rotation import plain_colour, rotation
+
+ENVMAP_TO_BLENDER = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=np.float64)
+"""B: Mitsuba's envmap frame (Y up) to Blender's equirectangular frame."""
+MAX_EXACT_ROWS = 1024
+"""Environment images up to this height are resampled without loss."""
+
+
+def export_world(
+    scene: bpy.types.Scene,
+    root: ET.Element,
+    store: TextureStore,
+    images: ImageReader,
+    findings: Findings,
+    center: np.ndarray,
+    radius: float,
+) -> bool:
+    """Append the world's emitter to ``root``; False when there is no world or it is black.
+
+    Constant Background -> ``constant``; Environment Texture with constant strength -> ``envmap``, rotated by its
+    Mapping node; any other node tree is rendered once with Cycles as an equirectangular image, the sun disc of a Sky
+    Texture apart. center, radius: bounds of the geometry.
+    """
+    world = scene.world
+    if world is None:
+        return False
+    tree = world.node_tree
+    if tree is None:
+        return _constant(root, np.array(world.color))
+    if surface_source(tree, "Volume") is not None:
+        findings.add("ignored", f"world '{world.name}' volume", "no fog or atmosphere")
+    source = surface_source(tree)
+    if source is None:
+        return False
+    if source.node.type == "BACKGROUND":
+        strength = resolve(source.node.inputs["Strength"], source.scope)
+        colour = resolve(source.node.inputs["Color"], source.scope)
+        amount = plain_colour(strength)
+        if amount is not None:
+            plain = plain_colour(colour)
+            if plain is not None:
+                return _constant(root, plain * amount)
+            if np.allclose(amount, 0):
+                return False
+            if colour.node.type == "TEX_ENVIRONMENT" and _hdri(
+                root, colour.node, colour.scope, float(amount[0]), store, images, findings, world.name
+            ):
+                return True
+    return _rendered(world, root, store, findings, center, radius)
+
+
+def _constant(root: ET.Element, radiance: np.ndarray) -> bool:
+    """Background colour x strength -> ``constant``."""
+    if not np.any(radiance > 0):
+        return False
+    element = xmltree.plugin("emitter", "constant", id="world")
+    xmltree.rgb(element, "radiance", np.maximum(radiance, 0))
+    root.append(element)
+    return True
+
+
+def _hdri(
+    root: ET.Element,
+    node: Any,
+    scope: Any,
+    strength: float,
+    store: TextureStore,
+    images: ImageReader,
+    findings: Findings,
+    world: str,
+) -> bool:
+    """Environment Texture -> ``envmap`` with to_world = R^-1 B; False when its coordinates are not a rotation."""
+    turn = rotation(find_input(node, "Vector"), scope)
+    if node.projection != "EQUIRECTANGULAR" or turn is None:
+        return False
+    if node.image is None:
+        findings.add("missing", f"world '{world}' image", "no image chosen; magenta light stands for it")
+        return _constant(root, np.array([1.0, 0.0, 1.0]) * strength)
+    texels, srgb = images.read(node.image, None)
+    colour = texels[..., :3]
+    if colour.dtype == np.uint8:
+        codes = colour.astype(np.float32) / 255
+        colour = srgb_to_linear(codes) if srgb else codes
+    _envmap(root, colour, strength, turn.T @ ENVMAP_TO_BLENDER, store, f"{world}-{node.image.name}")
+    return True
+
+
+def _envmap(
+    root: ET.Element, bottom_up: np.ndarray, strength: float, turn: np.ndarray, store: TextureStore, label: str
+) -> None:
+    """``envmap`` from an equirectangular image in Blender's row order (Mitsuba's wants the zenith first).
+
+    Both centre column i at (i + 0.5) / width; row j lies at (j + 0.5) / height in Blender and at j / (height - 1)
+    in Mitsuba 3.9.1 (measured): see :func:`rows_to_nodes`.
+    """
+    radiance = rows_to_nodes(np.maximum(bottom_up[::-1].astype(np.float32), 0))
+    element = xmltree.plugin("emitter", "envmap", id="world")
+    xmltree.text(element, "filename", store.save(radiance, False, label))
+    xmltree.number(element, "scale", strength)
+    placed = np.eye(4)
+    placed[:3, :3] = turn
+    xmltree.matrix(element, "to_world", placed)
+    root.append(element)
+
+
+def rows_to_nodes(image: np.ndarray) -> np.ndarray:
+    """Resample rows centred at (j + 0.5) / h to rows at j / (h' - 1), both linearly interpolated.
+
+    With h' = 2 h + 1 every old row is a new one and the others lie half way between two: the interpolated image
+    is exactly the same. Images above MAX_EXACT_ROWS keep their height (a blur of at most half a texel).
+    """
+    height = image.shape[0]
+    rows = 2 * height + 1 if height <= MAX_EXACT_ROWS else height
+    position = np.clip(np.arange(rows) / (rows - 1) * height - 0.5, 0, height - 1)
+    low = np.floor(position).astype(int)
+    high = np.minimum(low + 1, height - 1)
+    share = (position - low).astype(np.float32)[:, None, None]
+    return image[low] * (1 - share) + image[high] * share
+
+
+def _rendered(
+    world: Any, root: ET.Element, store: TextureStore, findings: Findings, center: np.ndarray, radius: float
+) -> bool:
+    """Any other world -> rendered once by Cycles as an equirectangular image (sky textures, gradients, mixes)."""
+    paths = [node for node in walk(world.node_tree) if node.type == "LIGHT_PATH"]
+    copy = world.copy()
+    if paths:
+        _unlink_camera_rays(copy.node_tree)
+        findings.add(
+            "approximated",
+            f"world '{world.name}' Light Path node",
+            "taken as seen by indirect rays (Is Camera Ray = 0); other outputs as by camera rays",
+        )
+    try:
+        sun = find_sun(copy)
+        if sun is None:
+            pixels = render_equirect(copy)
+        else:
+            irradiance = measure(copy, sun)
+            with without_disc(sun):
+                pixels = render_equirect(copy)
+            if np.any(irradiance > 0):
+                root.append(far_disc(-sun.direction, sun.angle, irradiance, "light-sky-sun", center, radius))
+                findings.add("exact", f"world '{world.name}' sun disc", "a far disc of the same light")
+    finally:
+        bpy.data.worlds.remove(copy)
+    if not np.any(pixels > 0):
+        return sun is not None
+    findings.add(
+        "baked",
+        f"world '{world.name}'",
+        f"its nodes are rendered into a {SIZE[0]} x {SIZE[1]} environment image",
+    )
+    _envmap(root, pixels, 1.0, ENVMAP_TO_BLENDER, store, f"{world.name}-world")
+    return True
+
+
+def _unlink_camera_rays(tree: bpy.types.NodeTree) -> None:
+    for node in tree.nodes:
+        if node.type != "LIGHT_PATH":
+            continue
+        for link in list(node.outputs["Is Camera Ray"].links):
+            target = link.to_socket
+            tree.links.remove(link)
+            target.default_value = 0.0 if target.type == "VALUE" else (0.0, 0.0, 0.0, 1.0)

@@ -1,0 +1,1 @@
+"""G-buffers, coverage and rasterised colour of a view."""

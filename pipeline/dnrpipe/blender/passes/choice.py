@@ -1,0 +1,65 @@
+"""Which rasteriser this machine can run. Imports no bpy: the trial runs in a subprocess."""
+
+from __future__ import annotations
+
+import functools
+import json
+import signal
+import subprocess
+import sys
+from typing import Any
+
+from dnrpipe.errors import UserError
+
+ENGINES = ("eevee", "workbench", "cycles-direct")
+TIMEOUT = 120.0  # seconds
+SLOWEST_FRAME = 1.0  # seconds per 256² frame (a GPU: milliseconds); beyond it direct light is the better bargain
+
+
+def choose_raster(requested: str) -> tuple[str, str]:
+    """The engine to rasterise with, and why. ``requested``: auto, eevee, workbench or cycles-direct.
+
+    auto is EEVEE if it survives a trial and a 256² frame takes at most SLOWEST_FRAME, else Cycles with
+    direct light only. Raises UserError when a requested engine does not run here, or is unknown.
+    """
+    if requested == "cycles-direct":
+        return requested, "requested"
+    if requested in ENGINES:
+        trial = try_engine(requested)
+        if trial["ok"]:
+            return requested, "requested"
+        raise UserError(
+            f"raster engine '{requested}' does not run here: {trial['reason']}; install libegl1 and "
+            "libgl1-mesa-dri, or use --set passes.raster=cycles-direct"
+        )
+    if requested != "auto":
+        raise UserError(f"unknown raster engine '{requested}'; choose auto, {', '.join(ENGINES)}")
+    trial = try_engine("eevee")
+    if not trial["ok"]:
+        return "cycles-direct", f"EEVEE does not run here: {trial['reason']}"
+    seconds = trial["seconds_next"]
+    if seconds > SLOWEST_FRAME:
+        return "cycles-direct", f"EEVEE takes {seconds:.1f} s per 256x256 frame here"
+    return "eevee", f"EEVEE takes {seconds:.2f} s per 256x256 frame here"
+
+
+@functools.cache
+def try_engine(engine: str) -> dict[str, Any]:
+    """Render two small frames with ``engine`` in a subprocess, once per process.
+
+    Returns {"ok": True, "seconds_first", "seconds_next"} or {"ok": False, "reason"}.
+    """
+    command = [sys.executable, "-m", "dnrpipe.blender.passes.probe", engine]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, stdin=subprocess.DEVNULL)
+    except subprocess.TimeoutExpired:
+        return {"ok": False, "reason": f"no frame within {TIMEOUT:.0f} s"}
+    if done.returncode < 0:
+        return {"ok": False, "reason": f"its trial was killed by {signal.Signals(-done.returncode).name}"}
+    lines = [line for line in done.stdout.splitlines() if line.startswith('{"ok"')]
+    if done.returncode == 0 and lines:
+        answer = json.loads(lines[-1])
+        return answer if answer["ok"] else {"ok": False, "reason": "its trial frame is empty"}
+    errors = [line.strip() for line in done.stderr.splitlines() if line.strip()]
+    reason = f"its trial ended with exit code {done.returncode}"
+    return {"ok": False, "reason": f"{reason} ({errors[-1][:200]})" if errors else reason}

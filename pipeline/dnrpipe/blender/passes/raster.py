@@ -1,0 +1,91 @@
+"""The original scene as a fast rasterised (or direct-light) picture: linear, transparent, nothing else."""
+
+from __future__ import annotations
+
+import bpy
+
+from dnrpipe.errors import UserError
+
+from ..geometry.freeze import render_layer
+from .rendering import output_exr
+
+WORKBENCH_AA = ((1, "OFF"), (5, "5"), (8, "8"), (11, "11"), (16, "16"), (32, "32"))
+
+
+def configure_raster(scene: bpy.types.Scene, engine: str, samples: int) -> None:
+    """Set the original scene up for ``engine`` ("eevee", "workbench", "cycles-direct").
+
+    Lights, world and materials stay as in the file. Compositor, sequencer, stamp, border, simplify,
+    motion blur, freestyle, depth of field, multi-view, camera markers, dithering and film exposure are
+    taken out: they would not match the G-buffers or the ray tracer.
+    """
+    render = scene.render
+    render.film_transparent = True
+    render.use_compositing = render.use_sequencer = render.use_stamp = render.use_simplify = False
+    render.use_border = render.use_crop_to_border = render.use_motion_blur = False
+    render.use_freestyle = render.use_multiview = False
+    render.dither_intensity = 0.0
+    render.use_persistent_data = True
+    scene.timeline_markers.clear()  # markers switch the camera at render time
+    wanted = render_layer(scene)
+    for layer in scene.view_layers:
+        layer.use = layer == wanted
+    render.use_single_layer = False
+    output_exr(scene, "image")
+    if engine == "eevee":
+        _eevee(scene, samples)
+    elif engine == "workbench":
+        _workbench(scene, samples)
+    elif engine == "cycles-direct":
+        _cycles_direct(scene, samples)
+    else:
+        raise UserError(f"unknown raster engine '{engine}'; choose eevee, workbench or cycles-direct")
+
+
+def _eevee(scene: bpy.types.Scene, samples: int) -> None:
+    scene.render.engine = "BLENDER_EEVEE"
+    scene.eevee.taa_render_samples = samples
+    scene.eevee.use_overscan = False
+    scene.render.filter_size = 1.0  # sharper than the default 1.5; the ray tracer's filter is a 1-pixel box
+
+
+def _workbench(scene: bpy.types.Scene, samples: int) -> None:
+    scene.render.engine = "BLENDER_WORKBENCH"
+    shading = scene.display.shading
+    shading.light = "STUDIO"
+    shading.use_world_space_lighting = True  # the light stays with the scene, not with the camera
+    shading.color_type = "TEXTURE"
+    shading.show_shadows = shading.show_cavity = shading.show_object_outline = shading.show_xray = False
+    shading.show_specular_highlight = False  # it follows the camera
+    shading.use_dof = False
+    for material in bpy.data.materials:
+        _viewport_colour(material)
+    scene.display.render_aa = next((name for count, name in WORKBENCH_AA if count >= samples), "32")
+
+
+def _cycles_direct(scene: bpy.types.Scene, samples: int) -> None:
+    scene.render.engine = "CYCLES"
+    cycles = scene.cycles
+    cycles.device = "CPU"
+    cycles.samples = samples
+    cycles.use_adaptive_sampling = cycles.use_denoising = False
+    cycles.max_bounces = 0
+    cycles.time_limit = 0
+    cycles.film_exposure = 1.0
+    cycles.pixel_filter_type = "BOX"
+    cycles.filter_width = 1.0
+    cycles.seed = 0
+    cycles.use_animated_seed = False
+    for layer in scene.view_layers:
+        layer.samples = 0  # a layer may override the scene's samples
+
+
+def _viewport_colour(material: bpy.types.Material) -> None:
+    """Workbench draws untextured materials in their viewport colour; give it the shader's base colour."""
+    if material.node_tree is None:
+        return
+    for node in material.node_tree.nodes:
+        socket = next((node.inputs[name] for name in ("Base Color", "Color") if name in node.inputs), None)
+        if node.type.startswith("BSDF_") and socket is not None and not socket.is_linked:
+            material.diffuse_color = socket.default_value
+            return

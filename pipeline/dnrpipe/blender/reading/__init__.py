@@ -1,0 +1,1 @@
+"""Scene files in: open, complete (camera, light), list what is missing."""

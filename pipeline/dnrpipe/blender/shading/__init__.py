@@ -1,0 +1,1 @@
+"""Blender's materials -> Mitsuba BSDFs and textures."""

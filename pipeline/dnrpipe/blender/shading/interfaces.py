@@ -1,0 +1,63 @@
+"""Blender's transmitting shader nodes -> Mitsuba BSDFs: glass, refraction, transparency."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..bundle import xmltree
+from .algebra import SMOOTH, below, squared
+from .normals import NormalShaders
+from .sockets import Scope
+from .surface import Surface
+from .textures import Value, constant
+
+MIN_ETA = 1.0001
+
+
+class InterfaceShaders(NormalShaders):
+    """One method per node that lets light through."""
+
+    def _glass(self, node: Any, scope: Scope) -> Surface:
+        """Glass BSDF -> ``(rough)dielectric``, colour on both lobes, alpha = roughness squared."""
+        colour = self._colour(node, scope, "Color")
+        element = self._interface(colour, colour, self._index(node, scope), self._scalar(node, scope, "Roughness"))
+        if self._number(node, scope, 0.0, "Thin Film Thickness") > 0:
+            self.note("ignored", "thin film", "no interference colours")
+        return self._bent(element, node, scope, both_sides=True)
+
+    def _refraction(self, node: Any, scope: Scope) -> Surface:
+        """Refraction BSDF -> ``dnr_refraction`` over a dielectric: transmission alone, nothing lost to Fresnel."""
+        colour = self._colour(node, scope, "Color")
+        index = self._index(node, scope)
+        element = xmltree.plugin("bsdf", "dnr_refraction")
+        xmltree.number(element, "eta", index)
+        element.append(self._interface(constant(1.0), colour, index, self._scalar(node, scope, "Roughness")))
+        return self._bent(element, node, scope, both_sides=True)
+
+    def _index(self, node: Any, scope: Scope) -> float:
+        """Index of refraction; 1 is kept away from, since nothing would refract."""
+        ior = self._number(node, scope, 1.45, "IOR")
+        return MIN_ETA if abs(ior - 1) < 1e-4 else max(ior, 1e-3)
+
+    def _interface(self, reflected: Value, transmitted: Value, index: float, roughness: Value) -> Any:
+        """Smooth or rough dielectric interface with a tint on each lobe."""
+        if below(roughness, SMOOTH):
+            element = xmltree.plugin("bsdf", "dielectric")
+        else:
+            element = xmltree.plugin("bsdf", "roughdielectric")
+            xmltree.text(element, "distribution", "ggx")
+            self._put(element, "alpha", squared(roughness))
+        xmltree.number(element, "int_ior", index)
+        xmltree.number(element, "ext_ior", 1.0)
+        self._put_colour(element, "specular_transmittance", transmitted)
+        self._put_colour(element, "specular_reflectance", reflected)
+        return element
+
+    def _transparent(self, node: Any, scope: Scope) -> Surface:
+        """Transparent BSDF -> nothing that scatters, opacity 0; its colour tints what passes."""
+        colour = self._colour(node, scope, "Color")
+        if np.allclose(colour.mean, 0.0, atol=1e-4):
+            return Surface(None)
+        return Surface(None, opacity=constant(0.0), tint=colour)

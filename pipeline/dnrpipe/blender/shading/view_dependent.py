@@ -1,0 +1,88 @@
+"""Values that depend on the angle of view: Blender's Fresnel and Layer Weight nodes as tables. No bpy here.
+
+Notation
+    c    cosine between the view direction and the shading normal, in [0, 1]
+    f(c) the node's output; one row for the front of the surface, one for its back
+
+A table is a :class:`Textured` of its own placement, so that arithmetic on it (Math, ColorRamp, Mix, ...) is exact;
+texture plugin ``dnr_view`` (dnrpipe/raytrace/plugins/views.py) looks it up while rendering.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+
+import numpy as np
+
+from ..bundle import xmltree
+from .textures import Placement, Textured, Value, constant
+
+VIEW_LAYER = "dnrpipe.view"
+"""Name of the layer of coordinates (c, side) in :class:`Placement`."""
+COSINES = 256
+PLACEMENT = Placement(uv=VIEW_LAYER, wrap="clamp")
+
+
+def table(front: np.ndarray, back: np.ndarray) -> Textured:
+    """Table from f at the cosines of :func:`cosines`, [COSINES] or [COSINES, 3] for each side."""
+    rows = np.stack([front, back]).astype(np.float32)
+    return Textured(rows.reshape(2, COSINES, -1), False, PLACEMENT)
+
+
+def cosines() -> np.ndarray:
+    """The cosines of a table's columns, float64 [COSINES], from grazing to straight on."""
+    return np.linspace(0.0, 1.0, COSINES)
+
+
+def dielectric_fresnel(cosine: np.ndarray, eta: float) -> np.ndarray:
+    """Unpolarised reflectance of a dielectric interface; 1 under total reflection.
+
+    eta: index beyond the surface over index on the side of the view.
+    """
+    g2 = eta * eta - 1 + cosine * cosine
+    g = np.sqrt(np.maximum(g2, 0))
+    parallel = (g - cosine) / np.maximum(g + cosine, 1e-9)
+    ratio = (cosine * (g + cosine) - 1) / np.maximum(cosine * (g - cosine) + 1, 1e-9)
+    return np.where(g2 > 0, 0.5 * parallel**2 * (1 + ratio**2), 1.0)
+
+
+def fresnel_node(ior: float) -> Textured:
+    """Fresnel node: dielectric Fresnel of ``ior``, of 1 / ior from behind."""
+    eta = max(ior, 1e-5)
+    return table(dielectric_fresnel(cosines(), eta), dielectric_fresnel(cosines(), 1 / eta))
+
+
+def layer_weight_fresnel(blend: float) -> Textured:
+    """Layer Weight node, Fresnel: dielectric Fresnel of index 1 / (1 - blend), inverted from behind."""
+    eta = max(1 - blend, 1e-5)
+    return table(dielectric_fresnel(cosines(), 1 / eta), dielectric_fresnel(cosines(), eta))
+
+
+def layer_weight_facing(blend: float) -> Textured:
+    """Layer Weight node, Facing: 1 - c^p, p = 2 blend below a blend of 0.5, else 0.5 / (1 - blend)."""
+    blend = min(max(blend, 0.0), 1 - 1e-5)
+    power = 2 * blend if blend < 0.5 else 0.5 / (1 - blend)
+    values = 1 - cosines() ** power
+    return table(values, values)
+
+
+def is_view_dependent(value: Value | None) -> bool:
+    """Whether ``value`` is a table over the angle of view."""
+    return isinstance(value, Textured) and value.placement.uv == VIEW_LAYER
+
+
+def average(value: Value) -> Value:
+    """``value``, or the constant that stands for a view-dependent one: its cosine-weighted mean over the front."""
+    if not (isinstance(value, Textured) and is_view_dependent(value)):
+        return value
+    weights = cosines() / cosines().sum()
+    return constant(np.broadcast_to(weights @ value.linear()[0].astype(np.float64), (3,)))
+
+
+def element(inner: ET.Element, name: str) -> ET.Element:
+    """``dnr_view`` texture called ``name`` around the bitmap ``inner`` of a table."""
+    outer = xmltree.plugin("texture", "dnr_view", name=name)
+    xmltree.integer(outer, "size", COSINES)
+    inner.set("name", "values")
+    outer.append(inner)
+    return outer
