@@ -14,7 +14,7 @@ bpy = pytest.importorskip("bpy")
 from mathutils import Euler, Matrix  # noqa: E402
 
 from dnrpipe.baking import FOLDER, bake  # noqa: E402
-from dnrpipe.blender import bake as baking  # noqa: E402
+from dnrpipe.blender.baking import bake as baking  # noqa: E402
 from dnrpipe.blender.baking.bakes import BakeBook  # noqa: E402
 from dnrpipe.blender.baking.mesh import object_positions, object_random  # noqa: E402
 from dnrpipe.blender.findings import Findings  # noqa: E402

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dnrpipe.blender.passes.worker import choice
+from dnrpipe.blender.passes import choice
 from dnrpipe.errors import UserError
 from dnrpipe.executors import Retry, TaskResult, run_tasks
 from dnrtrain.contract import GBUFFER_CHANNELS, RASTER_CHANNELS, View

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dnrpipe.blender.passes.worker import scratch
+from dnrpipe.blender.passes import scratch
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from typing import Any
 from .effects.plan import plan_effects
 from .errors import UserError
 from .executors import Retry, run_tasks
+from .finding_lines import finding_lines
 from .settings import PassSettings
 
 LISTED = 12  # names per line
@@ -79,8 +80,9 @@ def describe(found: dict[str, Any]) -> str:
     census = found["census"]
     counts = ", ".join(f"{count} {kind.lower()}" for kind, count in census["objects"].items())
     world = census["world"]
+    version = ".".join(census["file_version"].split(".")[:2])  # the rest is the file format's own count
     lines = [
-        f"{found['file']}: scene '{census['scene']}', saved by Blender {census['file_version']}",
+        f"{found['file']}: scene '{census['scene']}', saved by Blender {version}",
         f"  objects: {counts}",
         f"  geometry: {census['instances']} instances, {census['triangles']} triangles",
         _named("  materials", list(census["materials"])),
@@ -91,11 +93,11 @@ def describe(found: dict[str, Any]) -> str:
     lines += [f"warning: {text}" for text in found["warnings"]]
     lines.append("converted exactly:")
     lines += [_named(f"  {kind}", names) for kind, names in found["exact"].items()]
-    lines += [f"  {_finding(row)}" for row in found["findings"]["exact"]]
+    lines += [f"  {line}" for line in finding_lines(found["findings"]["exact"])]
     for kind in ORDER:
         rows = found["findings"][kind]
         lines.append(f"{MEANING[kind]}: {'' if rows else 'nothing'}".rstrip())
-        lines += [f"  {_finding(row)}" for row in rows]
+        lines += [f"  {line}" for line in finding_lines(rows)]
     lines.append("effects that it calls for:")
     lines += [f"  {e['title']}: {'; '.join(e['evidence'][:2])}" for e in found["effects"] if e["on"]]
     return "\n".join(lines)
@@ -106,9 +108,3 @@ def _named(label: str, names: list[str]) -> str:
         return f"{label}: none"
     more = f" and {len(names) - LISTED} more" if len(names) > LISTED else ""
     return f"{label}: {len(names)}: {', '.join(repr(name) for name in names[:LISTED])}{more}"
-
-
-def _finding(row: dict[str, Any]) -> str:
-    names = [f"{key} '{row[key]}'" for key in ("object", "material") if row[key]]
-    where = f" ({', '.join(names)})" if names else ""
-    return f"{row['feature']}{where}: {row['note']}"

@@ -19,6 +19,7 @@ from .costs import CostRecord
 from .effects.store import keep_plan, plan_of
 from .errors import UserError
 from .executors import Retry, run_tasks
+from .finding_lines import finding_lines
 from .scene_files import read_frame, read_json, read_summary, scene_fingerprint
 from .settings import Settings
 from .stages import Outcome
@@ -241,12 +242,9 @@ def _show_findings(workspace: Workspace, console: Console) -> None:
     if baked:
         count = len({finding["material"] for finding in baked})
         console.say(f"  baked: {len(baked)} procedural value(s) of {count} material(s); census.json names them")
-    for finding in census["findings"]:
-        if finding["kind"] in ("approximated", "ignored", "missing"):
-            names = [f"object '{finding['object']}'"] if finding["object"] else []
-            names += [f"material '{finding['material']}'"] if finding["material"] else []
-            where = ", ".join(names)
-            console.say(f"  {finding['kind']}: {finding['feature']}{f' ({where})' if where else ''}: {finding['note']}")
+    for kind in ("approximated", "ignored", "missing"):
+        for line in finding_lines(finding for finding in census["findings"] if finding["kind"] == kind):
+            console.say(f"  {kind}: {line}")
 
 
 def _place_cameras(workspace: Workspace, settings: Settings, summary: dict[str, Any]) -> dict[str, list[View]]:

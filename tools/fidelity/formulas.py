@@ -25,25 +25,26 @@ def area_quarter(root: ET.Element) -> bool:
 
 
 def roughness_squared(root: ET.Element) -> bool:
-    """Principled: roughness r squared instead of r."""
+    """Principled: Mitsuba's ``principled`` with roughness r squared instead of r."""
     changed = False
-    for bsdf in root.iter("bsdf"):
-        if bsdf.get("type") == "principled":
-            for value in bsdf.iterfind("float[@name='roughness']"):
-                value.set("value", f"{float(value.get('value', '0')) ** 2:.9g}")
-                changed = True
+    for bsdf in _principled(root):
+        for value in bsdf.iterfind("float[@name='roughness']"):
+            value.set("value", f"{float(value.get('value', '0')) ** 2:.9g}")
+            changed = True
     return changed
 
 
 def no_multiple_scattering(root: ET.Element) -> bool:
-    """Rough metal: the base colour as it is, without what makes up for multiple scattering. Base colour is gold."""
-    changed = False
-    for bsdf in root.iter("bsdf"):
-        if bsdf.get("type") == "principled" and bsdf.find("float[@name='metallic']") is not None:
-            for value in bsdf.iterfind("rgb[@name='base_color']"):
-                value.set("value", "0.95 0.68 0.32")
-                changed = True
-    return changed
+    """Rough metal: Mitsuba's ``principled`` as it is, whose metal scatters once only."""
+    return bool(_principled(root))
+
+
+def _principled(root: ET.Element) -> list[ET.Element]:
+    """The Principled BSDFs of the bundle; our own plugin is exchanged for Mitsuba's, with the same parameters."""
+    found = [bsdf for bsdf in root.iter("bsdf") if bsdf.get("type") in ("principled", "dnr_principled")]
+    for bsdf in found:
+        bsdf.set("type", "principled")
+    return found
 
 
 def glass_tint_base(root: ET.Element) -> bool:
