@@ -31,6 +31,7 @@ from dnrpipe.console import Console  # noqa: E402
 from dnrpipe.workspace import Source, Workspace  # noqa: E402
 
 SIZE = 128
+FULL = baking.SAMPLES
 PLACE = Matrix.Translation((1, 2, 0.5)) @ Euler((0.3, 0.5, 0.2)).to_matrix().to_4x4() @ Matrix.Diagonal((1, -2, 0.5, 1))
 """Rotated, mirrored and stretched: object, generated and world coordinates all differ."""
 
@@ -70,8 +71,10 @@ def source_of(material: Any, socket: str = "Base Color") -> Any:
 
 
 @pytest.fixture(autouse=True)
-def fresh() -> None:
+def fresh(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An empty file; bakes of one point per texel, its centre, where the value is known exactly."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
+    monkeypatch.setattr(baking, "SAMPLES", 1)
 
 
 class Bench:
@@ -153,6 +156,22 @@ def test_coordinates_baked_in_every_space(tmp_path: Path) -> None:
         assert not bench.book.missing
         values = bench.baked(name, "Base Color", "colour")
         np.testing.assert_allclose(values, bench.expected(name, corners), atol=4e-3)  # half floats up to 12
+
+
+@pytest.mark.parametrize("averaged", [True, False])
+def test_what_is_finer_than_a_texel_is_averaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, averaged: bool
+) -> None:
+    """A checker of a thousand squares a side is grey; from one point per texel it would be black and white."""
+    monkeypatch.setattr(baking, "SAMPLES", FULL if averaged else 1)
+    checker = {"Scale": 1000.0, "Color1": (0, 0, 0, 1), "Color2": (1, 1, 1, 1)}
+    bench = Bench(
+        scene_of(material_of("fine", lambda tree: add_node(tree, "TexChecker", **checker).outputs["Color"])),
+        tmp_path / "bakes",
+    )
+    values = bench.baked("fine", "Base Color", "colour")
+    grey = float(((values > 0.1) & (values < 0.9)).mean())
+    assert grey > 0.8 if averaged else grey < 0.05
 
 
 def test_groups_scalars_and_normals(tmp_path: Path) -> None:

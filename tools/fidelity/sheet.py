@@ -35,7 +35,7 @@ def write_sheet(records: Sequence[dict[str, Any]], target: Path) -> None:
     draw = ImageDraw.Draw(sheet)
     font: Font = ImageFont.load_default(size=11)
     for column in range(COLUMNS):
-        for index, label in enumerate(("Cycles", "ours", f"difference × {GAIN:g}")):
+        for index, label in enumerate(("Cycles", "ours", f"difference x{GAIN:g}")):
             at = (GAP + column * (cell[0] + 2 * GAP) + index * (SIDE + GAP), 2)
             draw.text(at, label, fill=(90, 90, 90), font=font)
     for number, record in enumerate(shown):
