@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
@@ -257,6 +258,20 @@ def test_bundle_facts_find_every_effect(tmp_path: Path) -> None:
     (tmp_path / "torn.xml").write_text("<scene")
     with pytest.raises(UserError, match="damaged"):
         bundle_facts(tmp_path / "torn.xml")
+
+
+@pytest.mark.parametrize("wrapper", ["dnr_interface", "dnr_refraction"])
+def test_without_refraction_what_corrects_a_dielectric_goes_too(wrapper: str, tmp_path: Path) -> None:
+    (tmp_path / "scene.xml").write_text(
+        f'<scene version="3.0.0"><bsdf type="{wrapper}" id="mat-glass"><float name="eta" value="1.4"/>'
+        '<bsdf type="roughdielectric"><float name="alpha" value="0.1"/><float name="int_ior" value="1.4"/></bsdf>'
+        "</bsdf></scene>"
+    )
+    assert "refraction" in bundle_facts(tmp_path / "scene.xml")
+    write_without(tmp_path / "scene.xml", ["refraction"], tmp_path / "other.xml")
+    (glass,) = ET.parse(tmp_path / "other.xml").getroot()
+    assert (glass.get("type"), glass.get("id")) == ("thindielectric", "mat-glass")
+    assert [child.get("name") for child in glass] == ["int_ior"]
 
 
 @pytest.mark.parametrize("name", sorted(set(HELD) - {"volumes"}))

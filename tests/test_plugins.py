@@ -75,6 +75,16 @@ def test_refraction_loses_nothing(kind: dict[str, Any]) -> None:
     assert furnace(nested) == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.parametrize("eta", [1.45, 0.7])
+def test_rough_interface_keeps_the_energy_that_one_scattering_loses(eta: float) -> None:
+    """Through two walls, or thrown back from below, of a sphere in light from everywhere."""
+    rough = {"type": "roughdielectric", "distribution": "ggx", "alpha": 0.36, "int_ior": eta, "ext_ior": 1.0}
+    kept = furnace({"type": "dnr_interface", "eta": eta, "roughness": 0.6, "nested": rough})
+    lost = furnace(rough)
+    assert (lost < 0.95).all()
+    assert kept == pytest.approx(1.0, abs=0.02)
+
+
 @pytest.mark.parametrize("layer", [{}, {"metallic": 1.0}, {"coat": 1.0, "coat_roughness": 0.1}])
 def test_principled_keeps_white_white(layer: dict[str, Any]) -> None:
     found = furnace({"type": "dnr_principled", "base_color": rgb(1, 1, 1), "roughness": 0.6, **layer})
@@ -125,8 +135,49 @@ def test_open_emitter_glows_on_both_sides(flip: float) -> None:
     assert np.array(mi.render(scene, spp=256)).mean() == pytest.approx(3.0 * 0.5 * 0.2395, rel=0.03)
 
 
+def bent(normal: list[float], nested: dict[str, Any], **more: Any) -> dict[str, Any]:
+    texel = np.array(normal, np.float32) / np.linalg.norm(normal) * 0.5 + 0.5
+    picture = {"type": "bitmap", "bitmap": mi.Bitmap(texel.reshape(1, 1, 3)), "raw": True}
+    return {"type": "dnr_normal", "normal": picture, "nested": {"type": "twosided", "nested": nested}, **more}
+
+
+def sheet(bsdf: dict[str, Any], light: dict[str, Any], *, turn: float = 0.0) -> float:
+    """Mean radiance of a sheet in the plane z = 0, turned about z, seen at 60 degrees from +x."""
+    camera = mi.ScalarTransform4f().look_at([8.66, 0, 5], [0, 0, 0], [0, 0, 1])
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path"},
+            "sensor": {"type": "perspective", "fov": 1, "to_world": camera, "film": film},
+            "light": light,
+            "sheet": {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([0, 0, 1], turn), "bsdf": bsdf},
+        }
+    )
+    return float(np.array(mi.render(scene, spp=64, seed=1)).mean())
+
+
+def test_tangent_space_turns_with_the_surface() -> None:
+    sun = {"type": "directional", "direction": [0.3, 0, -1], "irradiance": 1.0}
+    found = sheet(bent([0, -0.5, 1], diffuse(0.5), space="tangent"), sun, turn=90)
+    normal, towards = np.array([0.5, 0, 1]) / np.sqrt(1.25), np.array([-0.3, 0, 1]) / np.sqrt(1.09)
+    assert found == pytest.approx(0.5 / np.pi * normal @ towards, rel=0.01)
+    assert found == pytest.approx(sheet(bent([0.5, 0, 1], diffuse(0.5)), sun), rel=0.01)
+    assert found < 0.9 * sheet(bent([0, -0.5, 1], diffuse(0.5)), sun, turn=90)
+
+
+def test_bent_mirrors_mirror_what_is_above_the_surface() -> None:
+    """A normal that tilts away from the viewer so far that it would mirror the ground."""
+    mirror = {"type": "conductor", "material": "none"}
+    sky = {"type": "constant"}
+    assert sheet(bent([-1, 0, 1], mirror), sky) == pytest.approx(1.0, abs=0.01)
+    assert sheet(bent([0.2, 0, 1], mirror), sky) == pytest.approx(1.0, abs=0.01)
+
+
 def test_unknown_profile_and_missing_parts_are_refused() -> None:
     with pytest.raises(RuntimeError, match="no profile"):
         mi.load_dict({"type": "sphere", "emitter": {"type": "dnr_lamp", "profile": "laser", "radiance": 1.0}})
+    with pytest.raises(RuntimeError, match="no space"):
+        mi.load_dict(bent([0, 0, 1], diffuse(0.5), space="object"))
     with pytest.raises(RuntimeError, match="exactly two"):
         mi.load_dict({"type": "dnr_add", "a": diffuse(0.5)})

@@ -98,7 +98,7 @@ def findings(workspace: Workspace) -> list[dict[str, Any]]:
 
 
 CONVERSION = ("blender", "baking.py", "prepare.py", "scene_files.py", "settings.py")
-TRACING = tuple(f"raytrace/{name}.py" for name in ("tracer", "engine", "sensors", "visibility"))
+TRACING = tuple(f"raytrace/{name}.py" for name in ("tracer", "engine", "sensors", "visibility", "coverage"))
 PLUGINS = ("raytrace/plugins",)
 
 

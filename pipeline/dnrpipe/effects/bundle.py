@@ -21,6 +21,7 @@ from ..errors import UserError
 LAMP_PREFIX = "light-"
 ENVIRONMENTS = {"envmap", "constant", "sunsky", "sky"}
 DIELECTRICS = {"dielectric", "roughdielectric"}
+AROUND_DIELECTRICS = {"dnr_interface", "dnr_refraction"}
 MASKS = {"mask", "dnr_transparent"}
 STRANDS_PREFIX = "hair-"
 THIN_KEEPS = {"int_ior", "ext_ior", "specular_transmittance", "specular_reflectance"}
@@ -64,6 +65,9 @@ def write_without(path: Path, left_out: Collection[str], target: Path) -> None:
     """Write the bundle ``path`` without some effects as ``target``, a file in the same folder."""
     root = _read(path)
     if "refraction" in left_out:
+        for bsdf in list(root.iter("bsdf")):
+            if bsdf.get("type") in AROUND_DIELECTRICS and (inner := bsdf.find("bsdf")) is not None:
+                _replace(bsdf, inner)
         for bsdf in list(root.iter("bsdf")):
             if _refracts(bsdf):
                 _straight_through(bsdf)
@@ -156,6 +160,11 @@ def _opaque(bsdf: ET.Element) -> None:
         _drop(bsdf, "opacity")
         ET.SubElement(bsdf, "float", {"name": "opacity", "value": "1"})
         return
+    _replace(bsdf, inner)
+
+
+def _replace(bsdf: ET.Element, inner: ET.Element) -> None:
+    """``inner`` in place of ``bsdf``, under its name."""
     outer = {key: value for key, value in bsdf.attrib.items() if key in ("id", "name")}
     tag_attributes, children, text = dict(inner.attrib), list(inner), inner.text
     bsdf.clear()

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from .coverage import has_tinted, with_tinted_alpha
+
 LAMP_PREFIX = "light-"
 UNSEEN_PREFIX = "unseen-"
 """Shapes that are invisible to camera rays only."""
@@ -37,39 +39,35 @@ def camera_integrator(mi: Any, scene: Any, max_depth: int, kind: str = "path") -
     else:
         settings |= {"max_depth": max_depth, "rr_depth": ROULETTE_DEPTH}
     hidden = mi.load_dict({**settings, "hide_emitters": True})
+    first_visible, found, name = _first_visible(mi, scene), hidden, kind
     unseen = any(shape.id().startswith(UNSEEN_PREFIX) for shape in scene.shapes())
-    if not glowing_shapes(scene) and not unseen:
-        return hidden, kind
-    return _camera_view(mi, scene, hidden, mi.load_dict({**settings, "hide_emitters": False})), f"{kind}+glow"
+    if glowing_shapes(scene) or unseen:
+        shown = mi.load_dict({**settings, "hide_emitters": False})
+        found, name = _camera_view(mi, scene, hidden, shown, first_visible), f"{kind}+glow"
+    if has_tinted(scene):
+        found = with_tinted_alpha(mi, found, first_visible)
+    return found, name
 
 
-def _camera_view(mi: Any, scene: Any, hidden: Any, shown: Any) -> Any:
-    """Integrator that treats what camera rays meet first, and leaves the rest to Mitsuba's own.
+def _is_one_of(mi: Any, hit: Any, shapes: list[Any]) -> Any:
+    """Whether ``hit`` is on one of the shapes."""
+    import drjit as dr
 
-    Lamps and unseen shapes are passed. Where a glowing surface comes next, its emission is added; it passes the ray on
-    (alpha), or scatters it into ``shown``, in which all emitters are visible. Anything else is for ``hidden``.
-    """
+    if not dr.is_jit_v(mi.Float):  # scalar variants: one ray at a time, no shape where nothing is hit
+        return hit.is_valid() and any(hit.shape is shape or hit.instance is shape for shape in shapes)
+    found = mi.Mask(False)
+    for shape in shapes:  # pointers compare element by element
+        found |= (hit.shape == mi.ShapePtr(shape)) | (hit.instance == mi.ShapePtr(shape))
+    return found & hit.is_valid()
+
+
+def _first_visible(mi: Any, scene: Any) -> Any:
+    """Function (scene, ray, active) -> (ray that starts behind lamps and unseen shapes, its first hit)."""
     import drjit as dr
 
     apart = [shape for shape in scene.shapes() if shape.id().startswith((LAMP_PREFIX, UNSEEN_PREFIX))]
-    lamps = [shape for shape in apart if shape.id().startswith(LAMP_PREFIX)]
-    jit = dr.is_jit_v(mi.Float)
-
-    def is_one_of(hit: Any, shapes: list[Any]) -> Any:
-        if not jit:  # scalar variants: one ray at a time, no shape where nothing is hit
-            return hit.is_valid() and any(hit.shape is shape or hit.instance is shape for shape in shapes)
-        found = mi.Mask(False)
-        for shape in shapes:  # pointers compare element by element
-            found |= (hit.shape == mi.ShapePtr(shape)) | (hit.instance == mi.ShapePtr(shape))
-        return found & hit.is_valid()
-
-    def glows(hit: Any) -> Any:
-        if not jit:
-            return hit.is_valid() and hit.shape.is_emitter() and not is_one_of(hit, lamps)
-        return hit.is_valid() & hit.shape.is_emitter() & ~is_one_of(hit, lamps)
 
     def first_visible(scene: Any, ray: Any, active: Any) -> tuple[Any, Any]:
-        """(ray that starts behind what the camera does not see, its first hit)."""
         ray = mi.Ray3f(ray)
         hit = scene.ray_intersect(ray, active)
         if not apart:
@@ -78,11 +76,30 @@ def _camera_view(mi: Any, scene: Any, hidden: Any, shown: Any) -> Any:
         def onwards(ray: Any, hit: Any, passing: Any) -> tuple[Any, Any, Any]:
             ray = hit.spawn_ray(ray.d)
             hit = scene.ray_intersect(ray, passing)
-            return ray, hit, passing & is_one_of(hit, apart)
+            return ray, hit, passing & _is_one_of(mi, hit, apart)
 
-        state = (ray, hit, active & is_one_of(hit, apart))
+        state = (ray, hit, active & _is_one_of(mi, hit, apart))
         ray, hit, _ = dr.while_loop(state, lambda ray, hit, passing: passing, onwards)
         return ray, hit
+
+    return first_visible
+
+
+def _camera_view(mi: Any, scene: Any, hidden: Any, shown: Any, first_visible: Any) -> Any:
+    """Integrator that treats what camera rays meet first, and leaves the rest to Mitsuba's own.
+
+    Lamps and unseen shapes are passed. Where a glowing surface comes next, its emission is added; it passes the ray on
+    (alpha), or scatters it into ``shown``, in which all emitters are visible. Anything else is for ``hidden``.
+    """
+    import drjit as dr
+
+    lamps = [shape for shape in scene.shapes() if shape.id().startswith(LAMP_PREFIX)]
+    jit = dr.is_jit_v(mi.Float)
+
+    def glows(hit: Any) -> Any:
+        if not jit:
+            return hit.is_valid() and hit.shape.is_emitter() and not _is_one_of(mi, hit, lamps)
+        return hit.is_valid() & hit.shape.is_emitter() & ~_is_one_of(mi, hit, lamps)
 
     def glowing_layers(scene: Any, sampler: Any, ray: Any, hit: Any, glow: Any) -> tuple[Any, Any, Any, Any]:
         """Walk through the glowing surfaces in front.

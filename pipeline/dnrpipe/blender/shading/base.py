@@ -21,7 +21,7 @@ from .textures import Constant, ImageReader, Placement, Textured, TextureStore, 
 from .values import Evaluator
 
 TANGENT_MAPS = {"normalmap", "texture"}
-"""Parameters of ``normalmap`` and ``bumpmap``, which use the tangents of the shape's own UV layer."""
+"""Parameters of ``dnr_normal`` (tangent space) and ``bumpmap``, which use the tangents of the shape's own UV layer."""
 ACTIVE = ""
 """Stands in :attr:`Converted.layers` for each mesh's own active UV layer."""
 

@@ -1,4 +1,4 @@
-"""Normal inputs of shader nodes: Normal Map and Bump -> ``normalmap``, ``bumpmap``, ``dnr_normal``."""
+"""Normal inputs of shader nodes: Normal Map and Bump -> ``bumpmap``, ``dnr_normal``."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class NormalShaders(ShaderBase):
     def _by(self, socket: Any, scope: Scope, surface: Surface) -> Surface:
         """``surface`` under the normal that ``socket`` receives.
 
-        Images go to Mitsuba's own plugins, anything else is baked. The bent BSDF is made two-sided first: seen from
+        Images are read as they are, anything else is baked. The bent BSDF is made two-sided first: seen from
         behind, normal and all are turned over, as in Cycles.
         """
         source = resolve(socket, scope)
@@ -44,7 +44,7 @@ class NormalShaders(ShaderBase):
         return bent or self._baked(socket, scope, surface)
 
     def _normal_mapped(self, node: Any, scope: Scope, surface: Surface) -> Surface | None:
-        """Normal Map node in tangent space -> ``normalmap``; strength s: n' = normalise(z + s (n - z)).
+        """Normal Map node in tangent space -> ``dnr_normal``; strength s: n' = normalise(z + s (n - z)).
 
         None where its colour is no plain image.
         """
@@ -56,7 +56,8 @@ class NormalShaders(ShaderBase):
         strength = self.values.number(find_input(node, "Strength"), scope)
         if strength != 1.0:
             value = value.map(lambda texels: weaken(texels, strength))
-        element = xmltree.plugin("bsdf", "normalmap")
+        element = xmltree.plugin("bsdf", "dnr_normal")
+        xmltree.text(element, "space", "tangent")
         element.append(self._texture(value, "normalmap", "normal", raw=True))
         element.append(surface.sided())
         return Surface(element, both_sides=True)

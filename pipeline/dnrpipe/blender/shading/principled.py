@@ -37,7 +37,7 @@ class PrincipledShader(LobeShaders, InterfaceShaders):
             surface = self._bent(self._opaque(node, scope, base, roughness, metallic, f0), node, scope)
         elif equals(metallic, 0.0):
             index = MIN_ETA if abs(ior - 1) < 1e-4 else ior
-            element = self._interface(constant(1.0), square_root(base), index, roughness)
+            element = self._interface(constant(1.0), square_root(base), index, roughness, node.distribution)
             if self._is_layered(node, scope):
                 self.note("approximated", "coat or sheen on a clear material", "on its opaque part only")
             if not equals(transmission, 1.0):
@@ -64,7 +64,10 @@ class PrincipledShader(LobeShaders, InterfaceShaders):
             # Cycles' diffuse lobe is Lambert's; Disney's is up to 4% off in energy and 5% at grazing angles.
             return self._diffuse_element(base)
         anisotropic = self._scalar(node, scope, "Anisotropic")
-        if equals(anisotropic, 0.0) and self._has_layers(node, scope, metallic, roughness):
+        normal = find_input(node, "Normal")
+        is_bent = normal is not None and resolve(normal, scope).linked
+        if equals(anisotropic, 0.0) and (is_bent or self._has_layers(node, scope, metallic, roughness)):
+            # Bent normals are seen at grazing angles, where Disney's diffuse lobe is too bright.
             return self._layered(node, scope, base, roughness, metallic, f0)
         element = self._native(base, roughness, metallic, constant(0.0), f0)
         if f0 < 1e-5:

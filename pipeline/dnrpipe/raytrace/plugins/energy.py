@@ -36,10 +36,7 @@ def average_fresnel(eta: float) -> float:
 @lru_cache(maxsize=64)
 def tables(eta: float) -> tuple[np.ndarray, np.ndarray]:
     """(E, S), float32 [ROUGHNESSES, COSINES]; row r = i / (ROUGHNESSES - 1), column m = (j + 0.5) / COSINES."""
-    axis = (np.arange(STRATA) + 0.5) / STRATA
-    u1, u2 = (grid.ravel() for grid in np.meshgrid(axis, axis))
-    cosine = (np.arange(COSINES) + 0.5) / COSINES
-    view = np.stack([np.sqrt(1 - cosine**2), np.zeros(COSINES), cosine], axis=-1)
+    u1, u2, view = _samples()
     f0 = ((eta - 1) / (eta + 1)) ** 2
     whole, share = np.zeros((2, ROUGHNESSES, COSINES), np.float32)
     for row in range(ROUGHNESSES):
@@ -52,6 +49,38 @@ def tables(eta: float) -> tuple[np.ndarray, np.ndarray]:
         s = np.clip((fresnel(np.clip(along, 0, 1), eta) - f0) / (1 - f0), 0, 1)
         whole[row], share[row] = kept.mean(1), (kept * s).mean(1)
     return whole, share
+
+
+@lru_cache(maxsize=64)
+def interface_table(eta: float) -> np.ndarray:
+    """Albedo of both lobes of a rough dielectric together, seen from the side where the relative index is ``eta``.
+
+    float32 [ROUGHNESSES, COSINES], laid out as :func:`tables`. The masking terms of the two directions are
+    independent, G1(wi) G1(wo) (Walter et al. 2007), as in Mitsuba's ``roughdielectric``.
+    """
+    u1, u2, view = _samples()
+    view = view[:, None, :]
+    whole = np.zeros((ROUGHNESSES, COSINES), np.float32)
+    for row in range(ROUGHNESSES):
+        alpha = max((row / (ROUGHNESSES - 1)) ** 2, MIN_ALPHA)
+        half = _visible_normals(view, alpha, u1[None], u2[None])
+        along = np.clip((view * half).sum(-1, keepdims=True), 0, 1)
+        reflected = 2 * along * half - view
+        inside = np.sqrt(np.clip(1 - (1 - along**2) / eta**2, 0, 1))
+        refracted = (along / eta - inside) * half - view / eta
+        share = fresnel(along[..., 0], eta)
+        back = np.where(reflected[..., 2] > 0, 1 / (1 + _smith(reflected[..., 2], alpha)), 0)
+        through = np.where(refracted[..., 2] < 0, 1 / (1 + _smith(refracted[..., 2], alpha)), 0)
+        whole[row] = (share * back + (1 - share) * through).mean(1)
+    return whole
+
+
+def _samples() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(u1, u2) of a stratified square [STRATA^2], and directions of view [COSINES, 3] at the tables' columns."""
+    axis = (np.arange(STRATA) + 0.5) / STRATA
+    u1, u2 = (grid.ravel() for grid in np.meshgrid(axis, axis))
+    cosine = (np.arange(COSINES) + 0.5) / COSINES
+    return u1, u2, np.stack([np.sqrt(1 - cosine**2), np.zeros(COSINES), cosine], axis=-1)
 
 
 def _smith(cosine: np.ndarray, alpha: float) -> np.ndarray:

@@ -19,6 +19,7 @@ import numpy as np
 
 from . import energy
 from .nesting import parameter
+from .tables import look_up, row_of, table_of
 
 SHEEN_ROUGHNESS = (0.1, 0.3, 0.5, 0.7, 1.0)
 SHEEN_COSINES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
@@ -49,25 +50,11 @@ def register(mi: Any) -> None:
     """``dnr_principled`` for the current variant."""
     import drjit as dr
 
-    def image(channels: list[np.ndarray]) -> Any:
-        """Raw ``bitmap`` texture of float arrays [H, W], looked up at (m, row)."""
-        texels = np.ascontiguousarray(np.stack(channels, axis=-1), dtype=np.float32)
-        data = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True, "wrap_mode": "clamp"}
-        return mi.load_dict(data, parallel=False)  # a worker's thread pool may be empty
-
-    def look_up(table: Any, si: Any, cosine: Any, row: Any, active: Any) -> Any:
-        at = mi.SurfaceInteraction3f(si)
-        at.uv = mi.Point2f(cosine, row)
-        return table.eval_3(at, active)
-
-    def row_of(roughness: Any) -> Any:
-        return (roughness * (energy.ROUGHNESSES - 1) + 0.5) / energy.ROUGHNESSES
-
     def albedo_tables(eta: float) -> Any:
         whole, share = energy.tables(eta)
         cosine = (np.arange(energy.COSINES) + 0.5) / energy.COSINES
         mean = (whole * cosine).sum(1, keepdims=True) / cosine.sum()
-        return image([whole, share, np.broadcast_to(mean, whole.shape)])
+        return table_of(mi, [whole, share, np.broadcast_to(mean, whole.shape)])
 
     def ggx(alpha: Any, h: Any, wi: Any, wo: Any) -> tuple[Any, Any]:
         """(D G2 / (4 cos wi), density of wo when h is drawn from the visible normals); cos wo is included."""
@@ -118,7 +105,7 @@ def register(mi: Any) -> None:
             self.coat_table = albedo_tables(coat_eta) if self.has["coat"] else None
             cosine = (np.arange(64) + 0.5) / 64
             albedo = sheen_albedo(sheen_roughness, cosine)[None]
-            self.sheen_table = image([albedo] * 3) if self.has["sheen"] else None
+            self.sheen_table = table_of(mi, [albedo] * 3) if self.has["sheen"] else None
             f0 = f0_of(eta)
             self.f0 = parameter(mi, f0)
             self.s_mean = parameter(mi, max((energy.average_fresnel(eta) - f0) / (1 - f0), 0.0))
@@ -141,7 +128,7 @@ def register(mi: Any) -> None:
             r = dr.clip(self.textures["roughness"].eval_1(si, active), 0, 1)
             metal = dr.clip(self.textures["metallic"].eval_1(si, active), 0, 1)
             tint = self.textures["specular_tint"].eval(si, active)
-            found = look_up(self.table, si, m, row_of(r), active)
+            found = look_up(mi, self.table, si, m, row_of(r), active)
             whole, share, mean = found[0], found[1], found[2]
             f0 = dr.clip(self.f0 * tint, 0, 1)
             boost = multiple(whole, mean, f0 + (1 - f0) * self.s_mean)
@@ -152,12 +139,14 @@ def register(mi: Any) -> None:
             sheen = coat = mi.Spectrum(0.0)
             coat_boost: Any = 1.0
             if self.sheen_table is not None:
-                amount = self.textures["sheen"].eval_1(si, active) * look_up(self.sheen_table, si, m, 0.5, active)[0]
+                amount = (
+                    self.textures["sheen"].eval_1(si, active) * look_up(mi, self.sheen_table, si, m, 0.5, active)[0]
+                )
                 sheen = self.textures["sheen_tint"].eval(si, active) * amount
                 below = below * (1 - dr.clip(dr.max(sheen), 0, 1))
             if self.coat_table is not None:
                 weight = dr.clip(self.textures["coat"].eval_1(si, active), 0, 1)
-                got = look_up(self.coat_table, si, m, row_of(self.coat_roughness), active)
+                got = look_up(mi, self.coat_table, si, m, row_of(self.coat_roughness), active)
                 coat_boost = multiple(got[0], got[2], self.coat_fss)
                 albedo = (self.coat_f0 * got[0] + (1 - self.coat_f0) * got[1]) * coat_boost * weight
                 coat = below * weight * coat_boost

@@ -1,4 +1,4 @@
-"""BSDF ``dnr_normal``: shading by a baked world-space normal."""
+"""BSDF ``dnr_normal``: shading by a baked world-space normal, or by one of a normal map."""
 
 from __future__ import annotations
 
@@ -6,16 +6,22 @@ from typing import Any
 
 from .nesting import only
 
-LEAST_FACING = 0.02
-"""Least cosine between a bent normal and the direction to the viewer."""
+LEAST_FACING = 0.01
+"""Least cosine between a diffuse lobe's bent normal and the direction to the viewer."""
+LEAST_HEIGHT = 0.01
+"""Least cosine between the geometric normal and where a bent one mirrors the viewer to."""
 
 
 def register(mi: Any) -> None:
     """``dnr_normal`` for the current variant."""
     import drjit as dr
 
-    class WorldNormal(mi.BSDF):
-        """``normal``: texture of world-space unit normals, n * 0.5 + 0.5 (raw). One nested BSDF.
+    class BentNormal(mi.BSDF):
+        """``normal``: texture of unit normals, n * 0.5 + 0.5 (raw), in ``space`` world (default) or tangent. One
+        nested BSDF.
+
+        Tangent space: x along the shape's dp/du, z the shading normal, y = z x x, turned towards dp/dv: where UVs are
+        mirrored Mitsuba's own ``normalmap`` turns y the other way.
 
         The nested BSDF sees a shading frame about that normal, as below Mitsuba's ``normalmap``. Directions that
         the true surface would not reflect (or transmit) to are dropped. The normal is taken for the front; the
@@ -26,23 +32,53 @@ def register(mi: Any) -> None:
             super().__init__(props)
             self.normal = only(props, mi.Texture, "dnr_normal")
             self.nested = only(props, mi.BSDF, "dnr_normal")
+            space = str(props.get("space", "world"))
+            if space not in ("world", "tangent"):
+                raise RuntimeError(f"dnr_normal: no space {space!r}; world or tangent")
+            self.tangent = space == "tangent"
             self.m_components = [self.nested.flags(i) for i in range(self.nested.component_count())]
             self.m_flags = self.nested.flags()
+            self.glossy = any(mi.has_flag(self.m_flags, kind) for kind in (mi.BSDFFlags.Glossy, mi.BSDFFlags.Delta))
 
         def _perturbed(self, si: Any, active: Any) -> Any:
             normal = mi.Normal3f(self.normal.eval_3(si, active)) * 2 - 1
             # An unbaked texel decodes to a vector of no use: the surface keeps its own normal there.
             usable = dr.squared_norm(normal) > 0.01
+            if self.tangent:
+                s, t, n = si.sh_frame.s, si.sh_frame.t, si.sh_frame.n
+                across = t * dr.select(dr.dot(t, si.dp_dv) < 0, -1.0, 1.0)
+                normal = mi.Normal3f(s * normal.x + across * normal.y + n * normal.z)
             normal = dr.normalize(dr.select(usable, normal, si.sh_frame.n))
-            # A normal that faces away from the viewer would show the BSDF's back: it is turned until it just faces
-            # the viewer (to the same end as Cycles' ensure_valid_specular_reflection).
-            view = si.to_world(si.wi) * dr.select(si.wi.z < 0, -1.0, 1.0)
-            normal = dr.normalize(normal + view * dr.maximum(LEAST_FACING - dr.dot(normal, view), 0))
+            if self.glossy:
+                normal = self._reflecting(si, normal)
             tangent = dr.normalize(si.sh_frame.s - normal * dr.dot(normal, si.sh_frame.s))
             bent = mi.SurfaceInteraction3f(si)
             bent.sh_frame = mi.Frame3f(tangent, dr.cross(normal, tangent), normal)
             bent.wi = bent.to_local(si.to_world(si.wi))
+            if not self.glossy:  # a diffuse lobe knows no direction of view, but its two-sidedness does
+                bent.wi.z = dr.select(si.wi.z < 0, -1.0, 1.0) * dr.maximum(dr.abs(bent.wi.z), LEAST_FACING)
             return bent
+
+        def _reflecting(self, si: Any, normal: Any) -> Any:
+            """``normal``, turned towards the geometric one until it mirrors the viewer above the surface.
+
+            In the plane of both, at angle a from the geometric normal g, the view v (v_x, v_z) is mirrored to the
+            height v_x sin 2a + v_z cos 2a = |v| cos(2a - atan2(v_x, v_z)): solved for Cycles' least height, which is
+            min(0.9 v_z, 0.01). Without this, normals that face away would show the BSDF's back.
+            """
+            view = si.to_world(si.wi)
+            side = dr.select(si.wi.z < 0, -1.0, 1.0)
+            bent = normal * side
+            up = si.n * dr.select(dr.dot(si.n, view) < 0, -1.0, 1.0)
+            along = bent - up * dr.dot(bent, up)
+            along = dr.normalize(dr.select(dr.squared_norm(along) > 1e-10, along, si.sh_frame.s))
+            x, z = dr.dot(view, along), dr.dot(view, up)
+            least = dr.minimum(0.9 * z, LEAST_HEIGHT)
+            height = 2 * dr.dot(bent, view) * dr.dot(bent, up) - z
+            length = dr.sqrt(x * x + z * z)
+            angle = 0.5 * (dr.atan2(x, z) + dr.acos(dr.clip(least / dr.maximum(length, 1e-6), -1, 1)))
+            turned = along * dr.sin(angle) + up * dr.cos(angle)
+            return dr.select(height < least, turned, bent) * side
 
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
             bent = self._perturbed(si, active)
@@ -100,4 +136,4 @@ def register(mi: Any) -> None:
         def to_string(self) -> str:
             return "dnr_normal[]"
 
-    mi.register_bsdf("dnr_normal", WorldNormal)
+    mi.register_bsdf("dnr_normal", BentNormal)

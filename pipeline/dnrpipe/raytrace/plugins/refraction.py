@@ -1,14 +1,18 @@
-"""BSDF ``dnr_refraction``: what an interface transmits, nothing lost to Fresnel (Blender's Refraction BSDF)."""
+"""BSDFs ``dnr_refraction``: what an interface transmits, nothing lost to Fresnel (Blender's Refraction BSDF), and
+``dnr_interface``: a rough dielectric that loses no energy (its Glass BSDF, Multiscatter GGX).
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
+from . import energy
 from .nesting import only, parameter
+from .tables import look_up, row_of, table_of
 
 
 def register(mi: Any) -> None:
-    """``dnr_refraction`` for the current variant."""
+    """``dnr_refraction`` and ``dnr_interface`` for the current variant."""
     import drjit as dr
 
     class Refraction(mi.BSDF):
@@ -62,3 +66,49 @@ def register(mi: Any) -> None:
             return "dnr_refraction[]"
 
     mi.register_bsdf("dnr_refraction", Refraction)
+
+    class Interface(mi.BSDF):
+        """Nested ``roughdielectric`` (GGX) of relative index ``eta`` and texture ``roughness``, over its albedo.
+
+        Single scattering loses what hits the microfacets twice. As in Cycles, both lobes are divided by the albedo
+        that they have together at this cosine and roughness, on the side that is seen.
+        """
+
+        def __init__(self, props: Any) -> None:
+            super().__init__(props)
+            eta = float(props["eta"])
+            self.roughness = props.get_texture("roughness")
+            self.nested = only(props, mi.BSDF, "dnr_interface")
+            outside, inside = energy.interface_table(eta), energy.interface_table(1 / eta)
+            self.table = table_of(mi, [outside, inside, inside])
+            self.m_components = [self.nested.flags(i) for i in range(self.nested.component_count())]
+            self.m_flags = self.nested.flags()
+
+        def _gain(self, si: Any, active: Any) -> Any:
+            cosine = mi.Frame3f.cos_theta(si.wi)
+            row = row_of(dr.clip(self.roughness.eval_1(si, active), 0, 1))
+            found = look_up(mi, self.table, si, dr.abs(cosine), row, active)
+            return 1 / dr.maximum(dr.select(cosine >= 0, found[0], found[1]), 0.05)
+
+        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
+            found, weight = self.nested.sample(ctx, si, sample1, sample2, active)
+            return found, weight * self._gain(si, active)
+
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self.nested.eval(ctx, si, wo, active) * self._gain(si, active)
+
+        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self.nested.pdf(ctx, si, wo, active)
+
+        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+            value, density = self.nested.eval_pdf(ctx, si, wo, active)
+            return value * self._gain(si, active), density
+
+        def traverse(self, callback: Any) -> None:
+            callback.put("roughness", self.roughness, mi.ParamFlags.Differentiable)
+            callback.put("nested_bsdf", self.nested, mi.ParamFlags.Differentiable)
+
+        def to_string(self) -> str:
+            return "dnr_interface[]"
+
+    mi.register_bsdf("dnr_interface", Interface)
