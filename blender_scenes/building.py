@@ -189,15 +189,6 @@ def point_light(
     return _aimed(name, data, location, None)
 
 
-def spot_light(
-    name: str, location: Rgb, target: Rgb, power: float, angle: float = 45.0, blend: float = 0.3, radius: float = 0.05
-) -> bpy.types.Object:
-    """Spot light of full cone ``angle`` degrees."""
-    data: Any = bpy.data.lights.new(name, "SPOT")
-    data.energy, data.spot_size, data.spot_blend, data.shadow_soft_size = power, np.radians(angle), blend, radius
-    return _aimed(name, data, location, target)
-
-
 def sun_light(
     name: str, direction: Rgb, strength: float, angle: float = 0.5, colour: Rgb = (1, 1, 1)
 ) -> bpy.types.Object:

@@ -7,6 +7,7 @@ from typing import Any
 
 import bpy
 import numpy as np
+from frames import minimal_frame, tangents
 
 Rgb = tuple[float, float, float]
 
@@ -188,21 +189,11 @@ def sweep(
     """
     path = np.asarray(path, dtype=float)
     count = len(path)
-    tangent = np.roll(path, -1, 0) - np.roll(path, 1, 0) if closed else np.gradient(path, axis=0)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    tangent = tangents(path, closed)
     side = np.cross(up, tangent[0])
     if np.linalg.norm(side) < 1e-6:
         side = np.cross((1.0, 0.0, 0.0), tangent[0])
-    frame = np.zeros_like(path)
-    for i in range(count):
-        side = side - tangent[i] * (side @ tangent[i])
-        side /= np.linalg.norm(side)
-        frame[i] = side
-    twist = np.zeros(count)
-    if closed:
-        last = frame[-1] - tangent[0] * (frame[-1] @ tangent[0])
-        gap = np.arctan2(np.cross(last, frame[0]) @ tangent[0], last @ frame[0])
-        twist = gap * np.arange(count) / count
+    frame, twist = minimal_frame(tangent, side, closed)
     other = np.cross(tangent, frame)
     c, s = np.cos(twist)[:, None, None], np.sin(twist)[:, None, None]
     size = np.ones(count) if scale is None else np.asarray(scale, dtype=float)

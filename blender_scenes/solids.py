@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import bpy
 import numpy as np
+from frames import minimal_frame, tangents
 from shapes import ball_profile, grid_uv
 
 Point = tuple[float, float, float]
@@ -175,19 +176,8 @@ def tube(
     """
     path = np.asarray(path, dtype=float)
     count = len(path)
-    tangent = np.roll(path, -1, 0) - np.roll(path, 1, 0) if closed else np.gradient(path, axis=0)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    side = np.cross(tangent[0], np.eye(3)[np.argmin(np.abs(tangent[0]))])
-    frame = np.zeros_like(path)
-    for i in range(count):
-        side = side - tangent[i] * (side @ tangent[i])
-        side /= np.linalg.norm(side)
-        frame[i] = side
-    twist = np.zeros(count)
-    if closed:
-        last = frame[-1] - tangent[0] * (frame[-1] @ tangent[0])
-        gap = np.arctan2(np.cross(last, frame[0]) @ tangent[0], last @ frame[0])
-        twist = gap * np.arange(count) / count
+    tangent = tangents(path, closed)
+    frame, twist = minimal_frame(tangent, np.cross(tangent[0], np.eye(3)[np.argmin(np.abs(tangent[0]))]), closed)
     other = np.cross(tangent, frame)
     angle = np.linspace(0, 2 * np.pi, sides, endpoint=False)[None, :] + twist[:, None]
     reach = np.broadcast_to(np.asarray(radius, dtype=float), (count,))[:, None, None]

@@ -128,10 +128,6 @@ def _remove_dangling(root: ET.Element) -> None:
             root.remove(shape)
 
 
-def _is_strands(shape: ET.Element) -> bool:
-    return (shape.get("id") or "").startswith(STRANDS_PREFIX) and shape.get("type") not in ("shapegroup", "instance")
-
-
 def _is_lamp(shape: ET.Element) -> bool:
     return (shape.get("id") or "").startswith(LAMP_PREFIX)
 

@@ -14,7 +14,6 @@ from ..findings import Findings, printable
 from .names import data_collections
 
 SHAPELESS_IMAGES = {"GENERATED", "VIEWER"}  # sources without a file
-TILE_TOKENS = ("<UDIM>", "<UVTILE>")
 SHOWN = 5  # names per warning
 
 STAND_INS = {

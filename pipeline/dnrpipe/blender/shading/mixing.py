@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any
 
 from ..bundle import xmltree
@@ -13,12 +14,12 @@ from .textures import Constant, Value, constant
 from .view_dependent import average, is_view_dependent
 
 
-class MixShaders(ShaderBase):
+class MixShaders(ShaderBase, ABC):
     """Combinations of shaders."""
 
+    @abstractmethod
     def shader(self, source: Any) -> Surface:
         """Convert the shader that ends in ``source``; the walker says how."""
-        raise NotImplementedError
 
     def _input(self, node: Any, scope: Scope, index: int) -> Surface:
         """The shader in the ``index``-th shader socket; nothing linked is black."""
