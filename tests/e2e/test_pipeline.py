@@ -20,13 +20,14 @@ pytestmark = [pytest.mark.slow, pytest.mark.e2e]
 
 
 def test_only_the_selected_views_are_traced(tiny: Path) -> None:
-    """selection.json, the files and the ledger name the same views."""
+    """selection.json, the files and the ledger name the same views; the path depth pilot is booked apart."""
     selected = json.loads((tiny / "selection.json").read_text())["views"]
     assert len(selected) == len(set(selected)) == 3
     files = {path.stem for path in (tiny / "raytraced" / "train").glob("*.exr")}
-    traced = [r.name for r in Ledger(tiny / "costs.jsonl").read() if r.stage == "raytrace"]
+    records = [r for r in Ledger(tiny / "costs.jsonl").read() if r.stage == "raytrace"]
     assert files == set(selected)
-    assert sorted(traced) == sorted(f"train/{name}" for name in selected)
+    assert sorted(r.name for r in records if r.unit == "view") == sorted(f"train/{name}" for name in selected)
+    assert [r.name for r in records if r.unit != "view"] == ["path depth pilot"]
 
 
 def test_evaluation_is_booked_apart(tiny: Path) -> None:
