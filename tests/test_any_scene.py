@@ -14,6 +14,7 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 from dnrpipe.blender.findings import Findings  # noqa: E402
+from dnrpipe.blender.inspection import Worker  # noqa: E402
 from dnrpipe.blender.prepare import prepare  # noqa: E402
 from dnrpipe.blender.reading.framing import framing_pose  # noqa: E402
 from dnrpipe.blender.reading.light import studio_radiance  # noqa: E402
@@ -22,6 +23,7 @@ from dnrpipe.blender.reading.missing import missing_files  # noqa: E402
 from dnrpipe.blender.reading.names import find_material  # noqa: E402
 from dnrpipe.blender.reading.opening import open_scene  # noqa: E402
 from dnrpipe.blender.reading.packing import pack_everything, save_blend  # noqa: E402
+from dnrpipe.effects.plan import plan_effects  # noqa: E402
 from dnrpipe.errors import UserError  # noqa: E402
 from dnrpipe.scene_files import scene_fingerprint  # noqa: E402
 
@@ -63,6 +65,18 @@ def test_refuses_in_one_line(name: str, tmp_path: Path) -> None:
         load_scene(path)
     message = str(raised.value)
     assert said in message and str(path) in message and "\n" not in message
+
+
+@pytest.mark.parametrize("name", ["lights only", "volume only", "points only"])
+def test_a_file_without_a_surface_can_be_inspected(name: str, tmp_path: Path) -> None:
+    """There is nothing to convert, but what it holds can be said."""
+    builder, said = REFUSED[name]
+    task = {"source": str(builder(tmp_path)), "folder": str(tmp_path / "bundle"), "bake_size": 64}
+    answer = Worker({})(task)
+    assert said in answer["warnings"][0]
+    assert sum(answer["census"]["objects"].values()) >= 1 and answer["census"]["triangles"] == 0
+    assert plan_effects(answer["census"], answer["bundle"]).effects
+    json.dumps(answer)
 
 
 @pytest.mark.parametrize("name", ["awkward names", "broken transforms", "not finite"])

@@ -5,3 +5,7 @@ from __future__ import annotations
 
 class UserError(Exception):
     """Bad input. The message says what is wrong, where, and what to do."""
+
+
+class NothingVisible(UserError):
+    """A readable scene without any surface: there is nothing to make pictures of."""

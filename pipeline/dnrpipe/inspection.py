@@ -83,7 +83,7 @@ def describe(found: dict[str, Any]) -> str:
     version = ".".join(census["file_version"].split(".")[:2])  # the rest is the file format's own count
     lines = [
         f"{found['file']}: scene '{census['scene']}', saved by Blender {version}",
-        f"  objects: {counts}",
+        f"  objects: {counts or 'none that pictures show'}",
         f"  geometry: {census['instances']} instances, {census['triangles']} triangles",
         _named("  materials", list(census["materials"])),
         _named("  lights", [lamp["name"] for lamp in census["lights"]]),
@@ -98,7 +98,8 @@ def describe(found: dict[str, Any]) -> str:
         rows = found["findings"][kind]
         lines.append(f"{MEANING[kind]}: {'' if rows else 'nothing'}".rstrip())
         lines += [f"  {line}" for line in finding_lines(rows)]
-    lines.append("effects that it calls for:")
+    calls = any(effect["on"] for effect in found["effects"])
+    lines.append(f"effects that it calls for:{'' if calls else ' none'}")
     lines += [f"  {e['title']}: {'; '.join(e['evidence'][:2])}" for e in found["effects"] if e["on"]]
     return "\n".join(lines)
 

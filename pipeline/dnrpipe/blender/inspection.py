@@ -5,12 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import bpy
+
 from dnrpipe.effects.bundle import bundle_facts
+from dnrpipe.errors import NothingVisible
 
 from .baking.rehearsal import BakeOptions, convert_materials, place_atlas
 from .bundle.export import export_bundle
 from .census import take_census
+from .findings import Findings
 from .reading.loading import load_scene
+from .reading.missing import note_missing
+from .reading.scripts import note_drivers
 
 
 class Worker:
@@ -20,7 +26,10 @@ class Worker:
         del common
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
-        loaded = load_scene(Path(task["source"]))
+        try:
+            loaded = load_scene(Path(task["source"]))
+        except NothingVisible as nothing:
+            return _without_surface(str(nothing))
         folder = Path(task["folder"])
         folder.mkdir(parents=True)
         meshes, findings = loaded.frozen.meshes, loaded.findings
@@ -31,3 +40,13 @@ class Worker:
         export_bundle(meshes, folder, findings, converter)
         census["findings"] = findings.to_list()
         return {"census": census, "bundle": bundle_facts(folder / "scene.xml"), "warnings": loaded.warnings}
+
+
+def _without_surface(reason: str) -> dict[str, Any]:
+    """What can be said of the open file when there is nothing to convert; ``reason`` is a warning."""
+    findings = Findings()
+    note_missing(findings)
+    note_drivers(findings)
+    census = take_census(bpy.context.scene, findings, [])
+    census["findings"] = findings.to_list()
+    return {"census": census, "bundle": {}, "warnings": [reason]}

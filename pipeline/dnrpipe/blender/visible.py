@@ -7,7 +7,7 @@ from collections import Counter
 import bpy
 import numpy as np
 
-from dnrpipe.errors import UserError
+from dnrpipe.errors import NothingVisible, UserError
 
 from .geometry.freeze import Frozen, freeze_scene
 
@@ -19,14 +19,14 @@ HUGE = 1e7
 def freeze_visible(scene: bpy.types.Scene) -> Frozen:
     """:func:`freeze_scene`; when nothing is visible, the first later frame of the range that shows something.
 
-    The scene stays at the frame that was frozen; a warning names it. Raises UserError when all frames are empty.
+    The scene stays at the frame that was frozen; a warning names it. Raises NothingVisible when all frames are empty.
     """
     try:
         frozen = freeze_scene(scene)
     except UserError as nothing:
         frozen = _later(scene)
         if frozen is None:
-            raise UserError(f"{nothing} (it holds {_contents(scene)}){_remoteness(scene)}") from None
+            raise NothingVisible(f"{nothing} (it holds {_contents(scene)}){_remoteness(scene)}") from None
     frozen.warnings += repair_warnings(frozen)
     return frozen
 

@@ -44,7 +44,8 @@ class Loaded:
 def load_scene(source: Path, *, strict: bool = False) -> Loaded:
     """Open ``source`` (see :func:`open_scene`) and freeze it; a missing camera or light is added to the open file.
 
-    Raises UserError for unusable input, and with ``strict`` for a scene with missing files.
+    Raises UserError for unusable input, and with ``strict`` for a scene with missing files; NothingVisible for a file
+    without a surface, which stays open.
     """
     warnings = open_scene(source, strict=strict)
     external = external_files(source)
@@ -53,7 +54,7 @@ def load_scene(source: Path, *, strict: bool = False) -> Loaded:
     try:
         frozen = freeze_visible(scene)
     except UserError as error:
-        raise UserError(f"{source}: {error}") from None
+        raise type(error)(f"{source}: {error}") from None
     bounds = scene_bounds(frozen.meshes)
     warnings += frozen.warnings
     warnings += ensure_camera(scene, np.array(bounds["center"]), (mesh.extent() for mesh in frozen.meshes))

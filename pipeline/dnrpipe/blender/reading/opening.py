@@ -8,7 +8,7 @@ from pathlib import Path
 
 import bpy
 
-from dnrpipe.errors import UserError
+from dnrpipe.errors import NothingVisible, UserError
 
 from .mending import mend_shaders
 from .missing import missing_files, missing_warnings, strict_refusal
@@ -48,7 +48,8 @@ def open_scene(path: str | Path, *, strict: bool = False) -> list[str]:
         strict: refuse a file that refers to missing images, libraries, fonts, volumes or caches.
 
     Raises:
-        UserError: no such file, unknown format, damaged file, no objects; ``strict`` and something is missing.
+        UserError: no such file, unknown format, damaged file; ``strict`` and something is missing.
+        NothingVisible: no object that could give a surface; the file stays open.
     """
     path = Path(path).resolve()
     if path.is_dir():
@@ -147,7 +148,7 @@ def _choose_scene(path: Path) -> list[str]:
     active = bpy.context.scene
     filled = [scene for scene in scenes if _may_show(scene)]
     if not filled:
-        raise UserError(
+        raise NothingVisible(
             f"{path}: {_scene_list(scenes)} no object with a surface{_loose_objects()};"
             " open a file with at least one visible object"
         )
