@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from .nesting import only
+from .nesting import only, wrapped_texture
 
 
 def register(mi: Any) -> None:
     """``dnr_uv_layer`` for the current variant."""
 
-    class UvLayer(mi.Texture):
+    class UvLayer(wrapped_texture(mi)):
         """``attribute``: string, a vertex attribute of 3 floats (u, v, unused). One nested texture.
 
         ``channel``: -1 for the colour (default), or 0 to 2: that channel of the nested texture as a scalar.
@@ -43,15 +43,6 @@ def register(mi: Any) -> None:
             if self.channel >= 0:
                 return mi.Color3f(self.eval_1(si, active))
             return self.inner.eval_3(self._moved(si, active), active)
-
-        def mean(self) -> Any:
-            return self.inner.mean()
-
-        def is_spatially_varying(self) -> bool:
-            return True
-
-        def traverse(self, callback: Any) -> None:
-            callback.put("inner", self.inner, mi.ParamFlags.Differentiable)
 
         def to_string(self) -> str:
             return f"dnr_uv_layer[attribute={self.attribute}, channel={self.channel}]"

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from .nesting import only
+from .nesting import only, wrapped_texture
 
 
 def register(mi: Any) -> None:
     """``dnr_view`` for the current variant."""
     import drjit as dr
 
-    class ViewTable(mi.Texture):
+    class ViewTable(wrapped_texture(mi)):
         """One nested texture, looked up by the cosine between view and normal instead of by UV.
 
         The nested image has ``size`` columns, cosine 0 at the centre of the first and 1 at that of the last, and
@@ -38,15 +38,6 @@ def register(mi: Any) -> None:
 
         def eval_3(self, si: Any, active: Any = True) -> Any:
             return self.inner.eval_3(self._moved(si), active)
-
-        def mean(self) -> Any:
-            return self.inner.mean()
-
-        def is_spatially_varying(self) -> bool:
-            return True
-
-        def traverse(self, callback: Any) -> None:
-            callback.put("inner", self.inner, mi.ParamFlags.Differentiable)
 
         def to_string(self) -> str:
             return f"dnr_view[size={self.size}]"
