@@ -28,6 +28,11 @@ def examine() -> list[dict[str, Any]]:
         _import_check("bpy", "import bpy; print(bpy.app.version_string)", "render"),
         _raster(),
         _mitsuba(),
+        _import_check(
+            "denoiser",
+            "import mitsuba_oidn as o; print('Open Image Denoise', o.oidn_version(), 'on the CPU')",
+            "render",
+        ),
         _torch(),
         _weights(),
         _module("OpenEXR", "OpenEXR"),

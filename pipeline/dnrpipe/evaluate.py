@@ -13,6 +13,7 @@ from dnrtrain.atomic import atomic_path, write_json
 from dnrtrain.contract import View
 from dnrtrain.exr import read_metadata
 
+from .base import RENDERED, base_path, base_views
 from .console import Console
 from .costs import CostRecord
 from .errors import UserError
@@ -49,14 +50,16 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
         stage="evaluate",
         purpose="evaluation",
     )
+    base_views(workspace, settings, console, run_id, views=views, split="test", stage="evaluate", purpose="evaluation")
     device = torch_device(settings)
     model = load_model(workspace.checkpoints("step2"), device)
     perceptual = perceptual_weights(console)
     lpips = {name: Lpips(name, weights) for name, weights in perceptual.items()} if perceptual else None
+    rendered = settings.model.base in RENDERED
     rows: list[dict[str, Any]] = []
     with console.bar("test views", len(views)) as bar:
         for view in views:
-            data = load(workspace, [view], "test", raytraced=True).to(device)
+            data = load(workspace, [view], "test", raytraced=True, base=settings.model.base).to(device)
             seconds, prediction = _timed_render(lambda data=data: render_views(model, data), device)
             assert data.target is not None  # loaded with raytraced=True
             row: dict[str, Any] = dict(image_metrics(prediction, data.target.cpu(), data.mask.cpu(), lpips))
@@ -64,12 +67,14 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
             predicted = _image(prediction)
             error, heat = flip_error(truth, predicted)
             traced = read_metadata(workspace.raytraced("test", view.name)) or {}
+            base = read_metadata(base_path(workspace, "test", view.name)) or {} if rendered else {}
             row |= {
                 "name": view.name,
                 "flip": error,
                 "ceiling_psnr": _ceiling(traced.get("noise_rmse")),
                 "seconds_traced": traced.get("seconds"),
                 "seconds_neural": seconds,
+                "seconds_base": base.get("seconds"),
                 "spp": traced.get("spp"),
             }
             rows.append(row)

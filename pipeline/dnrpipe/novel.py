@@ -13,6 +13,7 @@ import numpy as np
 from dnrtrain.atomic import atomic_path, write_json
 from dnrtrain.contract import View, write_cameras
 
+from .base import RENDERED, base_views
 from .console import Console
 from .costs import CostRecord
 from .errors import UserError
@@ -62,14 +63,36 @@ def render_novel(
     write_cameras(folder / "cameras.json", views, name)
     paths = [folder / "gbuffers" / f"{view.name}.exr" for view in views]
     _gbuffers(workspace, settings, console, views, paths, run_id)
+    kind = settings.model.base
+    bases = [folder / "base" / f"{view.name}.exr" for view in views]
+    base_views(
+        workspace,
+        settings,
+        console,
+        run_id,
+        views=views,
+        split="novel",
+        stage="render",
+        purpose="inference",
+        paths=bases,
+    )
     device = torch_device(settings)
     model = load_model(workspace.checkpoints("step2"), device)
     frame = read_frame(workspace)
     pictures: list[np.ndarray] = []
     seconds: list[float] = []
     with console.bar("frames", len(views)) as bar:
-        for view, path in zip(views, paths, strict=True):
-            data = load_views([path], None, frame, cameras=[view], folder=workspace.scene, target=False).to(device)
+        for view, path, base in zip(views, paths, bases, strict=True):
+            data = load_views(
+                [path],
+                None,
+                frame,
+                cameras=[view],
+                folder=workspace.scene,
+                target=False,
+                base=kind,
+                base_files=[base] if kind in RENDERED else None,
+            ).to(device)
             started = time.perf_counter()
             picture = render_views(model, data)[0].float().clamp(0, 1).permute(1, 2, 0).cpu().numpy()
             seconds.append(time.perf_counter() - started)
@@ -168,8 +191,10 @@ def _gbuffers(
         if any(path.name not in wanted for path in folder.glob("[!.]*.exr")):
             shutil.rmtree(folder)
     scene_print = scene_fingerprint(workspace)
+    raster = settings.model.base == "raster"
+    engine = workspace.manifest.stages["prepare"].detail["raster_engine"] if raster else "cycles-direct"
     tasks = [
-        pass_task(workspace, settings, view, "novel", scene_print, "none", raster=False, output=path)
+        pass_task(workspace, settings, view, "novel", scene_print, engine, raster=raster, output=path)
         for view, path in zip(views, paths, strict=True)
     ]
 
@@ -187,7 +212,7 @@ def _gbuffers(
     run_view_tasks(
         "G-buffers",
         "dnrpipe.blender.passes.worker",
-        pass_common(workspace, settings, "cycles-direct"),
+        pass_common(workspace, settings, engine),
         tasks,
         workspace=workspace,
         console=console,

@@ -39,8 +39,9 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
     _plan_effects(workspace, settings, console)
     scene_print = scene_fingerprint(workspace)
     engine, reason = _raster_engine(workspace, settings, console)
+    raster = settings.model.base == "raster"  # then test views need it, too
     tasks = [
-        pass_task(workspace, settings, view, split, scene_print, engine, raster=split in RASTERISED)
+        pass_task(workspace, settings, view, split, scene_print, engine, raster=split in RASTERISED or raster)
         for split in SPLITS
         for view in views[split]
     ]

@@ -61,8 +61,23 @@ class RaytraceSettings(Strict):
         default="auto", description="path vertices, 2 = direct light; auto: as deep as the scene needs, by a pilot"
     )
     variant: Literal["auto", "cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb"] = "auto"
+    denoise: bool = Field(default=False, description="denoise the views that are trained on (Open Image Denoise)")
+    evaluation_denoise: bool = Field(default=False, description="denoise the held-out references")
     seed: int = Field(default=0, ge=0)
     workers: int = Field(default=0, ge=0, description="0 = one per core")
+
+
+class BaseSettings(Strict):
+    """The image that the network corrects, where ``model.base`` is rendered (baked, direct, path)."""
+
+    light_size: Annotated[int, Field(ge=16, le=16384)] | Literal["auto"] = Field(
+        default="auto", description="texels of the baked light's side; auto: about one a pixel"
+    )
+    light_spp: int = Field(default=128, ge=1, le=1_000_000, description="paths per texel of the baked light")
+    samples: int = Field(
+        default=2, ge=1, le=64, description="rays per pixel of a base image; noisy pixels get four times as many more"
+    )
+    spp: int = Field(default=4, ge=1, le=1_000_000, description="path-traced samples of the kinds direct and path")
 
 
 class EffectSettings(Strict):
@@ -102,6 +117,7 @@ class Settings(Strict):
     cameras: CameraSettings = CameraSettings()
     passes: PassSettings = PassSettings()
     model: ModelSettings = ModelSettings()
+    base: BaseSettings = BaseSettings()
     select: SelectSettings = SelectSettings()
     raytrace: RaytraceSettings = RaytraceSettings()
     effects: EffectSettings = EffectSettings()
@@ -114,14 +130,14 @@ PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
         "cameras": {"train": 40, "val": 4, "test": 12, "width": 128, "height": 128},
         "passes": {"bake_size": 1024},
-        "raytrace": {"spp": 128, "evaluation_spp": 256},
+        "raytrace": {"spp": 128, "evaluation_spp": 512, "denoise": True, "evaluation_denoise": True},
         "model": {"texture_size": 128, "width": 24, "depth": 3, "aggregator": "residual"},
         "select": {"step1": {"epochs": 12, "texture_rate_scale": 10.0}},
         "finetune": {"step2": {"epochs": 50, "texture_rate_scale": 10.0, "photometric": "l1", "perceptual_crop": 64}},
     },
     "standard": {
         "cameras": {"train": 100, "val": 10, "test": 50, "width": 384, "height": 384},
-        "raytrace": {"spp": 256, "evaluation_spp": 512},
+        "raytrace": {"spp": 256, "evaluation_spp": 512, "denoise": True, "evaluation_denoise": True},
         "model": {"texture_size": 256, "width": 32, "depth": 4, "aggregator": "residual"},
         "select": {"step1": {"epochs": 30, "texture_rate_scale": 10.0}},
         "finetune": {"step2": {"epochs": 60, "texture_rate_scale": 10.0, "photometric": "l1", "perceptual_crop": 192}},

@@ -60,6 +60,11 @@ def _light(settings: Settings) -> dict[str, Any]:
     return chosen | {key: sorted(set(chosen[key]) - NEURAL) for key in ("enable", "disable")}
 
 
+def _base(settings: Settings) -> list[Any]:
+    """Settings that decide the base images."""
+    return [settings.model.base, settings.base.model_dump()]
+
+
 def _neural(settings: Settings) -> dict[str, list[str]]:
     """Effect settings that decide what the neural renderer is made of."""
     chosen = settings.effects
@@ -76,7 +81,11 @@ STAGES: dict[str, Stage] = {
             needs=(),
             reads=("the scene file",),
             writes=("scene", "cameras", "passes"),
-            settings=lambda s: [s.cameras.model_dump(), s.passes.model_dump(exclude={"workers"})],
+            settings=lambda s: [
+                s.cameras.model_dump(),
+                s.passes.model_dump(exclude={"workers"}),
+                *(["raster"] if s.model.base == "raster" else []),
+            ],
             run="dnrpipe.prepare:run",
             progress="dnrpipe.prepare:progress",
         ),
@@ -87,18 +96,22 @@ STAGES: dict[str, Stage] = {
             needs=("prepare",),
             reads=("passes", "cameras"),
             writes=("selection.json", "checkpoints/step1"),
-            settings=lambda s: [s.model.model_dump(), s.select.model_dump(), _neural(s)],
+            settings=lambda s: [s.model.coarse().model_dump(), s.select.model_dump(), _neural(s)],
             run="dnrpipe.training:run_select",
             progress="dnrpipe.training:select_progress",
         ),
         Stage(
             name="raytrace",
             command="raytrace-selected",
-            does="path tracing of the selected views",
+            does="path tracing of the selected views, their base images",
             needs=("prepare", "select"),
             reads=("scene", "selection.json"),
-            writes=("raytraced/train",),
-            settings=lambda s: [s.raytrace.model_dump(exclude={"workers", "evaluation_spp", "variant"}), _light(s)],
+            writes=("raytraced/train", "base/train"),
+            settings=lambda s: [
+                s.raytrace.model_dump(exclude={"workers", "evaluation_spp", "evaluation_denoise", "variant"}),
+                _light(s),
+                _base(s),
+            ],
             run="dnrpipe.trace:run",
             progress="dnrpipe.trace:progress",
         ),
@@ -107,7 +120,7 @@ STAGES: dict[str, Stage] = {
             command="finetune",
             does="step 2: six losses on the selected ray-traced views",
             needs=("select", "raytrace"),
-            reads=("passes", "raytraced/train", "checkpoints/step1"),
+            reads=("passes", "raytraced/train", "base/train", "checkpoints/step1"),
             writes=("checkpoints/step2",),
             settings=lambda s: [s.model.model_dump(), s.finetune.model_dump(), _neural(s)],
             run="dnrpipe.training:run_finetune",
@@ -119,8 +132,12 @@ STAGES: dict[str, Stage] = {
             does="held-out test views, ray-traced on demand",
             needs=("finetune",),
             reads=("passes/test", "checkpoints/step2"),
-            writes=("raytraced/test", "evaluation"),
-            settings=lambda s: [s.raytrace.model_dump(exclude={"workers", "spp", "variant"}), _light(s)],
+            writes=("raytraced/test", "base/test", "evaluation"),
+            settings=lambda s: [
+                s.raytrace.model_dump(exclude={"workers", "spp", "denoise", "variant"}),
+                _light(s),
+                _base(s),
+            ],
             run="dnrpipe.evaluate:run",
             progress="dnrpipe.evaluate:progress",
         ),

@@ -9,6 +9,7 @@ from typing import Any
 from dnrtrain.contract import View
 from dnrtrain.exr import read_metadata
 
+from .base import RENDERED, base_path, base_views
 from .console import Console
 from .costs import CostRecord
 from .effects.store import lenses, resolve_plan, trace_config, variant_for
@@ -24,7 +25,7 @@ TRACE_VERSION = 2
 
 
 def run(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
-    """Trace the selected views that are not on disk yet."""
+    """Trace the selected views that are not on disk yet, and render the base images that go with them."""
     by_name = {view.name: view for view in split_views(workspace)["train"]}
     selected = [by_name[name] for name in read_selection(workspace)["views"]]
     tasks = trace_views(
@@ -38,8 +39,11 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
         stage="raytrace",
         purpose="training",
     )
+    bases = base_views(
+        workspace, settings, console, run_id, views=selected, split="train", stage="raytrace", purpose="training"
+    )
     return Outcome(
-        digest([task["fingerprint"] for task in tasks]),
+        digest([task["fingerprint"] for task in [*tasks, *bases]]),
         {"views": [view.name for view in selected], "spp": settings.raytrace.spp},
     )
 
@@ -49,7 +53,12 @@ def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
     if not workspace.selection.exists():
         return 0, settings.select.budget
     names = read_selection(workspace)["views"]
-    return sum(workspace.raytraced("train", name).exists() for name in names), len(names)
+    rendered = settings.model.base in RENDERED
+    made = [
+        workspace.raytraced("train", name).exists() and (not rendered or base_path(workspace, "train", name).exists())
+        for name in names
+    ]
+    return sum(made), len(names)
 
 
 def trace_views(
@@ -81,8 +90,11 @@ def trace_views(
         for view in views
     ]
     light = [sorted(plan.left_out), plan.on("spectral")]
+    wanted = settings.raytrace.evaluation_denoise if split == "test" else settings.raytrace.denoise
     for task in tasks:
         decisive = {key: task[key] for key in ("view", "spp", "integrator", "max_depth", "lens", "seed")}
+        if wanted:
+            task["denoise"] = decisive["denoise"] = True
         task["fingerprint"] = digest([TRACE_VERSION, scene_print, decisive, light])
     if all(is_made(task) for task in tasks):
         return tasks

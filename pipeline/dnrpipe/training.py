@@ -12,6 +12,7 @@ from dnrtrain.atomic import write_json
 from dnrtrain.contract import View
 from dnrtrain.events import EpochEnd, Event, Note, Selected
 
+from .base import RENDERED, base_path
 from .console import Bar, Console
 from .costs import CostRecord
 from .effects.store import plan_of
@@ -23,7 +24,7 @@ from .stages import STAGES, Outcome, fingerprint
 from .workspace import Workspace, digest, file_sha256
 
 if TYPE_CHECKING:
-    from dnrtrain.dataset import ViewSet
+    from dnrtrain.dataset import Base, ViewSet
 
 
 def run_select(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
@@ -44,7 +45,7 @@ def run_select(workspace: Workspace, settings: Settings, console: Console, run_i
         dataset,
         val,
         np.stack([view.position for view in views["train"]]),
-        plan_of(workspace, settings).model(settings.model),
+        plan_of(workspace, settings).model(settings.model).coarse(),
         settings.select.step1,
         policy=settings.select.policy,
         budget=settings.select.budget,
@@ -79,7 +80,7 @@ def run_finetune(workspace: Workspace, settings: Settings, console: Console, run
 
     by_name = {view.name: view for view in split_views(workspace)["train"]}
     names = read_selection(workspace)["views"]
-    dataset = load(workspace, [by_name[name] for name in names], "train", raytraced=True)
+    dataset = load(workspace, [by_name[name] for name in names], "train", raytraced=True, base=settings.model.base)
     stamp = fingerprint(STAGES["finetune"], workspace, settings)
     assert stamp is not None
     folder = workspace.checkpoints("step2")
@@ -130,8 +131,13 @@ def check_budget(budget: int, candidates: int) -> None:
         )
 
 
-def load(workspace: Workspace, views: list[View], split: str, *, raytraced: bool = False) -> ViewSet:
-    """G-buffers of the views, with rasterised (train, val) or ray-traced targets, or none (test)."""
+def load(
+    workspace: Workspace, views: list[View], split: str, *, raytraced: bool = False, base: Base = "none"
+) -> ViewSet:
+    """G-buffers of the views, with rasterised (train, val) or ray-traced targets, or none (test).
+
+    base: the base image to load beside them (:mod:`.base`).
+    """
     from dnrtrain.dataset import load_views
 
     frame = read_frame(workspace)
@@ -142,6 +148,8 @@ def load(workspace: Workspace, views: list[View], split: str, *, raytraced: bool
         cameras=views,
         folder=workspace.scene,
         target=split != "test" or raytraced,
+        base=base,
+        base_files=[base_path(workspace, split, view.name) for view in views] if base in RENDERED else None,
     )
 
 

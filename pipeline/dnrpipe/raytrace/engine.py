@@ -72,6 +72,15 @@ class Engine:
         view, lens = scaled_view(view, self.unit_scale), scaled_lens(lens, self.unit_scale)
         return self.mi.load_dict(sensor_dict(self.mi, view, lens))
 
+    def auxiliary(self, bundle: Path, view: View, spp: int) -> tuple[np.ndarray, np.ndarray]:
+        """(albedo, shading normal in world space) of what is seen first, [H, W, 3] each, for the denoiser."""
+        integrator = self.mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
+        part = self.mi.render(
+            self.scenes[str(bundle)], sensor=self.sensor(view), integrator=integrator, spp=spp, seed=0
+        )
+        channels = np.nan_to_num(np.array(part, dtype=np.float32)[..., -6:], posinf=0.0, neginf=0.0)
+        return channels[..., :3].clip(0, 1), channels[..., 3:].clip(-1, 1)
+
     def frame(
         self, bundle: Path, integrator: Any, sensor: Any, view: View, spp: int, seed: int
     ) -> tuple[np.ndarray, int]:

@@ -32,13 +32,15 @@ def register(mi: Any) -> None:
     class Path(mi.SamplingIntegrator):
         """Path tracing with next event estimation, both weighted by the power heuristic.
 
-        ``max_depth``, ``rr_depth``, ``hide_emitters``: as of Mitsuba's ``path``. ``caustics``: true by default.
+        ``max_depth``, ``rr_depth``, ``hide_emitters``: as of Mitsuba's ``path``. ``caustics``: true by default;
+        ``after_diffuse``: the rays come from a diffuse surface instead of the eye, which matters for caustics.
         """
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
             self.max_depth = dr.opaque(mi.UInt32, int(props.get("max_depth", 8)))
             self.caustics = bool(props.get("caustics", True))
+            self.after_diffuse = bool(props.get("after_diffuse", False))
             self.rr_depth = int(props.get("rr_depth", 5))
 
         @dr.syntax
@@ -51,7 +53,7 @@ def register(mi: Any) -> None:
             active = mi.Bool(active)
             radiance, throughput = mi.Spectrum(0), mi.Spectrum(1)
             eta, depth = mi.Float(1), mi.UInt32(0)
-            valid, diffused, was_delta = mi.Bool(False), mi.Bool(False), mi.Bool(True)
+            valid, diffused, was_delta = mi.Bool(False), mi.Bool(self.after_diffuse), mi.Bool(True)
             before, density = dr.zeros(mi.SurfaceInteraction3f), mi.Float(1)
             si = scene.ray_intersect(ray, mi.RayFlags.All, True, active)
             if dr.hint(self.hide_emitters, mode="scalar"):

@@ -2,7 +2,8 @@
 
 Notation
     A, B     two independent half renders of a view, each spp/2 samples per pixel
-    noise    estimated relative RMSE of (A+B)/2 in display space: rms((A-B)/2) / rms(value)
+    noise    estimated relative RMSE of (A+B)/2 in display space: rms((A-B)/2) / rms(value); of denoised views, A and
+             B are denoised first: the noise that is left, not the denoiser's own error
 
 Two halves cost nothing extra (their mean is the image) and give an unbiased estimate of the variance.
 """
@@ -21,10 +22,12 @@ from dnrpipe.effects.statistics import display
 from dnrtrain.contract import View
 from dnrtrain.exr import write_exr
 
+from .denoise import denoise
 from .engine import Engine
 from .sensors import sensor_dict
 
 REPAIR_ROUNDS = 3
+AUXILIARY_SPP = 16
 
 
 class Worker:
@@ -32,7 +35,8 @@ class Worker:
 
     common: {"bundle": path of scene.xml, "variant": str, "threads": int}
     task: {"view": View as JSON, "output": path, "spp", "max_depth", "seed", "fingerprint"}, and optionally
-    "integrator" (direct, path, volpath; default path) and "lens" (see :func:`.sensors.sensor_dict`)
+    "integrator" (direct, path, volpath; default path), "lens" (see :func:`.sensors.sensor_dict`) and "denoise":
+    R G B are then denoised, and what was traced is in the channels ``raw.R``, ``raw.G``, ``raw.B``.
     """
 
     def __init__(self, common: dict[str, Any]) -> None:
@@ -55,6 +59,13 @@ class Worker:
         half_a, half_b, repaired, masked = _repair(render, half_a, half_b, max(1, spp // 2), seed)
         total = done_a + done_b
         image = (half_a * done_a + half_b * done_b) / total
+        channels = {channel: image[..., i] for i, channel in enumerate("RGBA")}
+        if task.get("denoise"):
+            channels |= {f"raw.{channel}": image[..., i] for i, channel in enumerate("RGB")}
+            halves = [image, half_a, half_b] if done_b else [image]
+            clean = self._denoised(halves, view)
+            channels |= {channel: clean[0][..., i] for i, channel in enumerate("RGB")}
+            half_a, half_b = clean[1:] if done_b else (half_a, half_b)
         noise, noise_rmse = estimate_noise(half_a, half_b) if done_b else (None, None)
         numbers = {
             "spp": total,
@@ -70,13 +81,19 @@ class Worker:
             "noise_rmse": noise_rmse,
             "repaired": repaired,
             "masked": masked,
+            "denoised": bool(task.get("denoise")),
         }
         write_exr(
             Path(task["output"]),
-            {channel: image[..., i] for i, channel in enumerate("RGBA")},
+            channels,
             {**numbers, "fingerprint": task["fingerprint"], "view": view.model_dump(mode="json")},
         )
         return numbers
+
+    def _denoised(self, images: list[np.ndarray], view: View) -> list[np.ndarray]:
+        """The images [H, W, 4] without noise; one thread, so that bits repeat."""
+        albedo, normal = self.engine.auxiliary(self.bundle, view, AUXILIARY_SPP)
+        return [denoise(image, albedo, normal, threads=1).astype(np.float64) for image in images]
 
 
 def _repair(

@@ -39,7 +39,7 @@ def camera_integrator(mi: Any, scene: Any, max_depth: int, kind: str = "path") -
     else:
         settings |= {"max_depth": max_depth, "rr_depth": ROULETTE_DEPTH}
     hidden = mi.load_dict({**settings, "hide_emitters": True})
-    first_visible, found, name = _first_visible(mi, scene), hidden, kind
+    first_visible, found, name = first_visible_of(mi, scene), hidden, kind
     unseen = any(shape.id().startswith(UNSEEN_PREFIX) for shape in scene.shapes())
     if glowing_shapes(scene) or unseen:
         shown = mi.load_dict({**settings, "hide_emitters": False})
@@ -49,7 +49,7 @@ def camera_integrator(mi: Any, scene: Any, max_depth: int, kind: str = "path") -
     return found, name
 
 
-def _is_one_of(mi: Any, hit: Any, shapes: list[Any]) -> Any:
+def is_one_of(mi: Any, hit: Any, shapes: list[Any]) -> Any:
     """Whether ``hit`` is on one of the shapes."""
     import drjit as dr
 
@@ -61,7 +61,7 @@ def _is_one_of(mi: Any, hit: Any, shapes: list[Any]) -> Any:
     return found & hit.is_valid()
 
 
-def _first_visible(mi: Any, scene: Any) -> Any:
+def first_visible_of(mi: Any, scene: Any) -> Any:
     """Function (scene, ray, active) -> (ray that starts behind lamps and unseen shapes, its first hit)."""
     import drjit as dr
 
@@ -76,9 +76,9 @@ def _first_visible(mi: Any, scene: Any) -> Any:
         def onwards(ray: Any, hit: Any, passing: Any) -> tuple[Any, Any, Any]:
             ray = hit.spawn_ray(ray.d)
             hit = scene.ray_intersect(ray, passing)
-            return ray, hit, passing & _is_one_of(mi, hit, apart)
+            return ray, hit, passing & is_one_of(mi, hit, apart)
 
-        state = (ray, hit, active & _is_one_of(mi, hit, apart))
+        state = (ray, hit, active & is_one_of(mi, hit, apart))
         ray, hit, _ = dr.while_loop(state, lambda ray, hit, passing: passing, onwards)
         return ray, hit
 
@@ -98,8 +98,8 @@ def _camera_view(mi: Any, scene: Any, hidden: Any, shown: Any, first_visible: An
 
     def glows(hit: Any) -> Any:
         if not jit:
-            return hit.is_valid() and hit.shape.is_emitter() and not _is_one_of(mi, hit, lamps)
-        return hit.is_valid() & hit.shape.is_emitter() & ~_is_one_of(mi, hit, lamps)
+            return hit.is_valid() and hit.shape.is_emitter() and not is_one_of(mi, hit, lamps)
+        return hit.is_valid() & hit.shape.is_emitter() & ~is_one_of(mi, hit, lamps)
 
     def glowing_layers(scene: Any, sampler: Any, ray: Any, hit: Any, glow: Any) -> tuple[Any, Any, Any, Any]:
         """Walk through the glowing surfaces in front.

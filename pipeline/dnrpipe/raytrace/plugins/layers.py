@@ -173,6 +173,20 @@ def register(mi: Any) -> None:
                 "odds": [part / total for part in odds],
             }
 
+        def _wanted(self, ctx: Any, layers: dict[str, Any]) -> dict[str, Any]:
+            """The layers without the lobes that ``ctx`` leaves out."""
+            diffuse = ctx.is_enabled(mi.BSDFFlags.DiffuseReflection, 0)
+            glossy = ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 1)
+            if diffuse and glossy:
+                return layers
+            odds, none = layers["odds"], mi.Spectrum(0.0)
+            if diffuse:
+                return layers | {"dielectric": none, "metal": none, "coat": none, "odds": [mi.Float(1), 0.0, 0.0]}
+            if glossy:
+                total = odds[1] + odds[2]
+                return layers | {"diffuse": none, "odds": [mi.Float(0), odds[1] / total, odds[2] / total]}
+            return layers | {"diffuse": none, "dielectric": none, "metal": none, "coat": none}
+
         def _value(self, layers: dict[str, Any], wi: Any, wo: Any) -> tuple[Any, Any]:
             """(BSDF times cos wo, density) for directions on the front."""
             h = dr.normalize(wi + wo)
@@ -194,7 +208,7 @@ def register(mi: Any) -> None:
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
             front = active & (si.wi.z > 0) & (wo.z > 0)
-            value, pdf = self._value(self._layers(si, front), si.wi, wo)
+            value, pdf = self._value(self._wanted(ctx, self._layers(si, front)), si.wi, wo)
             return dr.select(front, value, 0), dr.select(front, pdf, 0)
 
         def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
@@ -205,7 +219,7 @@ def register(mi: Any) -> None:
 
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
             front = active & (si.wi.z > 0)
-            layers = self._layers(si, front)
+            layers = self._wanted(ctx, self._layers(si, front))
             odds = layers["odds"]
             is_diffuse = sample1 < odds[0]
             alpha = layers["alpha"]

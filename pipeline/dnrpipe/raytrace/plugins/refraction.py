@@ -45,11 +45,16 @@ def register(mi: Any) -> None:
             reflected = mi.fresnel(dr.dot(si.wi, m) * dr.sign(cosine), self.eta)[0]
             return dr.select(cosine * mi.Frame3f.cos_theta(wo) < 0, 1 / dr.maximum(1 - reflected, 1e-3), 0)
 
+        def _asked(self, ctx: Any) -> bool:
+            return ctx.is_enabled(mi.BSDFFlags(int(self.m_components[self.lobe]) & int(mi.BSDFFlags.All)), self.lobe)
+
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
+            active = active & self._asked(ctx)
             found, weight = self.nested.sample(self._only_transmission(), si, sample1, sample2, active)
-            return found, weight * self._gain(si, found.wo)
+            return found, dr.select(active, weight * self._gain(si, found.wo), 0)
 
         def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            active = active & self._asked(ctx)
             return self.nested.eval(self._only_transmission(), si, wo, active) * self._gain(si, wo)
 
         def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:

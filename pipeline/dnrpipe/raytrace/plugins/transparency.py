@@ -48,6 +48,9 @@ def register(mi: Any) -> None:
             tint = self.transmittance.eval(si, active & through)
             if self.nested is None:
                 return straight, tint
+            if not ctx.is_enabled(mi.BSDFFlags.Null, len(self.m_components) - 1):
+                found, weight = self.nested.sample(ctx, si, sample1, sample2, active)
+                return found, weight * opacity
             rescaled = dr.minimum(sample1 / dr.maximum(opacity, 1e-6), 1)
             found, weight = self.nested.sample(ctx, si, rescaled, sample2, active & (sample1 < opacity))
             found.pdf *= opacity

@@ -1,0 +1,206 @@
+"""Base images: what the network corrects. Bakes the scene's light once, then renders views from it, on demand.
+
+Which one it is says ``model.base``: ``none``; ``raster``, the rasterised colour of the passes; ``baked``, baked light
+and specular paths; ``direct`` or ``path``, a few path-traced samples, denoised (direct light alone, or the plan's depth).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dnrtrain.contract import View
+
+from .console import Console
+from .costs import CostRecord
+from .effects.plan import EffectPlan
+from .effects.store import resolve_plan, trace_config
+from .errors import UserError
+from .executors import Retry, run_tasks
+from .raytrace.variants import choose_variant
+from .scene_files import scene_fingerprint
+from .settings import Settings
+from .tasks import run_view_tasks, task_name, view_record
+from .workspace import Workspace, digest
+
+BASE_VERSION = 1
+RENDERED = ("baked", "direct", "path")
+"""Kinds of base images that are rendered into files of their own."""
+AUTOMATIC_TEXELS = 4
+"""Light map texels per pixel of an image's side: about one texel a pixel where the atlas shows a part of itself."""
+SIZES = (256, 4096)
+
+
+def base_path(workspace: Workspace, split: str, name: str) -> Path:
+    """``base/<split>/<view>.exr``."""
+    return workspace.root / "base" / split / f"{name}.exr"
+
+
+def light_path(workspace: Workspace) -> Path:
+    """The baked light of the scene."""
+    return workspace.root / "base" / "light.npz"
+
+
+def light_size(settings: Settings) -> int:
+    """Texels of the light map's side: the setting, else a power of two that suits the images."""
+    if settings.base.light_size != "auto":
+        return settings.base.light_size
+    wanted = AUTOMATIC_TEXELS * max(settings.cameras.width, settings.cameras.height)
+    return int(min(max(2 ** round(np.log2(wanted)), SIZES[0]), SIZES[1]))
+
+
+def base_views(
+    workspace: Workspace,
+    settings: Settings,
+    console: Console,
+    run_id: str,
+    *,
+    views: Sequence[View],
+    split: str,
+    stage: Any,
+    purpose: Any,
+    paths: Sequence[Path] | None = None,
+) -> list[dict[str, Any]]:
+    """Render the base images of ``views`` that are missing or out of date; returns all tasks ([] where none is due).
+
+    paths: where they go instead of ``base/<split>``. Raises UserError where this machine has no jit variant of Mitsuba.
+    """
+    kind = settings.model.base
+    if kind not in RENDERED or not views:
+        return []
+    plan = resolve_plan(workspace, settings, console, run_id, stage)
+    common, environment, stamp = _prepared(workspace, settings, console, run_id, plan, stage)
+    paths = paths or [base_path(workspace, split, view.name) for view in views]
+    tasks = []
+    for view, path in zip(views, paths, strict=True):
+        data = view.model_dump(mode="json")
+        tasks.append({"view": data, "output": str(path), "fingerprint": digest([BASE_VERSION, stamp, data])})
+
+    def book(task: dict[str, Any], result: dict[str, Any], workers: int) -> CostRecord:
+        record = view_record(
+            run=run_id,
+            stage=stage,
+            purpose=purpose,
+            task=task,
+            result=result,
+            workers=workers,
+            device=f"mitsuba {common['variant']}",
+        )
+        return record.model_copy(update={"name": f"base/{task_name(task)}"})
+
+    run_view_tasks(
+        "base images",
+        "dnrpipe.raytrace.base_worker",
+        common,
+        tasks,
+        workspace=workspace,
+        console=console,
+        stage=stage,
+        workers=1,  # a kernel to compile; its threads fill the machine
+        book=book,
+        environment=environment,
+    )
+    return tasks
+
+
+def _prepared(
+    workspace: Workspace, settings: Settings, console: Console, run_id: str, plan: EffectPlan, stage: Any
+) -> tuple[dict[str, Any], dict[str, str], str]:
+    """(what the workers share, their environment, a hash of all that decides the images but for the view)."""
+    chosen, kind = settings.base, settings.model.base
+    choice = choose_variant(settings.raytrace.variant)
+    if choice.variant.startswith("scalar"):
+        raise UserError(
+            f"model.base={kind} needs a jit variant of Mitsuba (LLVM or CUDA; see `dnrpipe doctor`);"
+            " or choose --set model.base=raster"
+        )
+    config = trace_config(workspace, plan, choice.variant)
+    light = [config["integrator"], config["max_depth"], sorted(plan.left_out), scene_fingerprint(workspace)]
+    common: dict[str, Any] = {
+        "bundle": config["bundle"],
+        "variant": choice.variant,
+        "kind": kind,
+        "samples": chosen.samples,
+    }
+    if kind == "baked":
+        common["light"] = str(light_path(workspace))
+        task = {
+            "output": common["light"],
+            "size": light_size(settings),
+            "spp": chosen.light_spp,
+            "integrator": config["integrator"],
+            "max_depth": config["max_depth"],
+            "seed": settings.raytrace.seed,
+        }
+        task["fingerprint"] = digest([BASE_VERSION, light, {k: v for k, v in task.items() if k != "output"}])
+        _bake(workspace, console, run_id, stage, common, choice.environment, task)
+        return common, choice.environment, digest([task["fingerprint"], chosen.samples])
+    direct = kind == "direct"
+    common |= {
+        "integrator": "path" if direct else config["integrator"],
+        "max_depth": 2 if direct else config["max_depth"],
+        "spp": chosen.spp,
+        "seed": settings.raytrace.seed,
+    }
+    return common, choice.environment, digest([kind, light, chosen.spp, chosen.samples, settings.raytrace.seed])
+
+
+def _bake(
+    workspace: Workspace,
+    console: Console,
+    run_id: str,
+    stage: Any,
+    common: dict[str, Any],
+    environment: dict[str, str],
+    task: dict[str, Any],
+) -> None:
+    """Bake the light where it is missing or of other inputs."""
+    path = Path(task["output"])
+    if _light_print(path) == task["fingerprint"]:
+        return
+    shared = {"bundle": common["bundle"], "variant": common["variant"]}
+    with console.bar("baking light", 1) as bar:
+        outcomes = run_tasks(
+            "dnrpipe.raytrace.light_worker",
+            shared,
+            [task],
+            workers=1,
+            log=workspace.log(stage),
+            environment=environment,
+        )
+        for outcome in outcomes:
+            if isinstance(outcome, Retry):
+                console.warn(f"baking light: {outcome.reason}; trying once more")
+                continue
+            if outcome.result is None:
+                raise UserError(f"baking light failed twice: {outcome.error}; see {workspace.log(stage)}")
+            result = outcome.result
+            bar.advance(note=f"{task['size']}² texels, {task['spp']} spp")
+            workspace.ledger.append(
+                CostRecord(
+                    time=time.time(),
+                    run=run_id,
+                    stage=stage,
+                    purpose="training",
+                    unit="scene",
+                    name="light",
+                    seconds=result["seconds"],
+                    cpu_seconds=result["cpu_seconds"],
+                    device=f"mitsuba {common['variant']}",
+                    spp=task["spp"],
+                    peak_mb=result["peak_mb"],
+                    detail={"texels": result["texels"]},
+                )
+            )
+
+
+def _light_print(path: Path) -> str | None:
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return str(data["fingerprint"])
+    except (OSError, ValueError, KeyError, EOFError):
+        return None

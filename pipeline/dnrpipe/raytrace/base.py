@@ -1,0 +1,284 @@
+"""Base images: what a view looks like by baked light and mirror-like paths alone, without noise and in milliseconds.
+
+Notation
+    E        light map (see :mod:`.lightmap`), rho the diffuse reflectance of the point at hand
+    chain    the path that follows the non-diffuse lobes: mirror reflection, refraction, glossy lobes, cut-outs
+    sample   one of S rays through a pixel; the same S places in every pixel, so that nothing flickers
+
+    base     = mean over samples of the sum over the chain's vertices of throughput (emission + rho E)
+    diffuse  = the first vertex's share of it
+
+A glossy lobe is sampled by numbers of a fixed low-discrepancy sequence, which repeats over tiles of TILE² pixels. Where
+light sources can be hit, emitter sampling serves the first glossy vertex, and multiple importance sampling joins both.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .lightmap import diffuse_context, reflectance
+from .texels import ATTRIBUTE
+from .visibility import LAMP_PREFIX, UNSEEN_PREFIX, is_one_of
+
+TILE = 4
+MAX_VERTICES = 10
+GOLDEN = (0.7548776662466927, 0.5698402909980532)
+"""Steps of the two-dimensional R2 sequence (Roberts 2018)."""
+STEPS = (*GOLDEN, 0.8191725133961645)
+LEAST_THROUGHPUT = 1e-3
+EXTRA = 4
+"""Further samples of noisy pixels, as a multiple of the first ones."""
+NOISY = 0.04
+"""Disagreement from which on a pixel is noisy, of the range from dark to bright."""
+MEANS = (
+    *("base.R", "base.G", "base.B", "base.A", "diffuse.R", "diffuse.G", "diffuse.B"),
+    *("albedo.R", "albedo.G", "albedo.B", "normal.X", "normal.Y", "normal.Z"),
+)
+CENTRES = ("chain.U", "chain.V", "chain.mask", "chain.weight")
+IGNORE_CONTEXT = ("Principled", "PrincipledThin")
+"""Mitsuba's BSDFs that do not split into lobes: all of theirs is taken for diffuse."""
+
+
+class BaseRenderer:
+    """Renders base images of one scene.
+
+    Args:
+        light: E of the front and of the back, float32 [2, size, size, 3], row 0 at V = 0.
+        samples: S, rays per pixel.
+    """
+
+    def __init__(self, mi: Any, scene: Any, light: np.ndarray, samples: int) -> None:
+        import drjit as dr
+
+        self.mi, self.scene, self.samples = mi, scene, samples
+        self.light = [mi.Texture2f(mi.TensorXf(side), wrap_mode=dr.WrapMode.Clamp) for side in light]
+        shapes = scene.shapes()
+        self.apart = [shape for shape in shapes if shape.id().startswith((LAMP_PREFIX, UNSEEN_PREFIX))]
+        self.lamps = [shape for shape in shapes if shape.id().startswith(LAMP_PREFIX)]
+        self.lit = bool(scene.emitters())
+        bsdfs = {str(bsdf): bsdf for bsdf in (shape.bsdf() for shape in shapes) if bsdf is not None}
+        self.whole = [b for text, b in bsdfs.items() if any(f"{name}[" in text for name in IGNORE_CONTEXT)]
+        self.mirrors = any(
+            mi.has_flag(b.flags(), kind) for b in bsdfs.values() for kind in (mi.BSDFFlags.Glossy, mi.BSDFFlags.Delta)
+        )
+        self.translucent = bool(self.whole) or any(
+            mi.has_flag(b.flags(), mi.BSDFFlags.DiffuseTransmission) for b in bsdfs.values()
+        )
+        order = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]], np.uint32)  # Bayer
+        self.order = mi.UInt32(order.ravel())
+        # Recorded at the first call: tracing the plugins anew would take longer than the frame itself.
+        self.kernel = dr.freeze(self._kernel)
+
+    def frame(self, view: Any) -> dict[str, np.ndarray]:
+        """Channels of BASE_CHANNELS and ``normal.X/Y/Z``, float32 [H, W], for a view in the bundle's units.
+
+        Adaptive: pixels whose first samples disagree (mirrors, rough metal, edges), and those around them, get
+        EXTRA times as many more. Which ones they are depends on the view alone, as all else here.
+        """
+        height, width, samples = view.height, view.width, self.samples
+        everywhere = np.arange(height * width, dtype=np.uint32)
+        values = self._sampled(view, everywhere, 0, samples)
+        means, first = values.mean(axis=1), values[:, 0]
+        if samples > 1 and self.mirrors:
+            noisy = everywhere[_disagree(values[..., :3], (height, width))]
+            if len(noisy):
+                more = self._sampled(view, noisy, samples, EXTRA * samples)
+                means[noisy] = (means[noisy] + EXTRA * more.mean(axis=1)) / (1 + EXTRA)
+        # The first sample is the pixel's centre.
+        table = np.concatenate([means[:, : len(MEANS)], first[:, len(MEANS) :]], axis=1).astype(np.float32)
+        return {name: table[:, i].reshape(height, width) for i, name in enumerate(MEANS + CENTRES)}
+
+    def _sampled(self, view: Any, pixels: np.ndarray, start: int, samples: int) -> np.ndarray:
+        """[P, samples, channels] of samples ``start`` onwards of some pixels."""
+        import drjit as dr
+
+        mi = self.mi
+        pixel = np.repeat(pixels.astype(np.uint32), samples)
+        sample = np.tile(np.arange(start, start + samples, dtype=np.uint32), len(pixels))
+        m = view.matrix
+        axes = [mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in m[:3, i])) for i in range(4)]
+        film = [dr.opaque(mi.Float, float(v)) for v in (view.fl_x, view.fl_y, view.cx, view.cy)]
+        channels = self.kernel(
+            self.scene, self.light, self.order, mi.UInt32(pixel), mi.UInt32(sample), axes, film, view.width
+        )
+        dr.eval(channels)
+        return np.stack([np.array(channel) for channel in channels], axis=-1).reshape(len(pixels), samples, -1)
+
+    def _kernel(
+        self, scene: Any, light: Any, order: Any, pixel: Any, sample: Any, axes: Any, film: Any, width: int
+    ) -> list[Any]:
+        """One sample of each pixel named. All that varies comes in as data: recorded once, replayed for every view."""
+        import drjit as dr
+
+        mi = self.mi
+        x, y = pixel % width, pixel // width
+        tile = dr.gather(mi.UInt32, order, (y % TILE) * TILE + x % TILE)
+        number, place = mi.Float(sample * (TILE * TILE) + tile), mi.Float(sample)
+        right = mi.Float(x) + _fraction(0.5 + place * GOLDEN[0]) - film[2]
+        down = mi.Float(y) + _fraction(0.5 + place * GOLDEN[1]) - film[3]
+        direction = axes[0] * (right / film[0]) - axes[1] * (down / film[1]) - axes[2]
+        ray = mi.Ray3f(mi.Point3f(axes[3]), dr.normalize(direction))
+        return self._follow(scene, light, ray, number)
+
+    def _baked(self, light: Any, si: Any, active: Any) -> Any:
+        """E at the surface point, on the side that is seen."""
+        import drjit as dr
+
+        mi = self.mi
+        place = si.shape.eval_attribute_3(ATTRIBUTE, si, active & si.shape.has_attribute(ATTRIBUTE, active))
+        front = dr.dot(si.n, si.to_world(si.wi)) >= 0
+        uv = mi.Point2f(place.x, place.y)
+        found = [mi.Spectrum(*texture.eval(uv, active)) for texture in light]
+        return dr.select(front, found[0], found[1]), uv
+
+    def _follow(self, scene: Any, light: Any, ray: Any, number: Any) -> list[Any]:
+        """One sample along each ray: the values named by MEANS and CENTRES. number: its place in the sequence."""
+        import drjit as dr
+
+        mi = self.mi
+        smooth = diffuse_context(mi)
+        rest = mi.BSDFContext()
+        rest.type_mask = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Diffuse)
+        glossy = mi.BSDFContext()
+        glossy.type_mask = mi.BSDFFlags.Glossy
+
+        def uniform(vertex: Any, dimension: int) -> Any:
+            shift = mi.Float(vertex) * 0.31415926 + 0.173 * dimension
+            return _fraction(shift + number * STEPS[dimension])
+
+        def step(s: dict[str, Any]) -> dict[str, Any]:
+            active, straight = s["active"], s["straight"]
+            si = scene.ray_intersect(s["ray"], mi.RayFlags.All, True, active)
+            passed = active & straight & is_one_of(mi, si, self.apart) if self.apart else mi.Mask(False)
+            going = active & ~passed
+            # Light that is hit
+            source = mi.DirectionSample3f(scene, si, s["before"])
+            seen = going & (si.is_valid() | ~straight)
+            chance = scene.pdf_emitter_direction(s["before"], source, seen & s["sampled"])
+            weight = dr.select(s["sampled"], _power(s["density"], chance), 1)
+            emitted = dr.select(seen, s["throughput"] * weight * source.emitter.eval(si, seen), 0)
+            # Baked light
+            met = going & si.is_valid()
+            bsdf = si.bsdf()
+            rho = dr.select(met, reflectance(mi, bsdf, smooth, si, met, self.translucent), 0)
+            baked, uv = self._baked(light, si, met)
+            here = emitted + dr.select(met, s["throughput"] * rho * baked, 0)
+            primary = straight
+            total = s["total"] + here
+            diffuse = s["diffuse"] + dr.select(primary, here, 0)
+            albedo = s["albedo"] + dr.select(primary & met, s["throughput"] * rho, 0)
+            turned = dr.select(si.wi.z < 0, -si.sh_frame.n, si.sh_frame.n)
+            normal = dr.select(primary & met, mi.Vector3f(turned), s["normal"])
+            ends = met & ~straight & ~s["ended"] & (dr.mean(rho) > 0.05)
+            chain_uv = dr.select(ends, uv, s["chain_uv"])
+            chain_weight = dr.select(ends, dr.mean(s["throughput"]), s["chain_weight"])
+            # Emitters, once, through glossy lobes
+            onwards = met & ~_has(mi, bsdf, self.whole)
+            rough = onwards & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) & ~s["lit"]
+            if self.lit:
+                pair = mi.Point2f(uniform(s["vertex"] + 17, 0), uniform(s["vertex"] + 17, 1))
+                toward, arriving = scene.sample_emitter_direction(si, pair, True, rough)
+                value, other = bsdf.eval_pdf(glossy, si, si.to_local(toward.d), rough & (toward.pdf > 0))
+                share = dr.select(toward.delta, 1, _power(toward.pdf, other))
+                direct = dr.select(rough & (toward.pdf > 0), s["throughput"] * value * arriving * share, 0)
+                total += dr.select(dr.all(dr.isfinite(direct)), direct, 0)
+            # The mirror-like rest
+            pair = mi.Point2f(uniform(s["vertex"], 0), uniform(s["vertex"], 1))
+            bounce, factor = bsdf.sample(rest, si, uniform(s["vertex"], 2), pair, onwards)
+            null = mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Null)
+            delta = mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Delta)
+            throughput = dr.select(onwards, s["throughput"] * factor, s["throughput"])
+            throughput = dr.select(dr.all(dr.isfinite(throughput)), throughput, 0)
+            next_ray = si.spawn_ray(dr.select(passed, s["ray"].d, si.to_world(bounce.wo)))
+            alive = onwards & (bounce.pdf > 0) & (dr.max(throughput) > LEAST_THROUGHPUT)
+            return {
+                "active": passed | (alive & (s["vertex"] < MAX_VERTICES)),
+                "ray": dr.select(passed | onwards, next_ray, s["ray"]),
+                "straight": straight & (passed | (null & onwards)),
+                "throughput": throughput,
+                "total": total,
+                "diffuse": diffuse,
+                "albedo": albedo,
+                "normal": normal,
+                "covered": s["covered"] | (met & ~(null & alive)),
+                "before": dr.select(onwards & ~null, si, s["before"]),
+                "density": dr.select(null, s["density"], bounce.pdf),
+                "sampled": dr.select(null, s["sampled"], rough & ~delta),
+                "lit": s["lit"] | (rough & ~null),
+                "vertex": s["vertex"] + 1,
+                "chain_uv": chain_uv,
+                "chain_weight": chain_weight,
+                "ended": s["ended"] | ends,
+            }
+
+        state = {
+            "active": mi.Mask(True) & (number >= 0),
+            "ray": ray,
+            "straight": mi.Mask(True) & (number >= 0),
+            "throughput": mi.Spectrum(1.0),
+            "total": mi.Spectrum(0.0),
+            "diffuse": mi.Spectrum(0.0),
+            "albedo": mi.Spectrum(0.0),
+            "normal": mi.Vector3f(0.0),
+            "covered": mi.Mask(False),
+            "before": dr.zeros(mi.SurfaceInteraction3f),
+            "density": mi.Float(1.0),
+            "sampled": mi.Mask(False),
+            "lit": mi.Mask(False),
+            "vertex": mi.UInt32(0),
+            "chain_uv": mi.Point2f(0.0),
+            "chain_weight": mi.Float(0.0),
+            "ended": mi.Mask(False),
+        }
+        names = list(state)
+
+        def unpacked(*values: Any) -> tuple[Any, ...]:
+            result = step(dict(zip(names, values, strict=True)))
+            return tuple(result[name] for name in names)
+
+        done = dr.while_loop(tuple(state.values()), lambda *values: values[0], unpacked)
+        s = dict(zip(names, done, strict=True))
+        covered, ended = (dr.select(s[name], mi.Float(1), 0) for name in ("covered", "ended"))
+        colours = (s[name] for name in ("diffuse", "albedo", "normal"))
+        return [
+            *s["total"],
+            covered,
+            *(c for colour in colours for c in colour),
+            *s["chain_uv"],
+            ended,
+            s["chain_weight"],
+        ]
+
+
+def _disagree(radiance: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """bool [H * W]: pixels whose samples [P, S, 3] differ after tone mapping, and their eight neighbours."""
+    level = radiance.mean(axis=-1)
+    shown = level / (level + max(float(level.mean()), 1e-12))
+    spread = (shown.max(axis=1) - shown.min(axis=1)).reshape(shape)
+    padded = np.pad(spread > NOISY, 1)
+    height, width = shape
+    around = [padded[i : i + height, j : j + width] for i in range(3) for j in range(3)]
+    return np.logical_or.reduce(around).ravel()
+
+
+def _fraction(x: Any) -> Any:
+    import drjit as dr
+
+    return x - dr.floor(x)
+
+
+def _power(a: Any, b: Any) -> Any:
+    """Power heuristic; 0 where both are 0."""
+    import drjit as dr
+
+    total = a * a + b * b
+    return dr.select(total > 0, a * a / total, 0)
+
+
+def _has(mi: Any, bsdf: Any, members: list[Any]) -> Any:
+    found = mi.Mask(False)
+    for member in members:
+        found |= bsdf == mi.BSDFPtr(member)
+    return found

@@ -1,0 +1,258 @@
+"""Frames in a hurry: path tracing at a few samples and auxiliary images, by kernels that are traced once and kept.
+
+Python that describes a frame to Dr.Jit (our integrators and BSDFs) takes ten times longer than the kernel of a frame at
+one sample per pixel. ``dr.freeze`` records it once. What differs between frames goes in as opaque numbers: camera,
+seed, samples; a Mitsuba sensor per view would be recorded anew each time, so rays are made here.
+
+Notation
+    n     rays of a launch: H x W x samples, those of a pixel side by side
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dnrpipe.errors import UserError
+from dnrtrain.contract import View
+
+from .engine import Engine
+from .texels import ATTRIBUTE
+from .units import scaled_view
+from .visibility import first_visible_of
+
+WARM_FRAMES = 3
+"""Calls until nothing is recorded any more: the first ones teach Dr.Jit which inputs change."""
+
+
+@dataclass(frozen=True)
+class Auxiliary:
+    """What a pixel shows first, as :mod:`.denoise` wants it; float32, means over primary rays.
+
+    albedo    [H, W, 3] diffuse reflectance; 1 on surfaces without a diffuse lobe (Open Image Denoise asks for it on
+              mirrors and glass); 0 where nothing is
+    normal    [H, W, 3] world-space shading normal
+    coverage  [H, W] share of the rays that meet a surface
+    """
+
+    albedo: np.ndarray
+    normal: np.ndarray
+    coverage: np.ndarray
+
+
+class Frames:
+    """Frames of one bundle, of one size. Views are pinhole cameras in scene units.
+
+    Args:
+        integrator, max_depth: as of :meth:`.engine.Engine.integrator`.
+        size: (width, height) in pixels of all views.
+
+    Raises UserError under a scalar variant, which has no kernels to keep.
+    """
+
+    def __init__(self, engine: Engine, bundle: Path, integrator: str, max_depth: int, size: tuple[int, int]) -> None:
+        if not engine.compiled:
+            raise UserError("timing frames needs a jit variant of Mitsuba (LLVM or CUDA); see `dnrpipe doctor`")
+        self.engine, self.mi, self.size = engine, engine.mi, size
+        self.scene = engine.scenes[str(bundle)]
+        self.integrator, self.name = engine.integrator(bundle, integrator, max_depth)
+        self._path: dict[int, Any] = {}
+        self._auxiliary: dict[int, Any] = {}
+        self._gbuffer: dict[int, tuple[Any, Any]] = {}
+
+    def path(self, view: View, spp: int, seed: int) -> np.ndarray:
+        """Path-traced RGBA, linear Rec.709, premultiplied, box filter, float32 [H, W, 4]; NaN where Mitsuba gave it."""
+        if spp not in self._path:
+            self._path[spp] = self._warmed(self._path_kernel(spp), view, spp)
+        return self._image(self._path[spp](*self._inputs(view, seed, spp)))
+
+    def auxiliary(self, view: View, rays: int, seed: int) -> Auxiliary:
+        """Means over ``rays`` primary rays a pixel; a square number of them is stratified, one per cell."""
+        if rays not in self._auxiliary:
+            self._auxiliary[rays] = self._warmed(self._auxiliary_kernel(rays), view, rays)
+        image = self._image(self._auxiliary[rays](*self._inputs(view, seed, rays)))
+        return Auxiliary(image[..., :3], image[..., 3:6], image[..., 6])
+
+    def gbuffer(self, view: View, rays: int = 16) -> dict[str, np.ndarray]:
+        """The view's G-buffer without the object numbers: channels of :mod:`dnrtrain.contract`, float32 [H, W].
+
+        coverage: share of ``rays`` stratified rays. The rest is of the ray through the pixel's centre.
+        """
+        if rays not in self._gbuffer:
+            centre, cover = self._centre_kernel(), self._cover_kernel(rays)
+            self._gbuffer[rays] = self._warmed(centre, view, 1), self._warmed(cover, view, rays)
+        centre, cover = self._gbuffer[rays]
+        image = self._image([*centre(*self._inputs(view, 0, 1)), *cover(*self._inputs(view, 0, rays))])
+        axis = view.matrix[:3, 2]
+        position, mask = image[..., 5:8] / self.engine.unit_scale, image[..., 8] > 0
+        names = ("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "position.X", "position.Y", "position.Z", "mask")
+        result = {name: image[..., i] for i, name in enumerate(names)}
+        for i, name in enumerate(names[5:8]):
+            result[name] = np.where(mask, position[..., i], 0)
+        depth = (view.position - position) @ axis
+        return {**result, "depth.Z": np.where(mask, depth, 0).astype(np.float32), "coverage": image[..., 9]}
+
+    def _centre_kernel(self) -> Any:
+        import drjit as dr
+
+        mi, scene, seen = self.mi, self.scene, self._seen()
+        rays, prototype = self._rays, self.mi.load_dict({"type": "independent"})
+
+        @dr.freeze
+        def kernel(camera: list[Any], seed: Any, samples: Any) -> list[Any]:
+            sampler = prototype.fork()
+            ray = rays(sampler, camera, seed, samples, 1, 0)
+            hit = seen(scene, ray, sampler)
+            found = hit.is_valid()
+            place = hit.shape.eval_attribute_3(ATTRIBUTE, hit, found & hit.shape.has_attribute(ATTRIBUTE, found))
+            towards = dr.select(dr.dot(hit.sh_frame.n, ray.d) > 0, -hit.sh_frame.n, hit.sh_frame.n)
+            normal = dr.select(found, towards, 0)
+            values = [*normal, place[0], place[1], *hit.p, dr.select(found, mi.Float(1), mi.Float(0))]
+            values = [dr.select(found, value, 0) for value in values]
+            dr.eval(values)
+            return values
+
+        return kernel
+
+    def _cover_kernel(self, count: int) -> Any:
+        import drjit as dr
+
+        mi, scene, seen = self.mi, self.scene, self._seen()
+        rays, means, prototype = self._rays, self._means, self.mi.load_dict({"type": "independent"})
+        cells = math.isqrt(count) if math.isqrt(count) ** 2 == count else 1
+
+        @dr.freeze
+        def kernel(camera: list[Any], seed: Any, samples: Any) -> list[Any]:
+            sampler = prototype.fork()
+            hit = seen(scene, rays(sampler, camera, seed, samples, count, cells), sampler)
+            return means([dr.select(hit.is_valid(), mi.Float(1), mi.Float(0))], count)
+
+        return kernel
+
+    def _path_kernel(self, spp: int) -> Any:
+        import drjit as dr
+
+        mi, scene, integrator = self.mi, self.scene, self.integrator
+        rays, means, prototype = self._rays, self._means, mi.load_dict({"type": "independent"})
+
+        @dr.freeze
+        def kernel(camera: list[Any], seed: Any, samples: Any) -> list[Any]:
+            sampler = prototype.fork()
+            ray = rays(sampler, camera, seed, samples, spp, cells=1)
+            colour, valid, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(ray), None, mi.Bool(True))
+            colour = mi.Color3f(colour)
+            return means([colour.x, colour.y, colour.z, dr.select(valid, mi.Float(1), mi.Float(0))], spp)
+
+        return kernel
+
+    def _auxiliary_kernel(self, count: int) -> Any:
+        import drjit as dr
+
+        mi, scene = self.mi, self.scene
+        rays, means, prototype = self._rays, self._means, mi.load_dict({"type": "independent"})
+        seen, cells = self._seen(), math.isqrt(count) if math.isqrt(count) ** 2 == count else 1
+        diffuse = mi.BSDFFlags.Diffuse
+
+        @dr.freeze
+        def kernel(camera: list[Any], seed: Any, samples: Any) -> list[Any]:
+            sampler = prototype.fork()
+            hit = seen(scene, rays(sampler, camera, seed, samples, count, cells), sampler)
+            found = hit.is_valid()
+            bsdf = hit.bsdf()
+            albedo = mi.Color3f(bsdf.eval_diffuse_reflectance(hit, found))
+            albedo = dr.select(mi.has_flag(bsdf.flags(), diffuse), dr.clip(albedo, 0, 1), 1)
+            albedo, normal = dr.select(found, albedo, 0), dr.select(found, hit.sh_frame.n, 0)
+            values = [albedo.x, albedo.y, albedo.z, normal.x, normal.y, normal.z]
+            return means([*values, dr.select(found, mi.Float(1), mi.Float(0))], count)
+
+        return kernel
+
+    def _seen(self) -> Any:
+        """Function (scene, ray, sampler) -> what the pixel shows there first: lamps are passed, and what surfaces let
+
+        straight through is passed with its probability.
+        """
+        import drjit as dr
+
+        mi, visible = self.mi, first_visible_of(self.mi, self.scene)
+        lets_through = any(
+            mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null)
+            for shape in self.scene.shapes()
+            if shape.bsdf() is not None
+        )
+
+        def seen(scene: Any, ray: Any, sampler: Any) -> Any:
+            ray, hit = visible(scene, ray, mi.Bool(True))
+            if not lets_through:
+                return hit
+
+            def passes(hit: Any, sampler: Any, active: Any) -> Any:
+                bsdf = hit.bsdf()
+                null = active & hit.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
+                share = dr.mean(bsdf.eval_null_transmission(hit, null))
+                return null & (sampler.next_1d(active) < share)
+
+            def onwards(hit: Any, direction: Any, sampler: Any, active: Any) -> tuple[Any, ...]:
+                _, following = visible(scene, hit.spawn_ray(direction), active)
+                hit = dr.select(active, following, hit)
+                return hit, direction, sampler, passes(hit, sampler, active)
+
+            state = (hit, mi.Vector3f(ray.d), sampler, passes(hit, sampler, mi.Bool(True)))
+            return dr.while_loop(state, lambda hit, direction, sampler, active: active, onwards)[0]
+
+        return seen
+
+    def _rays(self, sampler: Any, camera: list[Any], seed: Any, samples: Any, count: int, cells: int) -> Any:
+        """Rays through random points of the pixels, one in each of ``cells``² cells; 0 cells: through the centres."""
+        import drjit as dr
+
+        mi, (width, height) = self.mi, self.size
+        total = width * height * count
+        sampler.seed(seed, total)
+        index = dr.arange(mi.UInt32, total)
+        pixel = index // samples
+        offset = sampler.next_2d()
+        if cells == 0:
+            offset = mi.Point2f(0.5, 0.5)
+        elif cells > 1:
+            cell = index - pixel * samples
+            offset = (mi.Point2f(cell % cells, cell // cells) + offset) / cells
+        x = (mi.Float(pixel % width) + offset.x - camera[13]) / camera[12]
+        y = (mi.Float(pixel // width) + offset.y - camera[14]) / camera[12]
+        # Camera axes are OpenGL's: y up, looking along -z; rows of c2w in camera[0:12].
+        world = [camera[4 * row] * x - camera[4 * row + 1] * y - camera[4 * row + 2] for row in range(3)]
+        return mi.Ray3f(mi.Point3f(camera[3], camera[7], camera[11]), dr.normalize(mi.Vector3f(*world)))
+
+    @staticmethod
+    def _means(values: list[Any], count: int) -> list[Any]:
+        """Means over the rays of each pixel. Evaluated together first: each sum alone would trace all again."""
+        import drjit as dr
+
+        dr.eval(values)
+        return [dr.block_sum(value, count) / count for value in values]
+
+    def _inputs(self, view: View, seed: int, samples: int) -> tuple[list[Any], Any, Any]:
+        """Camera (c2w's first three rows, focal length, principal point), seed and samples as opaque numbers."""
+        import drjit as dr
+
+        if (view.width, view.height) != self.size:
+            raise ValueError(f"view {view.name}: is {view.width}x{view.height}, the kernels are for {self.size}")
+        mi, moved = self.mi, scaled_view(view, self.engine.unit_scale)
+        numbers = (*moved.matrix[:3].ravel(), moved.fl_x, moved.cx, moved.cy)
+        camera = [dr.opaque(mi.Float, float(number)) for number in numbers]
+        return camera, dr.opaque(mi.UInt32, seed), dr.opaque(mi.UInt32, samples)
+
+    def _warmed(self, kernel: Any, view: View, samples: int) -> Any:
+        """``kernel`` after frames of several cameras and seeds: each input that changes is then known to."""
+        for turn in range(WARM_FRAMES):
+            nearer = view.model_copy(update={"fl_x": view.fl_x * (1 + 0.01 * turn), "cx": view.cx + 0.1 * turn})
+            self._image(kernel(*self._inputs(nearer, turn, samples)))
+        return kernel
+
+    def _image(self, values: list[Any]) -> np.ndarray:
+        width, height = self.size
+        return np.stack([np.array(value) for value in values], axis=-1).reshape(height, width, -1)

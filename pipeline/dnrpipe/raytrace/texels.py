@@ -1,0 +1,81 @@
+"""The scene atlas as points on surfaces: which triangle lies under a point of the atlas, and where it is in space.
+
+Notation
+    (U, V)   atlas coordinates in [0, 1)², V up; texel (row j, column i) of a side-n lightmap covers
+             [i/n, (i+1)/n) x [j/n, (j+1)/n): row 0 is V = 0
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+ATTRIBUTE = "vertex_atlas"
+OPEN_MESH = 1e-3
+"""A surface whose area vectors sum to more than this share of its area has a rim."""
+
+
+class AtlasSurface:
+    """All meshes of a scene, unfolded: answers (U, V) -> surface point by casting rays onto the unfolded triangles.
+
+    Copies that share a place of the atlas lie on top of each other; one of them answers.
+    """
+
+    def __init__(self, mi: Any, scene: Any) -> None:
+        corners, places, found, open_ = [], [], [], []
+        for shape in scene.shapes():
+            if not (shape.is_mesh() and shape.has_attribute(ATTRIBUTE)):
+                continue
+            faces = np.array(shape.faces_buffer()).reshape(-1, 3)
+            vertices = np.array(shape.vertex_positions_buffer()).reshape(-1, 3)
+            atlas = np.array(shape.attribute_buffer(ATTRIBUTE)).reshape(-1, 3)
+            corners.append(vertices[faces])
+            places.append(atlas[faces])
+            open_.append(np.full(len(faces), _has_rim(vertices[faces])))
+            found.append(shape)
+        self.mi = mi
+        self.count = sum(map(len, corners))
+        self.shapes = found
+        if not found:
+            return
+        unfolded = np.concatenate(places).reshape(-1, 3).astype(np.float32)
+        unfolded[:, 2] = 0
+        mesh = mi.Mesh("atlas", len(unfolded), self.count)
+        parameters = mi.traverse(mesh)
+        parameters["vertex_positions"] = mi.Float(unfolded.ravel())
+        parameters["faces"] = mi.UInt32(np.arange(len(unfolded), dtype=np.uint32))
+        parameters.update()
+        self.flat = mi.load_dict({"type": "scene", "atlas": mesh})
+        self.open = mi.Float(np.concatenate(open_).astype(np.float32))
+        self.corners = mi.Float(np.concatenate(corners).astype(np.float32).ravel())
+
+    def points(self, uv: Any) -> tuple[Any, Any, Any]:
+        """mi.Point2f (U, V) -> (world position, geometric normal of the triangle, whether there is a surface)."""
+        import drjit as dr
+
+        mi = self.mi
+        ray = mi.Ray3f(mi.Point3f(uv.x, uv.y, 1), mi.Vector3f(0, 0, -1))
+        hit = self.flat.ray_intersect_preliminary(ray)
+        found = hit.is_valid()
+        first = hit.prim_index * 3
+        a, b, c = (dr.gather(mi.Point3f, self.corners, first + i, found) for i in range(3))
+        place = a + (b - a) * hit.prim_uv.x + (c - a) * hit.prim_uv.y
+        normal = dr.cross(b - a, c - a)
+        length = dr.norm(normal)
+        found &= length > 0
+        return place, mi.Normal3f(normal / dr.maximum(length, 1e-30)), found
+
+    def thin(self, uv: Any) -> Any:
+        """Whether the surface at (U, V) has a rim, so that its back can be seen."""
+        import drjit as dr
+
+        mi = self.mi
+        hit = self.flat.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(uv.x, uv.y, 1), mi.Vector3f(0, 0, -1)))
+        return hit.is_valid() & (dr.gather(mi.Float, self.open, hit.prim_index, hit.is_valid()) > 0.5)
+
+
+def _has_rim(triangles: np.ndarray) -> bool:
+    """Of a closed surface [T, 3, 3] the area vectors sum to nothing (divergence theorem)."""
+    cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]).astype(np.float64)
+    return bool(np.linalg.norm(cross.sum(axis=0)) > OPEN_MESH * max(np.linalg.norm(cross, axis=1).sum(), 1e-20))

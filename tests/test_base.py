@@ -1,0 +1,174 @@
+"""Baked light and base images on scenes whose answer is known, or path-traced beside them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dnrpipe.blender.bundle.ply import weld, write_ply
+from dnrpipe.raytrace import plugins
+from dnrpipe.raytrace.base import CENTRES, MEANS, BaseRenderer
+from dnrpipe.raytrace.lightmap import LightBaker, diffuse_context
+from dnrpipe.raytrace.sensors import sensor_dict
+from dnrpipe.raytrace.variants import choose_variant
+from dnrtrain.contract import BASE_CHANNELS, View
+
+mi = pytest.importorskip("mitsuba")
+SIZE = 48
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _variant() -> None:
+    chosen = choose_variant("auto")
+    if chosen.variant.startswith("scalar"):
+        pytest.skip("base images need a jit variant of Mitsuba; this machine has none")
+    os.environ.update(chosen.environment)
+    mi.set_variant(chosen.variant)
+    plugins.register(mi)
+
+
+def rgb(*value: float) -> dict[str, Any]:
+    return {"type": "rgb", "value": list(value)}
+
+
+def quad(path: Path, corners: list[list[float]], place: tuple[float, float], bsdf: dict[str, Any]) -> dict[str, Any]:
+    """A square of two triangles; its chart is [place, place + 0.4]² of the atlas."""
+    corner = np.array(corners, np.float32)
+    order = [0, 1, 2, 0, 2, 3]
+    unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+    normal = np.cross(corner[1] - corner[0], corner[2] - corner[0])
+    normals = np.tile(normal / np.linalg.norm(normal), (6, 1)).astype(np.float32)
+    atlas = np.concatenate([unit * 0.4 + place, np.zeros((4, 1))], axis=1).astype(np.float32)
+    write_ply(path, [weld(corner[order], normals, unit[order], [("atlas", atlas[order])])])
+    return {"type": "ply", "filename": str(path), "bsdf": bsdf}
+
+
+def corner_room(folder: Path, floor: dict[str, Any], wall: dict[str, Any], light: dict[str, Any]) -> Any:
+    """A floor and a wall behind it."""
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "floor": quad(folder / "f.ply", [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], (0.05, 0.05), floor),
+            "wall": quad(folder / "w.ply", [[-1, 1, 0], [1, 1, 0], [1, 1, 1.5], [-1, 1, 1.5]], (0.55, 0.05), wall),
+            "light": light,
+        }
+    )
+
+
+def camera(azimuth: float = 0.3) -> View:
+    """Looks at the room's middle from the front, from above."""
+    at = np.array([4 * np.sin(azimuth), -4 * np.cos(azimuth), 2.0])
+    back = (at - [0, 0.3, 0.4]) / np.linalg.norm(at - [0, 0.3, 0.4])
+    right = np.cross([0, 0, 1], back)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
+    pose[:3, 3] = at
+    rows = tuple(tuple(float(x) for x in row) for row in pose)
+    return View(name="v", width=SIZE, height=SIZE, fl_x=70, fl_y=70, cx=SIZE / 2, cy=SIZE / 2, c2w=rows)
+
+
+def onwards(depth: int = 7) -> Any:
+    return mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 5, "hide_emitters": True})
+
+
+def traced(scene: Any, view: View, spp: int = 2048) -> np.ndarray:
+    integrator = mi.load_dict({"type": "path", "max_depth": 8, "hide_emitters": True})
+    sensor = mi.load_dict(sensor_dict(mi, view))
+    return np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=3))
+
+
+def rendered(scene: Any, light: np.ndarray, view: View, samples: int = 4) -> dict[str, np.ndarray]:
+    return BaseRenderer(mi, scene, light, samples).frame(view)
+
+
+def colour(channels: dict[str, np.ndarray]) -> np.ndarray:
+    return np.stack([channels[f"base.{c}"] for c in "RGBA"], axis=-1)
+
+
+def test_light_in_a_white_furnace_is_one_on_both_sides(tmp_path: Path) -> None:
+    floor = {"type": "twosided", "b": {"type": "diffuse", "reflectance": rgb(0.2, 0.5, 0.8)}}
+    shape = quad(tmp_path / "f.ply", [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], (0.05, 0.05), floor)
+    scene = mi.load_dict({"type": "scene", "floor": shape, "light": {"type": "constant"}})
+    light = LightBaker(mi, scene, onwards()).bake(32, 256, 0)
+    assert light.shape == (2, 32, 32, 3)
+    chart = light[:, 4:12, 4:12]
+    assert np.abs(chart - 1).max() < 0.1
+    assert chart.mean() == pytest.approx(1, abs=0.01)
+
+
+@pytest.mark.parametrize("kind", ["diffuse", "dnr_principled"])
+def test_base_is_the_path_traced_picture_where_all_is_diffuse(tmp_path: Path, kind: str) -> None:
+    name = "reflectance" if kind == "diffuse" else "base_color"
+    extra = {} if kind == "diffuse" else {"roughness": 0.8}
+    red, white = ({"type": kind, name: rgb(*value), **extra} for value in ((0.8, 0.2, 0.1), (0.7, 0.7, 0.7)))
+    light = {"type": "point", "position": [-0.5, 0.0, 2.0], "intensity": rgb(6, 6, 6)}
+    scene = corner_room(tmp_path, {"type": "twosided", "b": white}, {"type": "twosided", "b": red}, light)
+    baked = LightBaker(mi, scene, onwards()).bake(128, 128, 0)
+    ours, truth = colour(rendered(scene, baked, camera())), traced(scene, camera())
+    assert np.abs(ours[..., 3] - truth[..., 3]).mean() < 0.01
+    inside = (truth[..., 3] > 0.99) & (ours[..., 3] > 0.99)
+    assert ours[inside, :3].mean() == pytest.approx(truth[inside, :3].mean(), rel=0.015)
+    assert np.sqrt(np.mean((ours - truth)[inside] ** 2)) < 0.04 * truth[inside, :3].mean()
+
+
+def test_mirror_shows_the_baked_wall_and_says_where_its_path_ends(tmp_path: Path) -> None:
+    mirror = {"type": "twosided", "b": {"type": "conductor", "material": "none"}}
+    wall = {"type": "twosided", "b": {"type": "diffuse", "reflectance": rgb(0.1, 0.6, 0.2)}}
+    light = {"type": "point", "position": [0.0, -0.5, 1.5], "intensity": rgb(6, 6, 6)}
+    scene = corner_room(tmp_path, mirror, wall, light)
+    baked = LightBaker(mi, scene, onwards()).bake(64, 128, 0)
+    channels, truth = rendered(scene, baked, camera(0.0)), traced(scene, camera(0.0))
+    inside = (truth[..., 3] > 0.99) & (truth[..., 1] > 0.02)
+    error = colour(channels)[inside, :3] - truth[inside, :3]
+    assert np.sqrt(np.mean(error**2)) < 0.1 * truth[inside, :3].mean()
+    on_floor = (channels["chain.mask"] > 0) & (channels["base.A"] > 0.99)
+    assert on_floor.sum() > 50
+    # The mirrored wall's chart, at full throughput.
+    assert (channels["chain.U"][on_floor] > 0.5).all() and (channels["chain.V"][on_floor] < 0.5).all()
+    assert channels["chain.weight"][on_floor] == pytest.approx(1, abs=1e-3)
+    assert np.abs(channels["diffuse.G"][on_floor]).max() < 0.05 * channels["base.G"][on_floor].max()
+
+
+def test_frames_repeat_bit_for_bit_and_views_share_one_kernel(tmp_path: Path) -> None:
+    glossy = {"type": "twosided", "b": {"type": "roughconductor", "alpha": 0.2}}
+    wall = {"type": "twosided", "b": {"type": "diffuse"}}
+    scene = corner_room(tmp_path, glossy, wall, {"type": "constant"})
+    renderer = BaseRenderer(mi, scene, np.ones((2, 8, 8, 3), np.float32), 2)
+    first = renderer.frame(camera(0.3))
+    other = renderer.frame(camera(0.5))
+    recorded = renderer.kernel.n_recordings
+    again = renderer.frame(camera(0.3))
+    renderer.frame(camera(0.7))
+    assert set(BASE_CHANNELS) <= set(first) == set(MEANS + CENTRES)
+    assert all(np.isfinite(values).all() for values in first.values())
+    assert all(np.array_equal(first[name], again[name]) for name in first)
+    assert not np.array_equal(first["base.R"], other["base.R"])
+    assert renderer.kernel.n_recordings == recorded <= 2
+
+
+def test_lobes_of_the_principled_plugin_add_up() -> None:
+    import drjit as dr
+
+    bsdf = mi.load_dict({"type": "dnr_principled", "base_color": rgb(0.3, 0.5, 0.7), "roughness": 0.4, "metallic": 0.2})
+    si = dr.zeros(mi.SurfaceInteraction3f, 64)
+    si.wi = dr.normalize(mi.Vector3f(0.3, 0.1, 0.9)) + dr.zeros(mi.Vector3f, 64)
+    u = mi.PCG32(64)
+    wo = mi.warp.square_to_cosine_hemisphere(mi.Point2f(u.next_float32(), u.next_float32()))
+    glossy = mi.BSDFContext()
+    glossy.type_mask = mi.BSDFFlags.Glossy
+    both, parts = mi.BSDFContext(), [diffuse_context(mi), glossy]
+    whole = np.array(bsdf.eval(both, si, wo))
+    assert sum(np.array(bsdf.eval(part, si, wo)) for part in parts) == pytest.approx(whole, rel=1e-4)
+    for part in parts:
+        found, weight = bsdf.sample(part, si, u.next_float32(), mi.Point2f(u.next_float32(), u.next_float32()))
+        value, density = bsdf.eval_pdf(part, si, found.wo)
+        good = np.array(found.pdf) > 0
+        assert np.array(density)[good] == pytest.approx(np.array(found.pdf)[good], rel=1e-3)
+        ratio = np.array(value)[:, good] / np.array(density)[good]
+        assert np.array(weight)[:, good] == pytest.approx(ratio, rel=1e-3)
+    assert (np.array(found.sampled_type) == int(mi.BSDFFlags.GlossyReflection)).all()
