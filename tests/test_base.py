@@ -94,7 +94,7 @@ def test_light_in_a_white_furnace_is_one_on_both_sides(tmp_path: Path) -> None:
     floor = {"type": "twosided", "b": {"type": "diffuse", "reflectance": rgb(0.2, 0.5, 0.8)}}
     shape = quad(tmp_path / "f.ply", [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], (0.05, 0.05), floor)
     scene = mi.load_dict({"type": "scene", "floor": shape, "light": {"type": "constant"}})
-    light = LightBaker(mi, scene, onwards()).bake(32, 256, 0)
+    light = LightBaker(mi, scene, onwards()).bake(32, 4096, 0)
     assert light.shape == (2, 32, 32, 3)
     chart = light[:, 4:12, 4:12]
     assert np.abs(chart - 1).max() < 0.1
@@ -144,7 +144,7 @@ def test_frames_repeat_bit_for_bit_and_views_share_one_kernel(tmp_path: Path) ->
     recorded = renderer.kernel.n_recordings
     again = renderer.frame(camera(0.3))
     renderer.frame(camera(0.7))
-    assert set(BASE_CHANNELS) <= set(first) == set(MEANS + CENTRES)
+    assert {*BASE_CHANNELS, "coverage"} <= set(first) == {*MEANS, *CENTRES, "coverage"}
     assert all(np.isfinite(values).all() for values in first.values())
     assert all(np.array_equal(first[name], again[name]) for name in first)
     assert not np.array_equal(first["base.R"], other["base.R"])

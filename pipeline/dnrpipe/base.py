@@ -1,7 +1,8 @@
 """Base images: what the network corrects. Bakes the scene's light once, then renders views from it, on demand.
 
 Which one it is says ``model.base``: ``none``; ``raster``, the rasterised colour of the passes; ``baked``, baked light
-and specular paths; ``direct`` or ``path``, a few path-traced samples, denoised (direct light alone, or the plan's depth).
+and specular paths; ``direct`` or ``path``, a few path-traced samples, denoised (direct light alone, or the plan's
+depth).
 """
 
 from __future__ import annotations

@@ -34,9 +34,13 @@ NOISY = 0.04
 """Disagreement from which on a pixel is noisy, of the range from dark to bright."""
 MEANS = (
     *("base.R", "base.G", "base.B", "base.A", "diffuse.R", "diffuse.G", "diffuse.B"),
-    *("albedo.R", "albedo.G", "albedo.B", "normal.X", "normal.Y", "normal.Z"),
+    *("albedo.R", "albedo.G", "albedo.B"),
 )
-CENTRES = ("chain.U", "chain.V", "chain.mask", "chain.weight")
+CENTRES = (
+    *("chain.U", "chain.V", "chain.mask", "chain.weight"),
+    *("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z", "mask"),
+)
+GBUFFER = ("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z")
 IGNORE_CONTEXT = ("Principled", "PrincipledThin")
 """Mitsuba's BSDFs that do not split into lobes: all of theirs is taken for diffuse."""
 
@@ -46,10 +50,10 @@ class BaseRenderer:
 
     Args:
         light: E of the front and of the back, float32 [2, size, size, 3], row 0 at V = 0.
-        samples: S, rays per pixel.
+        samples: S, rays per pixel. adaptive: whether noisy pixels get more.
     """
 
-    def __init__(self, mi: Any, scene: Any, light: np.ndarray, samples: int) -> None:
+    def __init__(self, mi: Any, scene: Any, light: np.ndarray, samples: int, adaptive: bool = True) -> None:
         import drjit as dr
 
         self.mi, self.scene, self.samples = mi, scene, samples
@@ -60,9 +64,7 @@ class BaseRenderer:
         self.lit = bool(scene.emitters())
         bsdfs = {str(bsdf): bsdf for bsdf in (shape.bsdf() for shape in shapes) if bsdf is not None}
         self.whole = [b for text, b in bsdfs.items() if any(f"{name}[" in text for name in IGNORE_CONTEXT)]
-        self.mirrors = any(
-            mi.has_flag(b.flags(), kind) for b in bsdfs.values() for kind in (mi.BSDFFlags.Glossy, mi.BSDFFlags.Delta)
-        )
+        self.adaptive = adaptive
         self.translucent = bool(self.whole) or any(
             mi.has_flag(b.flags(), mi.BSDFFlags.DiffuseTransmission) for b in bsdfs.values()
         )
@@ -72,7 +74,9 @@ class BaseRenderer:
         self.kernel = dr.freeze(self._kernel)
 
     def frame(self, view: Any) -> dict[str, np.ndarray]:
-        """Channels of BASE_CHANNELS and ``normal.X/Y/Z``, float32 [H, W], for a view in the bundle's units.
+        """Channels of BASE_CHANNELS and of the G-buffer, float32 [H, W], for a view in the bundle's units.
+
+        ``coverage`` is base.A, and ``depth.Z`` in the bundle's units, too.
 
         Adaptive: pixels whose first samples disagree (mirrors, rough metal, edges), and those around them, get
         EXTRA times as many more. Which ones they are depends on the view alone, as all else here.
@@ -81,14 +85,17 @@ class BaseRenderer:
         everywhere = np.arange(height * width, dtype=np.uint32)
         values = self._sampled(view, everywhere, 0, samples)
         means, first = values.mean(axis=1), values[:, 0]
-        if samples > 1 and self.mirrors:
+        if self.adaptive:
             noisy = everywhere[_disagree(values[..., :3], (height, width))]
             if len(noisy):
                 more = self._sampled(view, noisy, samples, EXTRA * samples)
                 means[noisy] = (means[noisy] + EXTRA * more.mean(axis=1)) / (1 + EXTRA)
         # The first sample is the pixel's centre.
         table = np.concatenate([means[:, : len(MEANS)], first[:, len(MEANS) :]], axis=1).astype(np.float32)
-        return {name: table[:, i].reshape(height, width) for i, name in enumerate(MEANS + CENTRES)}
+        channels = {name: table[:, i].reshape(height, width) for i, name in enumerate(MEANS + CENTRES)}
+        for name in GBUFFER:
+            channels[name] = channels[name] * channels["mask"]
+        return channels | {"coverage": channels["base.A"]}
 
     def _sampled(self, view: Any, pixels: np.ndarray, start: int, samples: int) -> np.ndarray:
         """[P, samples, channels] of samples ``start`` onwards of some pixels."""
@@ -100,9 +107,10 @@ class BaseRenderer:
         m = view.matrix
         axes = [mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in m[:3, i])) for i in range(4)]
         film = [dr.opaque(mi.Float, float(v)) for v in (view.fl_x, view.fl_y, view.cx, view.cy)]
-        channels = self.kernel(
-            self.scene, self.light, self.order, mi.UInt32(pixel), mi.UInt32(sample), axes, film, view.width
-        )
+        # Memory of Dr.Jit's own: where numpy's is aligned otherwise, the kernel would be recorded once more.
+        lanes = [mi.UInt32(values) + dr.opaque(mi.UInt32, 0) for values in (pixel, sample)]
+        dr.eval(lanes)
+        channels = self.kernel(self.scene, self.light, self.order, *lanes, axes, film, view.width)
         dr.eval(channels)
         return np.stack([np.array(channel) for channel in channels], axis=-1).reshape(len(pixels), samples, -1)
 
@@ -120,7 +128,7 @@ class BaseRenderer:
         down = mi.Float(y) + _fraction(0.5 + place * GOLDEN[1]) - film[3]
         direction = axes[0] * (right / film[0]) - axes[1] * (down / film[1]) - axes[2]
         ray = mi.Ray3f(mi.Point3f(axes[3]), dr.normalize(direction))
-        return self._follow(scene, light, ray, number)
+        return self._follow(scene, light, ray, -axes[2], number)
 
     def _baked(self, light: Any, si: Any, active: Any) -> Any:
         """E at the surface point, on the side that is seen."""
@@ -133,11 +141,15 @@ class BaseRenderer:
         found = [mi.Spectrum(*texture.eval(uv, active)) for texture in light]
         return dr.select(front, found[0], found[1]), uv
 
-    def _follow(self, scene: Any, light: Any, ray: Any, number: Any) -> list[Any]:
-        """One sample along each ray: the values named by MEANS and CENTRES. number: its place in the sequence."""
+    def _follow(self, scene: Any, light: Any, ray: Any, forward: Any, number: Any) -> list[Any]:
+        """One sample along each ray: the values named by MEANS and CENTRES.
+
+        forward: where the camera looks. number: the sample's place in the sequence.
+        """
         import drjit as dr
 
         mi = self.mi
+        origin = mi.Point3f(ray.o)
         smooth = diffuse_context(mi)
         rest = mi.BSDFContext()
         rest.type_mask = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Diffuse)
@@ -170,7 +182,10 @@ class BaseRenderer:
             diffuse = s["diffuse"] + dr.select(primary, here, 0)
             albedo = s["albedo"] + dr.select(primary & met, s["throughput"] * rho, 0)
             turned = dr.select(si.wi.z < 0, -si.sh_frame.n, si.sh_frame.n)
-            normal = dr.select(primary & met, mi.Vector3f(turned), s["normal"])
+            front = primary & met
+            normal = dr.select(front, mi.Vector3f(turned), s["normal"])
+            place = dr.select(front, uv, s["uv"])
+            depth = dr.select(front, dr.dot(si.p - origin, forward), s["depth"])
             ends = met & ~straight & ~s["ended"] & (dr.mean(rho) > 0.05)
             chain_uv = dr.select(ends, uv, s["chain_uv"])
             chain_weight = dr.select(ends, dr.mean(s["throughput"]), s["chain_weight"])
@@ -202,6 +217,8 @@ class BaseRenderer:
                 "diffuse": diffuse,
                 "albedo": albedo,
                 "normal": normal,
+                "uv": place,
+                "depth": depth,
                 "covered": s["covered"] | (met & ~(null & alive)),
                 "before": dr.select(onwards & ~null, si, s["before"]),
                 "density": dr.select(null, s["density"], bounce.pdf),
@@ -222,6 +239,8 @@ class BaseRenderer:
             "diffuse": mi.Spectrum(0.0),
             "albedo": mi.Spectrum(0.0),
             "normal": mi.Vector3f(0.0),
+            "uv": mi.Point2f(0.0),
+            "depth": mi.Float(0.0),
             "covered": mi.Mask(False),
             "before": dr.zeros(mi.SurfaceInteraction3f),
             "density": mi.Float(1.0),
@@ -241,24 +260,22 @@ class BaseRenderer:
         done = dr.while_loop(tuple(state.values()), lambda *values: values[0], unpacked)
         s = dict(zip(names, done, strict=True))
         covered, ended = (dr.select(s[name], mi.Float(1), 0) for name in ("covered", "ended"))
-        colours = (s[name] for name in ("diffuse", "albedo", "normal"))
-        return [
-            *s["total"],
-            covered,
-            *(c for colour in colours for c in colour),
-            *s["chain_uv"],
-            ended,
-            s["chain_weight"],
-        ]
+        chain = [*s["chain_uv"], ended, s["chain_weight"]]
+        return [*s["total"], covered, *s["diffuse"], *s["albedo"], *chain, *s["normal"], *s["uv"], s["depth"], covered]
 
 
 def _disagree(radiance: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """bool [H * W]: pixels whose samples [P, S, 3] differ after tone mapping, and their eight neighbours."""
-    level = radiance.mean(axis=-1)
-    shown = level / (level + max(float(level.mean()), 1e-12))
-    spread = (shown.max(axis=1) - shown.min(axis=1)).reshape(shape)
-    padded = np.pad(spread > NOISY, 1)
+    """bool [H * W]: pixels whose samples [P, S, 3] differ after tone mapping, and their eight neighbours.
+
+    A single sample is compared with those of the pixels to the right and below.
+    """
     height, width = shape
+    level = radiance.mean(axis=-1)
+    shown = (level / (level + max(float(level.mean()), 1e-12))).reshape(height, width, -1)
+    if shown.shape[2] == 1:
+        wide = np.pad(shown[..., 0], ((0, 1), (0, 1)), mode="edge")
+        shown = np.stack([wide[i : i + height, j : j + width] for i in (0, 1) for j in (0, 1)], axis=-1)
+    padded = np.pad(np.ptp(shown, axis=-1) > NOISY, 1)
     around = [padded[i : i + height, j : j + width] for i in range(3) for j in range(3)]
     return np.logical_or.reduce(around).ravel()
 

@@ -66,6 +66,7 @@ class Worker:
 
     def _channels(self, view: View) -> dict[str, np.ndarray]:
         channels = self.renderer.frame(scaled_view(view, self.engine.unit_scale))
+        channels["depth.Z"] = channels["depth.Z"] / self.engine.unit_scale
         if self.common["kind"] != "baked":
             channels |= self._traced(view, channels)
         return channels
