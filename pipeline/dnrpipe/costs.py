@@ -219,7 +219,8 @@ def upfront_seconds(records: Sequence[CostRecord], only: Collection[str] | None 
     for record in records:
         if record.purpose != "training" or record.cache_hit:
             continue
-        if record.stage == "raytrace" and only is not None and record.name not in only:
+        unwanted = only is not None and record.name.removeprefix("base/") not in only
+        if record.stage == "raytrace" and record.unit == "view" and unwanted:
             continue
         latest[(record.stage, record.unit, record.name)] = record
     return total(latest.values()).wall_seconds

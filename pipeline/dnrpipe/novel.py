@@ -61,8 +61,7 @@ def render_novel(
             path.unlink()
     write_json(stamp_file, stamp)
     write_cameras(folder / "cameras.json", views, name)
-    paths = [folder / "gbuffers" / f"{view.name}.exr" for view in views]
-    _gbuffers(workspace, settings, console, views, paths, run_id)
+    paths = _inputs(workspace, settings, console, views, folder, run_id)
     kind = settings.model.base
     bases = [folder / "base" / f"{view.name}.exr" for view in views]
     base_views(
@@ -82,7 +81,7 @@ def render_novel(
     pictures: list[np.ndarray] = []
     seconds: list[float] = []
     with console.bar("frames", len(views)) as bar:
-        for view, path, base in zip(views, paths, bases, strict=True):
+        for view, path in zip(views, paths, strict=True):
             data = load_views(
                 [path],
                 None,
@@ -91,7 +90,7 @@ def render_novel(
                 folder=workspace.scene,
                 target=False,
                 base=kind,
-                base_files=[base] if kind in RENDERED else None,
+                base_files=[path] if kind in RENDERED else None,
             ).to(device)
             started = time.perf_counter()
             picture = render_views(model, data)[0].float().clamp(0, 1).permute(1, 2, 0).cpu().numpy()
@@ -177,6 +176,39 @@ def write_webp(path: Path, pictures: Sequence[np.ndarray]) -> None:
         first.save(temporary, save_all=True, append_images=rest, duration=1000 // FPS, loop=0, quality=85)
 
 
+def _inputs(
+    workspace: Workspace, settings: Settings, console: Console, views: Sequence[View], frames: Path, run_id: str
+) -> list[Path]:
+    """Files with what the network sees of each view. Base images that are rendered bring the G-buffer along."""
+    if settings.model.base in RENDERED:
+        paths = [frames / "base" / f"{view.name}.exr" for view in views]
+        _drop_strangers(paths)
+        base_views(
+            workspace,
+            settings,
+            console,
+            run_id,
+            views=views,
+            split="novel",
+            stage="render",
+            purpose="inference",
+            paths=paths,
+        )
+        return paths
+    paths = [frames / "gbuffers" / f"{view.name}.exr" for view in views]
+    _drop_strangers(paths)
+    _gbuffers(workspace, settings, console, views, paths, run_id)
+    return paths
+
+
+def _drop_strangers(paths: Sequence[Path]) -> None:
+    folder = paths[0].parent
+    if folder.exists():
+        wanted = {path.name for path in paths}
+        if any(path.name not in wanted for path in folder.glob("[!.]*.exr")):
+            shutil.rmtree(folder)
+
+
 def _gbuffers(
     workspace: Workspace,
     settings: Settings,
@@ -185,11 +217,6 @@ def _gbuffers(
     paths: Sequence[Path],
     run_id: str,
 ) -> None:
-    folder = paths[0].parent
-    if folder.exists():
-        wanted = {path.name for path in paths}
-        if any(path.name not in wanted for path in folder.glob("[!.]*.exr")):
-            shutil.rmtree(folder)
     scene_print = scene_fingerprint(workspace)
     raster = settings.model.base == "raster"
     engine = workspace.manifest.stages["prepare"].detail["raster_engine"] if raster else "cycles-direct"

@@ -45,6 +45,7 @@ class TestView(_Frozen):
     noise_share: float | None
     seconds_traced: float | None
     seconds_neural: float | None
+    seconds_base: float | None
     spp: int | None
     truth: Picture | None
     prediction: Picture | None
@@ -72,7 +73,8 @@ class Quality(_Frozen):
     """Held-out quality. ``views`` are sorted from the worst PSNR to the best.
 
     neural_seconds: the network alone; gbuffer_seconds: Blender's passes of such a view (None where the
-    ledger has none); frame_seconds: both; traced_seconds: path tracing. All per frame, on the wall clock.
+    ledger has none), or the base image where one is rendered (``based``);
+    frame_seconds: both; traced_seconds: path tracing. All per frame, on the wall clock.
     perceptual: LPIPS weights were there for measuring; trained_with_perceptual: L_p was among the losses.
     """
 
@@ -84,6 +86,7 @@ class Quality(_Frozen):
     device: str
     neural_seconds: float | None
     gbuffer_seconds: float | None
+    based: bool
     frame_seconds: float | None
     traced_seconds: float | None
     spp: list[int]

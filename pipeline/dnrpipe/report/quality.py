@@ -42,6 +42,7 @@ class ViewMetrics(BaseModel):
     ceiling_psnr: float | None = None
     seconds_traced: float | None = None
     seconds_neural: float | None = None
+    seconds_base: float | None = None
     spp: int | None = None
 
 
@@ -76,7 +77,9 @@ def build_quality(root: Path, metrics: Metrics, records: Sequence[CostRecord]) -
     seconds = booked or timed
     measured = [v.seconds_neural for v in views if v.seconds_neural is not None]
     neural = metrics.neural_ms / 1000 if metrics.neural_ms is not None else _mean(measured)
-    gbuffer = _mean(list(passes.values()))
+    # A base image that is rendered brings its G-buffer along.
+    bases = [v.seconds_base for v in views if v.seconds_base is not None]
+    gbuffer = _mean(bases or list(passes.values()))
     ceilings = [v.ceiling_psnr for v in views if v.ceiling_psnr is not None]
     shares = [v.noise_share for v in views if v.noise_share is not None]
     return Quality(
@@ -90,6 +93,7 @@ def build_quality(root: Path, metrics: Metrics, records: Sequence[CostRecord]) -
         device=metrics.device,
         neural_seconds=neural,
         gbuffer_seconds=gbuffer,
+        based=bool(bases),
         frame_seconds=None if neural is None else neural + (gbuffer or 0.0),
         traced_seconds=_mean(seconds),
         spp=sorted({v.spp for v in views if v.spp is not None}),

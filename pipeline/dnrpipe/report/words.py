@@ -51,7 +51,7 @@ def verdict(quality: Quality | None, selection: Selection | None) -> str:
         return text + "."
     text += f", at {duration(quality.neural_seconds)} per frame"
     if quality.gbuffer_seconds is not None:
-        text += f" plus {duration(quality.gbuffer_seconds)} for its G-buffer"
+        text += f" plus {duration(quality.gbuffer_seconds)} for its {'base image' if quality.based else 'G-buffer'}"
     if quality.traced_seconds is None:
         return text + "."
     if quality.traced_seconds <= quality.frame_seconds:
