@@ -28,7 +28,7 @@ from .settings import Settings
 from .tasks import run_view_tasks, task_name, view_record
 from .workspace import Workspace, digest
 
-BASE_VERSION = 1
+LIGHT_VERSION, BASE_VERSION = 1, 2
 RENDERED = ("baked", "direct", "path")
 """Kinds of base images that are rendered into files of their own."""
 AUTOMATIC_TEXELS = 4
@@ -137,7 +137,7 @@ def _prepared(
             "max_depth": config["max_depth"],
             "seed": settings.raytrace.seed,
         }
-        task["fingerprint"] = digest([BASE_VERSION, light, {k: v for k, v in task.items() if k != "output"}])
+        task["fingerprint"] = digest([LIGHT_VERSION, light, {k: v for k, v in task.items() if k != "output"}])
         _bake(workspace, console, run_id, stage, common, choice.environment, task)
         return common, choice.environment, digest([task["fingerprint"], chosen.samples])
     direct = kind == "direct"

@@ -7,6 +7,7 @@ scene.dnr/
   passes/<split>/<view>.exr     G-buffers and rasterised colour
   selection.json                the chosen views, in order
   raytraced/<split>/<view>.exr  path-traced views
+  base/                         baked light; base images, base/<split>/<view>.exr
   checkpoints/{step1,step2}/    weights and histories
   evaluation/  renders/  report/  logs/
   costs.jsonl                   the ledger

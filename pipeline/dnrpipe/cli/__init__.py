@@ -13,6 +13,7 @@ import click
 
 from .. import __version__
 from . import information, pictures, scene, stages
+from .ablate import ablate
 
 
 class _Group(click.Group):
@@ -52,6 +53,7 @@ for _command in (
     pictures.render,
     pictures.report,
     stages.run,
+    ablate,
     information.status,
     information.costs,
     information.doctor,

@@ -14,6 +14,7 @@ light sources can be hit, emitter sampling serves the first glossy vertex, and m
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -23,10 +24,11 @@ from .texels import ATTRIBUTE
 from .visibility import LAMP_PREFIX, UNSEEN_PREFIX, is_one_of
 
 TILE = 4
-MAX_VERTICES = 10
+MAX_VERTICES = 8
 GOLDEN = (0.7548776662466927, 0.5698402909980532)
 """Steps of the two-dimensional R2 sequence (Roberts 2018)."""
-STEPS = (*GOLDEN, 0.8191725133961645)
+NUMBERS = 5
+"""Random numbers per vertex: two for the direction, one for the lobe, two for the emitter."""
 LEAST_THROUGHPUT = 1e-3
 EXTRA = 4
 """Further samples of noisy pixels, as a multiple of the first ones."""
@@ -43,6 +45,15 @@ CENTRES = (
 GBUFFER = ("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z")
 IGNORE_CONTEXT = ("Principled", "PrincipledThin")
 """Mitsuba's BSDFs that do not split into lobes: all of theirs is taken for diffuse."""
+
+
+def _steps() -> list[float]:
+    """Steps of Kronecker sequences, one per number that a path needs: independent, so that no bounce follows another.
+
+    The first two are the R2 sequence's, the others the roots of primes.
+    """
+    primes = [n for n in range(5, 300) if all(n % d for d in range(2, math.isqrt(n) + 1))]
+    return [*GOLDEN, *(math.sqrt(prime) % 1 for prime in primes)][: NUMBERS * (MAX_VERTICES + 1)]
 
 
 class BaseRenderer:
@@ -69,7 +80,7 @@ class BaseRenderer:
             mi.has_flag(b.flags(), mi.BSDFFlags.DiffuseTransmission) for b in bsdfs.values()
         )
         order = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]], np.uint32)  # Bayer
-        self.order = mi.UInt32(order.ravel())
+        self.tables = mi.UInt32(order.ravel()), mi.Float(np.array(_steps(), np.float32))
         # Recorded at the first call: tracing the plugins anew would take longer than the frame itself.
         self.kernel = dr.freeze(self._kernel)
 
@@ -110,25 +121,25 @@ class BaseRenderer:
         # Memory of Dr.Jit's own: where numpy's is aligned otherwise, the kernel would be recorded once more.
         lanes = [mi.UInt32(values) + dr.opaque(mi.UInt32, 0) for values in (pixel, sample)]
         dr.eval(lanes)
-        channels = self.kernel(self.scene, self.light, self.order, *lanes, axes, film, view.width)
+        channels = self.kernel(self.scene, self.light, self.tables, *lanes, axes, film, view.width)
         dr.eval(channels)
         return np.stack([np.array(channel) for channel in channels], axis=-1).reshape(len(pixels), samples, -1)
 
     def _kernel(
-        self, scene: Any, light: Any, order: Any, pixel: Any, sample: Any, axes: Any, film: Any, width: int
+        self, scene: Any, light: Any, tables: Any, pixel: Any, sample: Any, axes: Any, film: Any, width: int
     ) -> list[Any]:
         """One sample of each pixel named. All that varies comes in as data: recorded once, replayed for every view."""
         import drjit as dr
 
         mi = self.mi
         x, y = pixel % width, pixel // width
-        tile = dr.gather(mi.UInt32, order, (y % TILE) * TILE + x % TILE)
+        tile = dr.gather(mi.UInt32, tables[0], (y % TILE) * TILE + x % TILE)
         number, place = mi.Float(sample * (TILE * TILE) + tile), mi.Float(sample)
         right = mi.Float(x) + _fraction(0.5 + place * GOLDEN[0]) - film[2]
         down = mi.Float(y) + _fraction(0.5 + place * GOLDEN[1]) - film[3]
         direction = axes[0] * (right / film[0]) - axes[1] * (down / film[1]) - axes[2]
         ray = mi.Ray3f(mi.Point3f(axes[3]), dr.normalize(direction))
-        return self._follow(scene, light, ray, -axes[2], number)
+        return self._follow(scene, light, tables[1], ray, -axes[2], number)
 
     def _baked(self, light: Any, si: Any, active: Any) -> Any:
         """E at the surface point, on the side that is seen."""
@@ -141,7 +152,7 @@ class BaseRenderer:
         found = [mi.Spectrum(*texture.eval(uv, active)) for texture in light]
         return dr.select(front, found[0], found[1]), uv
 
-    def _follow(self, scene: Any, light: Any, ray: Any, forward: Any, number: Any) -> list[Any]:
+    def _follow(self, scene: Any, light: Any, steps: Any, ray: Any, forward: Any, number: Any) -> list[Any]:
         """One sample along each ray: the values named by MEANS and CENTRES.
 
         forward: where the camera looks. number: the sample's place in the sequence.
@@ -157,8 +168,8 @@ class BaseRenderer:
         glossy.type_mask = mi.BSDFFlags.Glossy
 
         def uniform(vertex: Any, dimension: int) -> Any:
-            shift = mi.Float(vertex) * 0.31415926 + 0.173 * dimension
-            return _fraction(shift + number * STEPS[dimension])
+            step = dr.gather(mi.Float, steps, vertex * NUMBERS + dimension)
+            return _fraction(0.5 + number * step)
 
         def step(s: dict[str, Any]) -> dict[str, Any]:
             active, straight = s["active"], s["straight"]
@@ -189,11 +200,11 @@ class BaseRenderer:
             ends = met & ~straight & ~s["ended"] & (dr.mean(rho) > 0.05)
             chain_uv = dr.select(ends, uv, s["chain_uv"])
             chain_weight = dr.select(ends, dr.mean(s["throughput"]), s["chain_weight"])
-            # Emitters, once, through glossy lobes
+            # Emitters, once, through glossy lobes: measured, further vertices cost more than they bring
             onwards = met & ~_has(mi, bsdf, self.whole)
             rough = onwards & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) & ~s["lit"]
             if self.lit:
-                pair = mi.Point2f(uniform(s["vertex"] + 17, 0), uniform(s["vertex"] + 17, 1))
+                pair = mi.Point2f(uniform(s["vertex"], 3), uniform(s["vertex"], 4))
                 toward, arriving = scene.sample_emitter_direction(si, pair, True, rough)
                 value, other = bsdf.eval_pdf(glossy, si, si.to_local(toward.d), rough & (toward.pdf > 0))
                 share = dr.select(toward.delta, 1, _power(toward.pdf, other))

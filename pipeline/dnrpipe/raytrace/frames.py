@@ -62,7 +62,8 @@ class Frames:
         self.integrator, self.name = engine.integrator(bundle, integrator, max_depth)
         self._path: dict[int, Any] = {}
         self._auxiliary: dict[int, Any] = {}
-        self._gbuffer: dict[int, tuple[Any, Any]] = {}
+        self._centre: Any = None
+        self._cover: dict[int, Any] = {}
 
     def path(self, view: View, spp: int, seed: int) -> np.ndarray:
         """Path-traced RGBA, linear Rec.709, premultiplied, box filter, float32 [H, W, 4]; NaN where Mitsuba gave it."""
@@ -80,13 +81,11 @@ class Frames:
     def gbuffer(self, view: View, rays: int = 16) -> dict[str, np.ndarray]:
         """The view's G-buffer without the object numbers: channels of :mod:`dnrtrain.contract`, float32 [H, W].
 
-        coverage: share of ``rays`` stratified rays. The rest is of the ray through the pixel's centre.
+        coverage: as of :meth:`coverage`. The rest is of the ray through the pixel's centre.
         """
-        if rays not in self._gbuffer:
-            centre, cover = self._centre_kernel(), self._cover_kernel(rays)
-            self._gbuffer[rays] = self._warmed(centre, view, 1), self._warmed(cover, view, rays)
-        centre, cover = self._gbuffer[rays]
-        image = self._image([*centre(*self._inputs(view, 0, 1)), *cover(*self._inputs(view, 0, rays))])
+        if self._centre is None:
+            self._centre = self._warmed(self._centre_kernel(), view, 1)
+        image = self._image(self._centre(*self._inputs(view, 0, 1)))
         axis = view.matrix[:3, 2]
         position, mask = image[..., 5:8] / self.engine.unit_scale, image[..., 8] > 0
         names = ("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "position.X", "position.Y", "position.Z", "mask")
@@ -94,7 +93,52 @@ class Frames:
         for i, name in enumerate(names[5:8]):
             result[name] = np.where(mask, position[..., i], 0)
         depth = (view.position - position) @ axis
-        return {**result, "depth.Z": np.where(mask, depth, 0).astype(np.float32), "coverage": image[..., 9]}
+        result["depth.Z"] = np.where(mask, depth, 0).astype(np.float32)
+        return result | {"coverage": self.coverage(view, mask, rays)}
+
+    def coverage(self, view: View, mask: np.ndarray, rays: int = 16) -> np.ndarray:
+        """Share of the pixel that surfaces cover, float32 [H, W]: of ``rays`` (a square number) in a regular grid.
+
+        mask: bool [H, W], whether the ray through the pixel's centre meets a surface. Only pixels that differ from a
+        neighbour are looked at (a tenth, as a rule); where surfaces let light straight through, all are, at random.
+        """
+        if rays not in self._cover:
+            kernel = self._cover_kernel(rays) if self._lets_through() else self._edge_kernel(rays)
+            self._cover[rays] = self._warmed(kernel, view, rays) if self._lets_through() else kernel
+        kernel = self._cover[rays]
+        if self._lets_through():
+            return self._image(kernel(*self._inputs(view, 0, rays)))[..., 0]
+        edges = np.flatnonzero(_differs(mask))
+        result = mask.astype(np.float32)
+        if len(edges):
+            import drjit as dr
+
+            camera, _, samples = self._inputs(view, 0, rays)
+            # Memory of Dr.Jit's own: where numpy's is aligned otherwise, the kernel would be recorded once more.
+            lanes = self.mi.UInt32(edges.repeat(rays).astype(np.uint32)) + dr.opaque(self.mi.UInt32, 0)
+            places = self.mi.UInt32(np.tile(np.arange(rays, dtype=np.uint32), len(edges))) + dr.opaque(
+                self.mi.UInt32, 0
+            )
+            dr.eval(lanes, places)
+            (hits,) = kernel(camera, lanes, places)
+            result.ravel()[edges] = np.array(hits).reshape(-1, rays).mean(axis=1)
+        return result
+
+    def _edge_kernel(self, count: int) -> Any:
+        import drjit as dr
+
+        mi, scene, seen, pinhole = self.mi, self.scene, self._seen(), self._pinhole
+        cells = math.isqrt(count)
+        if cells * cells != count:
+            raise ValueError(f"rays: is {count}, expected a square number")
+
+        @dr.freeze
+        def kernel(camera: list[Any], pixel: Any, place: Any) -> list[Any]:
+            offset = (mi.Point2f(place % cells, place // cells) + 0.5) / cells
+            hit = seen(scene, pinhole(camera, pixel, offset), None)
+            return [dr.select(hit.is_valid(), mi.Float(1), mi.Float(0))]
+
+        return kernel
 
     def _centre_kernel(self) -> Any:
         import drjit as dr
@@ -171,6 +215,11 @@ class Frames:
 
         return kernel
 
+    def _lets_through(self) -> bool:
+        """Whether a surface of the scene passes light straight on."""
+        bsdfs = [shape.bsdf() for shape in self.scene.shapes() if shape.bsdf() is not None]
+        return any(self.mi.has_flag(bsdf.flags(), self.mi.BSDFFlags.Null) for bsdf in bsdfs)
+
     def _seen(self) -> Any:
         """Function (scene, ray, sampler) -> what the pixel shows there first: lamps are passed, and what surfaces let
 
@@ -179,11 +228,7 @@ class Frames:
         import drjit as dr
 
         mi, visible = self.mi, first_visible_of(self.mi, self.scene)
-        lets_through = any(
-            mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null)
-            for shape in self.scene.shapes()
-            if shape.bsdf() is not None
-        )
+        lets_through = self._lets_through()
 
         def seen(scene: Any, ray: Any, sampler: Any) -> Any:
             ray, hit = visible(scene, ray, mi.Bool(True))
@@ -221,6 +266,13 @@ class Frames:
         elif cells > 1:
             cell = index - pixel * samples
             offset = (mi.Point2f(cell % cells, cell // cells) + offset) / cells
+        return self._pinhole(camera, pixel, offset)
+
+    def _pinhole(self, camera: list[Any], pixel: Any, offset: Any) -> Any:
+        """Rays through places (0..1, 0..1) of pixels, numbered row by row."""
+        import drjit as dr
+
+        mi, width = self.mi, self.size[0]
         x = (mi.Float(pixel % width) + offset.x - camera[13]) / camera[12]
         y = (mi.Float(pixel // width) + offset.y - camera[14]) / camera[12]
         # Camera axes are OpenGL's: y up, looking along -z; rows of c2w in camera[0:12].
@@ -256,3 +308,11 @@ class Frames:
     def _image(self, values: list[Any]) -> np.ndarray:
         width, height = self.size
         return np.stack([np.array(value) for value in values], axis=-1).reshape(height, width, -1)
+
+
+def _differs(mask: np.ndarray) -> np.ndarray:
+    """bool [H, W]: pixels that have an unlike pixel among their eight neighbours."""
+    padded = np.pad(mask, 1, mode="edge")
+    height, width = mask.shape
+    shifted = [padded[i : i + height, j : j + width] for i in range(3) for j in range(3)]
+    return np.any(shifted, axis=0) & ~np.all(shifted, axis=0)
