@@ -9,7 +9,7 @@ APT     := libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1 li
 APT_DEV := chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system browser demo test lint types imports docs docs-check bench bench-effects fidelity scenes clean
+.PHONY: help setup system browser demo test lint types imports docs docs-check bench bench-effects bench-frames fidelity scenes clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -47,17 +47,23 @@ types: $(STAMP)
 imports: $(STAMP)
 	$(BIN)/lint-imports
 
-docs: $(STAMP)  ## regenerate the CLI reference from --help
+docs: $(STAMP)  ## regenerate the CLI reference from --help, the ablation's tables from its results
 	$(BIN)/python tools/cli_reference.py docs/cli.md
+	$(BIN)/python tools/ablation_docs.py docs/ablation.md
 
 docs-check: $(STAMP)
 	$(BIN)/python tools/cli_reference.py --check docs/cli.md
+	$(BIN)/python tools/ablation_docs.py --check docs/ablation.md
 
 bench-effects: setup  ## the effect plan against "everything on", on the benchmark scenes
 	$(BIN)/python tools/bench_effects.py
 
 bench: setup  ## time the parts that the README speaks of
 	$(BIN)/python tools/bench.py
+
+FRAMES := $(DEMO)/demo.dnr
+bench-frames: setup  ## our frames against path tracing + denoiser at equal time; FRAMES=... names workspaces
+	$(BIN)/python -m tools.bench_frames $(FRAMES)
 
 fidelity: setup  ## Cycles against our conversion, one feature a scene: docs/fidelity.md
 	$(BIN)/python -m tools.fidelity --docs docs --jobs $$(nproc)

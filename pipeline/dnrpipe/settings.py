@@ -74,9 +74,7 @@ class BaseSettings(Strict):
         default="auto", description="texels of the baked light's side; auto: about one a pixel"
     )
     light_spp: int = Field(default=128, ge=1, le=1_000_000, description="paths per texel of the baked light")
-    samples: int = Field(
-        default=2, ge=1, le=64, description="rays per pixel of a base image; noisy pixels get four times as many more"
-    )
+    samples: int = Field(default=8, ge=1, le=64, description="rays per pixel of a base image")
     spp: int = Field(default=4, ge=1, le=1_000_000, description="path-traced samples of the kinds direct and path")
 
 

@@ -30,10 +30,6 @@ GOLDEN = (0.7548776662466927, 0.5698402909980532)
 NUMBERS = 5
 """Random numbers per vertex: two for the direction, one for the lobe, two for the emitter."""
 LEAST_THROUGHPUT = 1e-3
-EXTRA = 4
-"""Further samples of noisy pixels, as a multiple of the first ones."""
-NOISY = 0.04
-"""Disagreement from which on a pixel is noisy, of the range from dark to bright."""
 MEANS = (
     *("base.R", "base.G", "base.B", "base.A", "diffuse.R", "diffuse.G", "diffuse.B"),
     *("albedo.R", "albedo.G", "albedo.B"),
@@ -61,10 +57,10 @@ class BaseRenderer:
 
     Args:
         light: E of the front and of the back, float32 [2, size, size, 3], row 0 at V = 0.
-        samples: S, rays per pixel. adaptive: whether noisy pixels get more.
+        samples: S, rays per pixel.
     """
 
-    def __init__(self, mi: Any, scene: Any, light: np.ndarray, samples: int, adaptive: bool = True) -> None:
+    def __init__(self, mi: Any, scene: Any, light: np.ndarray, samples: int) -> None:
         import drjit as dr
 
         self.mi, self.scene, self.samples = mi, scene, samples
@@ -75,7 +71,6 @@ class BaseRenderer:
         self.lit = bool(scene.emitters())
         bsdfs = {str(bsdf): bsdf for bsdf in (shape.bsdf() for shape in shapes) if bsdf is not None}
         self.whole = [b for text, b in bsdfs.items() if any(f"{name}[" in text for name in IGNORE_CONTEXT)]
-        self.adaptive = adaptive
         self.translucent = bool(self.whole) or any(
             mi.has_flag(b.flags(), mi.BSDFFlags.DiffuseTransmission) for b in bsdfs.values()
         )
@@ -88,33 +83,24 @@ class BaseRenderer:
         """Channels of BASE_CHANNELS and of the G-buffer, float32 [H, W], for a view in the bundle's units.
 
         ``coverage`` is base.A, and ``depth.Z`` in the bundle's units, too.
-
-        Adaptive: pixels whose first samples disagree (mirrors, rough metal, edges), and those around them, get
-        EXTRA times as many more. Which ones they are depends on the view alone, as all else here.
         """
-        height, width, samples = view.height, view.width, self.samples
-        everywhere = np.arange(height * width, dtype=np.uint32)
-        values = self._sampled(view, everywhere, 0, samples)
-        means, first = values.mean(axis=1), values[:, 0]
-        if self.adaptive:
-            noisy = everywhere[_disagree(values[..., :3], (height, width))]
-            if len(noisy):
-                more = self._sampled(view, noisy, samples, EXTRA * samples)
-                means[noisy] = (means[noisy] + EXTRA * more.mean(axis=1)) / (1 + EXTRA)
-        # The first sample is the pixel's centre.
+        height, width = view.height, view.width
+        values = self._sampled(view)
+        means, first = values.mean(axis=1), values[:, 0]  # the first sample is the pixel's centre
         table = np.concatenate([means[:, : len(MEANS)], first[:, len(MEANS) :]], axis=1).astype(np.float32)
         channels = {name: table[:, i].reshape(height, width) for i, name in enumerate(MEANS + CENTRES)}
         for name in GBUFFER:
             channels[name] = channels[name] * channels["mask"]
         return channels | {"coverage": channels["base.A"]}
 
-    def _sampled(self, view: Any, pixels: np.ndarray, start: int, samples: int) -> np.ndarray:
-        """[P, samples, channels] of samples ``start`` onwards of some pixels."""
+    def _sampled(self, view: Any) -> np.ndarray:
+        """[H * W, S, channels]."""
         import drjit as dr
 
         mi = self.mi
-        pixel = np.repeat(pixels.astype(np.uint32), samples)
-        sample = np.tile(np.arange(start, start + samples, dtype=np.uint32), len(pixels))
+        pixels = view.width * view.height
+        pixel = np.repeat(np.arange(pixels, dtype=np.uint32), self.samples)
+        sample = np.tile(np.arange(self.samples, dtype=np.uint32), pixels)
         m = view.matrix
         axes = [mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in m[:3, i])) for i in range(4)]
         film = [dr.opaque(mi.Float, float(v)) for v in (view.fl_x, view.fl_y, view.cx, view.cy)]
@@ -123,7 +109,7 @@ class BaseRenderer:
         dr.eval(lanes)
         channels = self.kernel(self.scene, self.light, self.tables, *lanes, axes, film, view.width)
         dr.eval(channels)
-        return np.stack([np.array(channel) for channel in channels], axis=-1).reshape(len(pixels), samples, -1)
+        return np.stack([np.array(channel) for channel in channels], axis=-1).reshape(pixels, self.samples, -1)
 
     def _kernel(
         self, scene: Any, light: Any, tables: Any, pixel: Any, sample: Any, axes: Any, film: Any, width: int
@@ -273,22 +259,6 @@ class BaseRenderer:
         covered, ended = (dr.select(s[name], mi.Float(1), 0) for name in ("covered", "ended"))
         chain = [*s["chain_uv"], ended, s["chain_weight"]]
         return [*s["total"], covered, *s["diffuse"], *s["albedo"], *chain, *s["normal"], *s["uv"], s["depth"], covered]
-
-
-def _disagree(radiance: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """bool [H * W]: pixels whose samples [P, S, 3] differ after tone mapping, and their eight neighbours.
-
-    A single sample is compared with those of the pixels to the right and below.
-    """
-    height, width = shape
-    level = radiance.mean(axis=-1)
-    shown = (level / (level + max(float(level.mean()), 1e-12))).reshape(height, width, -1)
-    if shown.shape[2] == 1:
-        wide = np.pad(shown[..., 0], ((0, 1), (0, 1)), mode="edge")
-        shown = np.stack([wide[i : i + height, j : j + width] for i in (0, 1) for j in (0, 1)], axis=-1)
-    padded = np.pad(np.ptp(shown, axis=-1) > NOISY, 1)
-    around = [padded[i : i + height, j : j + width] for i in range(3) for j in range(3)]
-    return np.logical_or.reduce(around).ravel()
 
 
 def _fraction(x: Any) -> Any:

@@ -21,9 +21,9 @@ from dnrpipe.errors import UserError
 from dnrtrain.contract import View
 
 from .engine import Engine
+from .frames_rays import lets_through, pinhole, seen_first
 from .texels import ATTRIBUTE
 from .units import scaled_view
-from .visibility import first_visible_of
 
 WARM_FRAMES = 3
 """Calls until nothing is recorded any more: the first ones teach Dr.Jit which inputs change."""
@@ -103,17 +103,17 @@ class Frames:
         neighbour are looked at (a tenth, as a rule); where surfaces let light straight through, all are, at random.
         """
         if rays not in self._cover:
-            kernel = self._cover_kernel(rays) if self._lets_through() else self._edge_kernel(rays)
-            self._cover[rays] = self._warmed(kernel, view, rays) if self._lets_through() else kernel
+            kernel = self._cover_kernel(rays) if lets_through(self.mi, self.scene) else self._edge_kernel(rays)
+            self._cover[rays] = self._warmed(kernel, view, rays) if lets_through(self.mi, self.scene) else kernel
         kernel = self._cover[rays]
-        if self._lets_through():
+        if lets_through(self.mi, self.scene):
             return self._image(kernel(*self._inputs(view, 0, rays)))[..., 0]
         edges = np.flatnonzero(_differs(mask))
         result = mask.astype(np.float32)
         if len(edges):
             import drjit as dr
 
-            camera, _, samples = self._inputs(view, 0, rays)
+            camera = self._inputs(view, 0, rays)[0]
             # Memory of Dr.Jit's own: where numpy's is aligned otherwise, the kernel would be recorded once more.
             lanes = self.mi.UInt32(edges.repeat(rays).astype(np.uint32)) + dr.opaque(self.mi.UInt32, 0)
             places = self.mi.UInt32(np.tile(np.arange(rays, dtype=np.uint32), len(edges))) + dr.opaque(
@@ -127,7 +127,7 @@ class Frames:
     def _edge_kernel(self, count: int) -> Any:
         import drjit as dr
 
-        mi, scene, seen, pinhole = self.mi, self.scene, self._seen(), self._pinhole
+        mi, scene, width, seen = self.mi, self.scene, self.size[0], seen_first(self.mi, self.scene)
         cells = math.isqrt(count)
         if cells * cells != count:
             raise ValueError(f"rays: is {count}, expected a square number")
@@ -135,7 +135,7 @@ class Frames:
         @dr.freeze
         def kernel(camera: list[Any], pixel: Any, place: Any) -> list[Any]:
             offset = (mi.Point2f(place % cells, place // cells) + 0.5) / cells
-            hit = seen(scene, pinhole(camera, pixel, offset), None)
+            hit = seen(scene, pinhole(mi, camera, pixel, offset, width), None)
             return [dr.select(hit.is_valid(), mi.Float(1), mi.Float(0))]
 
         return kernel
@@ -143,7 +143,7 @@ class Frames:
     def _centre_kernel(self) -> Any:
         import drjit as dr
 
-        mi, scene, seen = self.mi, self.scene, self._seen()
+        mi, scene, seen = self.mi, self.scene, seen_first(self.mi, self.scene)
         rays, prototype = self._rays, self.mi.load_dict({"type": "independent"})
 
         @dr.freeze
@@ -165,7 +165,7 @@ class Frames:
     def _cover_kernel(self, count: int) -> Any:
         import drjit as dr
 
-        mi, scene, seen = self.mi, self.scene, self._seen()
+        mi, scene, seen = self.mi, self.scene, seen_first(self.mi, self.scene)
         rays, means, prototype = self._rays, self._means, self.mi.load_dict({"type": "independent"})
         cells = math.isqrt(count) if math.isqrt(count) ** 2 == count else 1
 
@@ -198,7 +198,7 @@ class Frames:
 
         mi, scene = self.mi, self.scene
         rays, means, prototype = self._rays, self._means, mi.load_dict({"type": "independent"})
-        seen, cells = self._seen(), math.isqrt(count) if math.isqrt(count) ** 2 == count else 1
+        seen, cells = seen_first(self.mi, self.scene), math.isqrt(count) if math.isqrt(count) ** 2 == count else 1
         diffuse = mi.BSDFFlags.Diffuse
 
         @dr.freeze
@@ -215,42 +215,6 @@ class Frames:
 
         return kernel
 
-    def _lets_through(self) -> bool:
-        """Whether a surface of the scene passes light straight on."""
-        bsdfs = [shape.bsdf() for shape in self.scene.shapes() if shape.bsdf() is not None]
-        return any(self.mi.has_flag(bsdf.flags(), self.mi.BSDFFlags.Null) for bsdf in bsdfs)
-
-    def _seen(self) -> Any:
-        """Function (scene, ray, sampler) -> what the pixel shows there first: lamps are passed, and what surfaces let
-
-        straight through is passed with its probability.
-        """
-        import drjit as dr
-
-        mi, visible = self.mi, first_visible_of(self.mi, self.scene)
-        lets_through = self._lets_through()
-
-        def seen(scene: Any, ray: Any, sampler: Any) -> Any:
-            ray, hit = visible(scene, ray, mi.Bool(True))
-            if not lets_through:
-                return hit
-
-            def passes(hit: Any, sampler: Any, active: Any) -> Any:
-                bsdf = hit.bsdf()
-                null = active & hit.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
-                share = dr.mean(bsdf.eval_null_transmission(hit, null))
-                return null & (sampler.next_1d(active) < share)
-
-            def onwards(hit: Any, direction: Any, sampler: Any, active: Any) -> tuple[Any, ...]:
-                _, following = visible(scene, hit.spawn_ray(direction), active)
-                hit = dr.select(active, following, hit)
-                return hit, direction, sampler, passes(hit, sampler, active)
-
-            state = (hit, mi.Vector3f(ray.d), sampler, passes(hit, sampler, mi.Bool(True)))
-            return dr.while_loop(state, lambda hit, direction, sampler, active: active, onwards)[0]
-
-        return seen
-
     def _rays(self, sampler: Any, camera: list[Any], seed: Any, samples: Any, count: int, cells: int) -> Any:
         """Rays through random points of the pixels, one in each of ``cells``² cells; 0 cells: through the centres."""
         import drjit as dr
@@ -266,18 +230,7 @@ class Frames:
         elif cells > 1:
             cell = index - pixel * samples
             offset = (mi.Point2f(cell % cells, cell // cells) + offset) / cells
-        return self._pinhole(camera, pixel, offset)
-
-    def _pinhole(self, camera: list[Any], pixel: Any, offset: Any) -> Any:
-        """Rays through places (0..1, 0..1) of pixels, numbered row by row."""
-        import drjit as dr
-
-        mi, width = self.mi, self.size[0]
-        x = (mi.Float(pixel % width) + offset.x - camera[13]) / camera[12]
-        y = (mi.Float(pixel // width) + offset.y - camera[14]) / camera[12]
-        # Camera axes are OpenGL's: y up, looking along -z; rows of c2w in camera[0:12].
-        world = [camera[4 * row] * x - camera[4 * row + 1] * y - camera[4 * row + 2] for row in range(3)]
-        return mi.Ray3f(mi.Point3f(camera[3], camera[7], camera[11]), dr.normalize(mi.Vector3f(*world)))
+        return pinhole(self.mi, camera, pixel, offset, self.size[0])
 
     @staticmethod
     def _means(values: list[Any], count: int) -> list[Any]:

@@ -1,0 +1,164 @@
+"""The frame benchmark's arithmetic: the rival's frontier and crossover, reprojection by known motion, flicker."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tools.bench_frames.ladder import classes, crossover, frontier, quality_at, standing
+from tools.bench_frames.motion import Surface, changes, flicker, project, reproject
+
+from dnrpipe.cameras import orbit_views
+from dnrpipe.settings import CameraSettings
+from dnrtrain.contract import View
+
+LADDER = {"1": (10.0, 20.0), "1 dear": (30.0, 19.0), "4": (40.0, 26.0), "16": (160.0, 30.0), "dull": (200.0, 30.0)}
+LINE = [(10.0, 20.0), (40.0, 26.0), (160.0, 30.0)]
+SUMMARY = {"bounds": {"center": [0.0, 0.0, 0.0], "radius": 1.0}, "cameras": [], "animation": []}
+
+
+def test_the_frontier_leaves_out_what_is_dearer_and_no_better() -> None:
+    assert frontier(LADDER) == ["1", "4", "16"]
+    assert frontier({}) == []
+    assert frontier({"a": (5.0, 20.0), "b": (5.0, 21.0)}) == ["b"]
+
+
+def test_quality_is_linear_in_log_time_between_points() -> None:
+    assert quality_at(LINE, 20.0) == pytest.approx(23.0)  # half way between 10 and 40 ms
+    assert quality_at(LINE, 40.0) == pytest.approx(26.0)
+    assert quality_at(LINE, 9.9) is None
+    assert quality_at(LINE, 1000.0) == 30.0
+
+
+def test_the_crossover_is_where_the_rival_draws_level() -> None:
+    assert crossover(LINE, 23.0) == pytest.approx(20.0)
+    assert crossover(LINE, 12.0) == 10.0
+    assert crossover(LINE, 30.1) is None
+    assert crossover([], 1.0) is None
+
+
+@given(st.floats(20.0, 30.0))
+def test_the_crossover_inverts_the_interpolation(quality: float) -> None:
+    at = crossover(LINE, quality)
+    assert at is not None
+    assert quality_at(LINE, at) == pytest.approx(quality, abs=1e-6)
+
+
+def test_standing_says_how_far_ahead_and_until_when() -> None:
+    found = standing(LADDER, (20.0, 28.0))
+    assert found["lead_db"] == pytest.approx(5.0)
+    assert not found["cheapest"]
+    assert found["crossover_ms"] == pytest.approx(80.0)
+    faster = standing(LADDER, (2.0, 25.0))  # nothing of the rival's is so fast: its cheapest counts
+    assert faster["cheapest"]
+    assert faster["lead_db"] == pytest.approx(5.0)
+    assert standing(LADDER, (20.0, 33.0))["crossover_ms"] is None
+
+
+def test_classes_hold_what_is_fast_enough() -> None:
+    rows = classes(LADDER, (35.0, 28.0), (5.0, 30.0, 100.0))
+    assert [row["rival"] for row in rows] == [None, "1", "4"]
+    assert [row["ours_db"] for row in rows] == [None, None, 28.0]
+
+
+def _view(**changes: object) -> View:
+    camera = CameraSettings(train=1, val=0, test=0, width=64, height=48)
+    return orbit_views(SUMMARY, camera, 8)[0].model_copy(update=changes)
+
+
+def _plane(view: View) -> Surface:
+    """What the view sees of the plane through the origin that faces the first camera."""
+    normal = _view().position / np.linalg.norm(_view().position)
+    rays = view.ray_directions().astype(np.float64)
+    distance = -(view.position @ normal) / (rays @ normal)
+    position = view.position + rays * distance[..., None]
+    depth = project(view, position)[2]
+    return Surface(view, position, depth, np.ones(depth.shape, bool))
+
+
+def _pattern(position: np.ndarray) -> np.ndarray:
+    """A smooth texture that lies in space."""
+    return 0.5 + 0.4 * np.stack([np.sin(2 * position[..., i] + i) for i in range(3)], axis=-1)
+
+
+def _moved(view: View, across: float, pixels: bool = False) -> View:
+    """The camera, ``across`` to its right (in pixels of the plane at the origin's depth)."""
+    depth = float(np.linalg.norm(view.position))
+    step = across * depth / view.fl_x if pixels else across
+    c2w = view.matrix.copy()
+    c2w[:3, 3] += step * c2w[:3, 0]
+    return view.model_copy(update={"c2w": tuple(tuple(float(x) for x in row) for row in c2w)})
+
+
+def test_a_point_on_the_axis_projects_to_the_principal_point() -> None:
+    view = _view(cx=20.0, cy=11.0)
+    x, y, depth = project(view, np.zeros((1, 3)))
+    assert (x[0], y[0]) == pytest.approx((20.0, 11.0))
+    assert depth[0] == pytest.approx(np.linalg.norm(view.position))
+    assert project(view, 2 * view.position[None])[2][0] < 0
+
+
+def test_standing_still_changes_nothing() -> None:
+    surface = _plane(_view())
+    image = np.random.default_rng(0).random((48, 64, 3))
+    picture, valid = reproject(image, surface, surface)
+    assert valid[1:-1, 1:-1].all()
+    assert np.abs(picture - image)[valid].max() < 1e-4
+    assert flicker([image] * 3, [image] * 3, [surface] * 3)["change"] < 1e-5
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(-20, 20))
+def test_a_shift_by_whole_pixels_moves_the_picture_by_them(pixels: int) -> None:
+    """The camera goes right, so the picture goes left; what was outside before takes no part."""
+    view = _view()
+    before, after = _plane(view), _plane(_moved(view, pixels, pixels=True))
+    image = np.random.default_rng(1).random((48, 64, 3))
+    picture, valid = reproject(image, before, after)
+    expected = np.roll(image, -pixels, axis=1)
+    assert np.abs(picture - expected)[valid].max() < 1e-4
+    inside = valid[2:-2].mean(axis=0) > 0.99
+    assert inside.sum() >= 64 - abs(pixels) - 2
+    assert not valid[:, 64 - pixels :].any() if pixels > 0 else True
+
+
+def test_a_texture_in_space_stays_put_and_noise_does_not() -> None:
+    view = _view()
+    surfaces = [_plane(_moved(view, 0.01 * step)) for step in range(4)]
+    still = [_pattern(surface.position) for surface in surfaces]
+    rng = np.random.default_rng(2)
+    noisy = [image + rng.normal(0, 0.05, image.shape) for image in still]
+    calm, shaky = flicker(still, still, surfaces), flicker(noisy, still, surfaces)
+    assert calm["flicker"] == 0
+    assert calm["change"] < 2e-3
+    # Difference of two independent draws, one of them bilinearly averaged: between one and sqrt 2 times the noise.
+    single = 0.05 * math.sqrt(2 / math.pi)
+    assert single < shaky["flicker"] < math.sqrt(2) * single * 1.02
+    assert shaky["valid"] > 0.9
+
+
+def test_light_that_moves_is_no_flicker() -> None:
+    surface = _plane(_view())
+    frames = [np.full((48, 64, 3), level) for level in (0.2, 0.3, 0.5)]
+    found = flicker(frames, frames, [surface] * 3)
+    assert found["change"] == pytest.approx(0.15)
+    assert found["reference"] == pytest.approx(0.15)
+    assert found["flicker"] == 0
+
+
+def test_what_was_hidden_before_takes_no_part() -> None:
+    view = _view()
+    after = _plane(view)
+    depth = after.depth.copy()
+    depth[:, :32] *= 0.8  # something stood in front of the left half
+    before = Surface(view, after.position, depth, after.mask)
+    _, valid = reproject(np.zeros((48, 64, 3)), before, after)
+    assert not valid[:, :31].any()
+    assert valid[1:-1, 33:-1].all()
+    nothing = Surface(view, after.position, after.depth, np.zeros_like(after.mask))
+    assert not changes([np.zeros((48, 64, 3))] * 2, [nothing, after])[0][1].any()
+    with pytest.raises(ValueError, match="too far apart"):
+        flicker([np.zeros((48, 64, 3))] * 2, [np.zeros((48, 64, 3))] * 2, [nothing, after])

@@ -1,0 +1,190 @@
+"""Frames by kept kernels: Mitsuba's own pictures, G-buffers that agree with geometry, nothing recorded twice."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dnrpipe.cameras import make_cameras
+from dnrpipe.raytrace.variants import choose_variant
+from dnrpipe.settings import CameraSettings
+
+SUMMARY = {"bounds": {"center": [0.0, 0.0, 0.0], "radius": 1.2}, "cameras": [], "animation": []}
+SPHERE = """<scene version="3.0.0">
+  <emitter type="constant"/>
+  <shape type="sphere"><bsdf type="diffuse"><rgb name="reflectance" value="0.6, 0.4, 0.2"/></bsdf></shape>
+  %s
+</scene>"""
+LAMP = """<shape type="sphere" id="light-near"><transform name="to_world"><scale value="0.2"/>
+  <translate x="%g" y="%g" z="%g"/></transform>
+  <emitter type="area"><rgb name="radiance" value="5"/></emitter></shape>"""
+HALF_THERE = """<shape type="sphere"><transform name="to_world"><scale value="1.3"/></transform>
+  <bsdf type="mask"><float name="opacity" value="0.25"/><bsdf type="diffuse"/></bsdf></shape>"""
+MIRROR = """<shape type="sphere"><transform name="to_world"><scale value="1.3"/></transform>
+  <bsdf type="conductor"/></shape>"""
+
+SCRIPT = """
+import json, sys
+from pathlib import Path
+import numpy as np
+from dnrtrain.contract import View
+from dnrpipe.raytrace.engine import Engine
+from dnrpipe.raytrace.frames import Frames
+variant, folder, views = sys.argv[1], Path(sys.argv[2]), [View.model_validate(v) for v in json.loads(sys.argv[3])]
+engine = Engine(variant, 0, [folder / "scene.xml"])
+frames = Frames(engine, folder / "scene.xml", "path", 5, (views[0].width, views[0].height))
+integrator, _ = engine.integrator(folder / "scene.xml", "path", 5)
+answer = {}
+def note(**values):
+    answer.update({name: float(value) for name, value in values.items()})
+"""
+
+
+def _run(folder: Path, extra: str, code: str, views: int = 3) -> dict[str, Any]:
+    """What the code notes down, in a process of its own."""
+    (folder / "scene.xml").write_text(SPHERE % extra)
+    choice = choose_variant()
+    if choice.variant.startswith("scalar"):
+        pytest.skip("needs a jit variant of Mitsuba")
+    cameras = _views(views)
+    data = json.dumps([view.model_dump(mode="json") for view in cameras])
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT + code + "\nprint(json.dumps(answer))", choice.variant, str(folder), data],
+        env={**os.environ, **choice.environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def _views(count: int) -> list[Any]:
+    camera = CameraSettings(train=count, val=0, test=0, width=48, height=32)
+    return [view.model_copy(update={"cx": 22.0, "cy": 17.5}) for view in make_cameras(SUMMARY, camera)["train"]]
+
+
+def test_a_frame_is_what_mitsuba_itself_renders(tmp_path: Path) -> None:
+    """Same mean as the tracer's frame within its noise, for views that the kernel was not recorded with."""
+    found = _run(
+        tmp_path,
+        LAMP % (0, 0, 2),
+        """
+worst = 0.0
+for number, view in enumerate(views):
+    kept = frames.path(view, 64, number)
+    plain, _ = engine.frame(folder / "scene.xml", integrator, engine.sensor(view), view, 256, number)
+    worst = max(worst, float(np.abs(kept - plain).mean()))
+    note(alpha=np.abs(kept[..., 3].mean() - plain[..., 3].mean()))
+before = frames._path[64].n_recordings
+again = frames.path(views[0], 64, 0)
+note(worst=worst, level=kept[..., :3].mean(), recorded=frames._path[64].n_recordings - before,
+     same=np.abs(again - frames.path(views[0], 64, 0)).max(), other=np.abs(again - frames.path(views[0], 64, 1)).max())
+""",
+    )
+    assert found["worst"] < 0.05 * found["level"]
+    assert found["alpha"] < 2e-3
+    assert found["recorded"] == 0
+    assert found["same"] == 0
+    assert found["other"] > 0
+
+
+def test_auxiliary_images_show_the_surface_and_not_the_lamp_before_it(tmp_path: Path) -> None:
+    position = _views(1)[0].position * 0.6  # in front of the camera
+    found = _run(
+        tmp_path,
+        LAMP % tuple(position),
+        """
+guide = frames.auxiliary(views[0], 16, 3)
+inside = guide.coverage == 1
+note(albedo=np.abs(guide.albedo[inside] - [0.6, 0.4, 0.2]).max(), inside=inside.sum(),
+     length=np.linalg.norm(guide.normal[inside], axis=-1).min(),
+     outside=np.abs(guide.normal[guide.coverage == 0]).max())
+""",
+        views=1,
+    )
+    assert found["inside"] > 200
+    assert found["albedo"] < 1e-3
+    assert found["length"] > 0.9
+    assert found["outside"] == 0
+
+
+def test_mirrors_have_albedo_one_and_half_transparent_surfaces_are_half_there(tmp_path: Path) -> None:
+    mirror = _run(
+        tmp_path, MIRROR, "g = frames.auxiliary(views[0], 16, 3); note(a=g.albedo[g.coverage == 1].min())", views=1
+    )
+    assert mirror["a"] == 1
+    code = """
+g = frames.auxiliary(views[0], 256, 3)
+rim = ~(np.abs(g.coverage - 1) < 1e-6) & (g.coverage > 0)
+r = np.linalg.norm(np.cross(views[0].ray_directions(), views[0].position), axis=-1)
+between = (r > 1.1) & (r < 1.2)
+note(between=g.coverage[between].mean(), inside=g.coverage[r < 0.9].min(), outside=g.coverage[r > 1.4].max())
+"""
+    found = _run(tmp_path, HALF_THERE, code, views=1)
+    # A ray beside the inner sphere meets the outer one twice: 1 - (1 - 1/4)².
+    assert found["between"] == pytest.approx(1 - 0.75**2, abs=0.02)
+    assert found["inside"] == 1
+    assert found["outside"] == 0
+
+
+def test_the_gbuffer_is_the_geometry(tmp_path: Path) -> None:
+    """Against the unit sphere by formula; coverage, looked at along the rim only, against many rays everywhere."""
+    found = _run(
+        tmp_path,
+        "",
+        """
+worst = dict(mask=0, position=0, normal=0, depth=0, cover=0)
+for view in views:
+    g = frames.gbuffer(view, rays=64)
+    d, o = view.ray_directions().astype(np.float64), view.position
+    b = d @ o
+    root = b * b - (o @ o - 1)
+    hit = root > 0
+    t = -b - np.sqrt(np.where(hit, root, 0))
+    p = o + d * t[..., None]
+    both = hit & (g["mask"] > 0)
+    position = np.stack([g[f"position.{a}"] for a in "XYZ"], -1)
+    normal = np.stack([g[f"normal.{a}"] for a in "XYZ"], -1)
+    sure = both & (root > 1e-2)
+    now = dict(mask=(hit != (g["mask"] > 0)).sum(), position=np.abs(position - p)[sure].max(),
+               normal=np.abs(normal - p)[sure].max(),
+               depth=np.abs(g["depth.Z"] - (o - p) @ view.matrix[:3, 2])[sure].max(),
+               cover=abs(g["coverage"].mean() - frames.auxiliary(view, 256, 1).coverage.mean()))
+    worst = {k: max(float(v), worst[k]) for k, v in now.items()}
+    assert not g["depth.Z"][g["mask"] == 0].any() and not position[g["mask"] == 0].any()
+note(**worst)
+""",
+    )
+    assert found["mask"] <= 2
+    assert found["position"] < 1e-4
+    assert found["normal"] < 1e-4
+    assert found["depth"] < 1e-4
+    assert found["cover"] < 1e-3
+
+
+def test_views_of_another_size_and_odd_ray_counts_are_refused(tmp_path: Path) -> None:
+    found = _run(
+        tmp_path,
+        "",
+        """
+try:
+    frames.path(views[0].model_copy(update={"width": 20}), 1, 0)
+    note(refused=0)
+except ValueError as error:
+    note(refused="is 20x32, the kernels are for" in str(error))
+try:
+    frames.gbuffer(views[0], rays=10)
+    note(odd=0)
+except ValueError as error:
+    note(odd="is 10, expected a square number" in str(error))
+""",
+        views=1,
+    )
+    assert found["refused"] == found["odd"] == 1

@@ -1,0 +1,148 @@
+"""Results as JSON (what was run, where, on what) and Markdown."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import shlex
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from dnrtrain.atomic import atomic_path, write_json
+
+PACKAGES = ("mitsuba", "drjit", "mitsuba-oidn", "torch", "numpy")
+NAMES = {"ours": "neural", "base": "base image alone"}
+
+
+def write(results: list[dict[str, Any]], path: Path) -> None:
+    """``path`` (.json) and its Markdown beside it, atomically."""
+    record = {"made": _made(), "scenes": results}
+    write_json(path, record)
+    with atomic_path(path.with_suffix(".md")) as temporary:
+        temporary.write_text(markdown(record), encoding="utf-8")
+
+
+def _made() -> dict[str, Any]:
+    def git(*arguments: str) -> str:
+        done = subprocess.run(["git", *arguments], capture_output=True, text=True, check=False)
+        return done.stdout.strip()
+
+    return {
+        "command": shlex.join(["python", "-m", "tools.bench_frames", *sys.argv[1:]]),
+        "date": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
+        "commit": git("rev-parse", "--short", "HEAD"),
+        "changed_files": len(git("status", "--porcelain").splitlines()),
+        "machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}",
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+        "python": platform.python_version(),
+        "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
+    }
+
+
+def _processor() -> str:
+    information = Path("/proc/cpuinfo")
+    if information.exists():
+        for line in information.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
+def markdown(record: dict[str, Any]) -> str:
+    """The tables of a record of :func:`write`."""
+    made, scenes = record["made"], record["scenes"]
+    first = scenes[0]["options"]
+    lines = [
+        "# Our frames against path tracing + Open Image Denoise at equal time",
+        "",
+        f"`{made['command']}` on {made['machine']}, {made['date']}, commit {made['commit']}"
+        f" ({made['changed_files']} files changed), load {made['load']:.1f} at the end.",
+        "",
+        f"Milliseconds by the {first['clock']} clock"
+        + (f" (CPU time over {first['threads']} threads)" if first["clock"] == "cpu" else "")
+        + ", median over the views, everything counted. PSNR in dB, display space over white.",
+        "",
+        *_overview(scenes),
+    ]
+    for scene in scenes:
+        lines += ["", *_scene(scene)]
+    return "\n".join(lines) + "\n"
+
+
+def _overview(scenes: list[dict[str, Any]]) -> list[str]:
+    lines = [
+        "| scene | renderer | ms | dB | SSIM | LPIPS (VGG) | rival at that time | lead | rival draws level at |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for scene in scenes:
+        for name, standing in scene["standing"].items():
+            row = scene["rows"][name]
+            at = f"{standing['rival_db']:.2f}" + (" (its cheapest)" if standing["cheapest"] else "")
+            level = standing["crossover_ms"]
+            end = f"{level:.0f} ms" if level is not None else f"not by {standing['ladder_end_ms']:.0f} ms"
+            lines.append(
+                f"| {scene['scene']} | {NAMES[name]} | {row['ms']:.1f} | {row['psnr']:.2f} | {row['ssim']:.4f} |"
+                f" {_number(row.get('lpips_vgg'), 4)} | {at} | {standing['lead_db']:+.2f} | {end} |"
+            )
+    return lines
+
+
+def _scene(scene: dict[str, Any]) -> list[str]:
+    width, height = scene["size"]
+    reference = scene["reference"]
+    lines = [
+        f"## {scene['scene']}",
+        "",
+        f"{width}x{height}, {len(scene['views'])} test views, {scene['integrator']}, depth {scene['max_depth']}."
+        f" Reference: {reference['spp']} spp, {reference['kind']}; its own noise caps PSNR at"
+        f" {reference['ceiling_psnr']:.1f} dB.",
+        "",
+        "| renderer | ms | of which | dB | in the mask | SSIM | LPIPS (VGG) |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    shown = [*scene["standing"], *scene["frontier"]]
+    for name in sorted(shown, key=lambda name: scene["rows"][name]["ms"]):
+        row = scene["rows"][name]
+        parts = ", ".join(f"{part} {ms:.1f}" for part, ms in row["parts"].items() if ms > 0)
+        label = f"**{NAMES[name]}**" if name in NAMES else name
+        lines.append(
+            f"| {label} | {row['ms']:.1f} | {parts} | {row['psnr']:.2f} | {_number(row.get('psnr_mask'), 2)} |"
+            f" {row['ssim']:.4f} | {_number(row.get('lpips_vgg'), 4)} |"
+        )
+    lines += ["", "| at most | best rival | dB | neural | base image alone |", "|---|---|---|---|---|"]
+    per = {name: standing["classes"] for name, standing in scene["standing"].items()}
+    for index, row in enumerate(next(iter(per.values()))):
+        mine = {name: _number(rows[index]["ours_db"], 2) for name, rows in per.items()}
+        lines.append(
+            f"| {row['limit_ms']:.0f} ms | {row['rival'] or 'none'} | {_number(row['rival_db'], 2)} |"
+            f" {mine.get('ours', '-')} | {mine.get('base', '-')} |"
+        )
+    if "stability" in scene:
+        lines += ["", *_stability(scene)]
+    return lines
+
+
+def _stability(scene: dict[str, Any]) -> list[str]:
+    found = scene["stability"]
+    rows = found["rows"]
+    lines = [
+        f"Orbit of {found['frames']} frames, {found['degrees']:g} degrees apart, each reprojected into the next. Mean"
+        f" absolute change x 1000; the reference ({found['reference_spp']} spp, {found['reference']}; its own noise"
+        f" {1000 * found['reference_noise']:.2f}) changes by {1000 * next(iter(rows.values()))['reference']:.2f}."
+        " Flicker: mean absolute difference of the change from the reference's.",
+        "",
+        "| renderer | change | flicker |",
+        "|---|---|---|",
+    ]
+    for name, row in sorted(rows.items(), key=lambda item: item[1]["flicker"]):
+        label = f"**{NAMES[name]}**" if name in NAMES else name
+        lines.append(f"| {label} | {1000 * row['change']:.2f} | {1000 * row['flicker']:.2f} |")
+    return lines
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

@@ -1,0 +1,93 @@
+"""Our frames, from nothing but a camera: G-buffer and base image, then the network; each part timed.
+
+G-buffer and base image come from one kernel of Mitsuba in this process. What it gives goes through the EXR files that
+the trainer reads, which is not timed: a viewer would hand over memory.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from dnrpipe.base import light_path
+from dnrpipe.errors import UserError
+from dnrpipe.raytrace.base import BaseRenderer
+from dnrpipe.raytrace.light_worker import read_light
+from dnrpipe.raytrace.units import scaled_view
+from dnrtrain.checkpoint import load_model, read_record
+from dnrtrain.contract import View
+from dnrtrain.dataset import load_views
+from dnrtrain.exr import write_exr
+from dnrtrain.model import render_views
+
+from .scene import BenchScene, Clock
+
+TIMED = ("none", "baked")
+"""Base images that this benchmark can render frame by frame."""
+
+
+class Ours:
+    """The workspace's fine-tuned model on the CPU, and its base image.
+
+    model is None, and frames have no ``ours``, where the workspace has none: the base image alone is measured then.
+    Raises UserError: the model has a base image that is not timed here, or its light is not baked.
+    """
+
+    def __init__(self, scene: BenchScene) -> None:
+        folder = scene.workspace.checkpoints("step2")
+        self.scene = scene
+        self.model = load_model(folder) if read_record(folder) is not None else None
+        self.base: Literal["none", "raster", "baked", "direct", "path"] = (
+            "baked" if self.model is None else self.model.settings.base
+        )
+        if self.base not in TIMED:
+            raise UserError(f"{folder}: base image '{self.base}' cannot be timed here, only {', '.join(TIMED)}")
+        self.renderer = None
+        if self.base == "baked":
+            light = light_path(scene.workspace)
+            if not light.exists():
+                raise UserError(f"{light}: the light is not baked; run `dnrpipe finetune` with model.base=baked first")
+            mitsuba_scene = scene.engine.scenes[str(scene.bundle)]
+            samples = scene.settings.base.samples
+            self.renderer = BaseRenderer(scene.engine.mi, mitsuba_scene, read_light(light), samples)
+
+    def frame(self, view: View, clock: Clock) -> dict[str, dict[str, Any]]:
+        """By "ours" and "base": {"picture": display RGB over white [1, 3, H, W], "parts": {name: ms}}."""
+        result: dict[str, dict[str, Any]] = {}
+        channels, parts = self._inputs(view, clock)
+        if self.renderer is not None:
+            picture = np.stack([channels[f"base.{c}"] for c in "RGBA"], axis=-1)
+            result["base"] = {"picture": self.scene.shown(picture), "parts": dict(parts)}
+        if self.model is not None:
+            data = self._data(view, channels)
+            picture, parts["network"] = clock.time(partial(render_views, self.model, data))
+            result["ours"] = {"picture": picture.float(), "parts": parts}
+        return result
+
+    def _inputs(self, view: View, clock: Clock) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+        """(channels that the network sees, ms by part). The base image's kernel gives the G-buffer, too."""
+        if self.renderer is None:
+            channels, ms = clock.time(partial(self.scene.frames.gbuffer, view))
+            return channels, {"G-buffer": ms}
+        scale = self.scene.engine.unit_scale
+        channels, ms = clock.time(partial(self.renderer.frame, scaled_view(view, scale)))
+        return {**channels, "depth.Z": channels["depth.Z"] / scale}, {"base image and G-buffer": ms}
+
+    def _data(self, view: View, channels: dict[str, np.ndarray]) -> Any:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "view.exr"
+            write_exr(path, channels, {})
+            return load_views(
+                [path],
+                None,
+                self.scene.frame,
+                cameras=[view],
+                folder=self.scene.workspace.scene,
+                target=False,
+                base=self.base,
+                base_files=None if self.renderer is None else [path],
+            )

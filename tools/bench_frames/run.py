@@ -1,0 +1,159 @@
+"""One workspace through the benchmark: same views, same references, one process, one clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from dnrtrain.metrics import image_metrics
+from dnrtrain.perceptual import build_lpips
+from dnrtrain.weights import WeightsMissing, load_weights
+
+from .ladder import classes, frontier, standing
+from .ours import Ours
+from .reference import Reference, make_references
+from .rival import METHODS, SAMPLES, climb, make_rungs
+from .scene import BenchScene, Clock, open_scene
+from .stability import measure
+
+CLASSES = (0.03, 0.07, 0.3)
+"""Seconds per 128² pixels that the classes are named by; their limits grow with the pixel count."""
+WARM = 2
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is measured, and how."""
+
+    cache: Path
+    views: int = 6
+    reference_spp: int = 1024
+    reference: str = "auto"
+    clock: str = "wall"
+    threads: int = 2
+    samples: tuple[int, ...] = SAMPLES
+    orbit: int = 12
+    orbit_spp: int = 512
+
+
+@dataclass
+class Ran:
+    """One renderer's frames: milliseconds of the parts and display pictures, view by view."""
+
+    parts: dict[str, list[float]] = field(default_factory=dict)
+    pictures: list[Any] = field(default_factory=list)
+
+    def ms(self) -> float:
+        """Median over the views of the sum of the parts."""
+        return float(np.median(np.sum(list(self.parts.values()), axis=0)))
+
+
+def bench(root: Path, options: Options, tell: Callable[[str], None]) -> dict[str, Any]:
+    """All figures of one workspace, JSON-ready. Raises UserError as its parts do."""
+    scene = open_scene(root, options.views, options.threads)
+    torch.set_num_threads(options.threads)
+    clock = Clock(options.clock, options.threads)
+    folder = options.cache / scene.name
+    ours = Ours(scene)
+    reference = make_references(scene, scene.views, "test", options.reference_spp, options.reference, folder, tell)
+    for turn in range(WARM):
+        climb(scene, scene.views[0], turn, clock, make_rungs(options.samples))
+        ours.frame(scene.views[-1], clock)
+    rungs = make_rungs(options.samples)
+    own: dict[str, Ran] = {}
+    for number, view in enumerate(scene.views):
+        climb(scene, view, 10_007 * (number + 1), clock, rungs)
+        for name, frame in ours.frame(view, clock).items():
+            ran = own.setdefault(name, Ran())
+            ran.pictures.append(frame["picture"])
+            for part, ms in frame["parts"].items():
+                ran.parts.setdefault(part, []).append(ms)
+        tell(f"{scene.name}: view {number + 1} of {len(scene.views)}")
+    truth = [scene.shown(picture) for picture in reference.pictures]
+    result = _figures(scene, options, reference, truth, rungs, own)
+    if options.orbit > 1:
+        shown = [(rungs[name].spp, rungs[name].method) for name in result["frontier"] if rungs[name].method != "raw"]
+        result["stability"] = measure(
+            scene,
+            ours,
+            clock,
+            shown,
+            frames=options.orbit,
+            spp=options.orbit_spp,
+            kind=options.reference,
+            folder=folder,
+            tell=tell,
+        )
+    return result
+
+
+def _figures(
+    scene: BenchScene,
+    options: Options,
+    reference: Reference,
+    truth: list[Any],
+    rungs: dict[str, Any],
+    own: dict[str, Ran],
+) -> dict[str, Any]:
+    masks = [torch.from_numpy(picture[..., 3] > 0.5).float()[None, None] for picture in reference.pictures]
+    everything = {**rungs, **own}
+    rows = {
+        name: {
+            "ms": ran.ms(),
+            "parts": {part: float(np.median(values)) for part, values in ran.parts.items()},
+            **_quality(ran.pictures, truth, masks, None),
+        }
+        for name, ran in everything.items()
+    }
+    points = {name: (rows[name]["ms"], rows[name]["psnr"]) for name in rungs}
+    try:
+        lpips = {"vgg": build_lpips(load_weights())["vgg"]}
+    except WeightsMissing:
+        lpips = None
+    best = frontier(points)
+    for name in [*best, *own]:
+        rows[name] |= _quality(everything[name].pictures, truth, masks, lpips)
+    scale = scene.size[0] * scene.size[1] / 128**2
+    limits = [1000 * seconds * scale for seconds in CLASSES]
+    standings = {}
+    for name in own:
+        point = (rows[name]["ms"], rows[name]["psnr"])
+        standings[name] = {**standing(points, point), "classes": classes(points, point, limits)}
+    return {
+        "scene": scene.name,
+        "size": list(scene.size),
+        "views": [view.name for view in scene.views],
+        "integrator": scene.frames.name,
+        "max_depth": scene.max_depth,
+        "variant": scene.engine.variant,
+        "options": {k: v for k, v in asdict(options).items() if k != "cache"},
+        "methods": {name: asdict(method) for name, method in METHODS.items()},
+        "reference": {
+            "kind": reference.kind,
+            "spp": reference.spp,
+            "noise_rmse": float(np.mean(reference.noise)),
+            "ceiling_psnr": reference.ceiling,
+        },
+        "rows": rows,
+        "frontier": best,
+        "standing": standings,
+    }
+
+
+def _quality(pictures: list[Any], truth: list[Any], masks: list[Any], lpips: Any) -> dict[str, float | None]:
+    """Means over the views of :func:`dnrtrain.metrics.image_metrics`; keys without a value are left out."""
+    found = [
+        image_metrics(picture.float(), target, mask, lpips)
+        for picture, target, mask in zip(pictures, truth, masks, strict=True)
+    ]
+    result = {}
+    for key in found[0]:
+        values = [row[key] for row in found if row[key] is not None]
+        if values:
+            result[key] = float(np.mean(values))  # pyright: ignore[reportCallIssue, reportArgumentType]
+    return result
