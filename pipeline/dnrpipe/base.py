@@ -28,7 +28,7 @@ from .settings import Settings
 from .tasks import run_view_tasks, task_name, view_record
 from .workspace import Workspace, digest
 
-LIGHT_VERSION, BASE_VERSION = 1, 3
+LIGHT_VERSION, BASE_VERSION = 1, 4
 RENDERED = ("baked", "direct", "path")
 """Kinds of base images that are rendered into files of their own."""
 AUTOMATIC_TEXELS = 4
@@ -128,7 +128,7 @@ def _prepared(
         "samples": chosen.samples,
     }
     if kind == "baked":
-        common["light"] = str(light_path(workspace))
+        common |= {"light": str(light_path(workspace)), "denoise": chosen.denoise}
         task = {
             "output": common["light"],
             "size": light_size(settings),
@@ -139,7 +139,7 @@ def _prepared(
         }
         task["fingerprint"] = digest([LIGHT_VERSION, light, {k: v for k, v in task.items() if k != "output"}])
         _bake(workspace, console, run_id, stage, common, choice.environment, task)
-        return common, choice.environment, digest([task["fingerprint"], chosen.samples])
+        return common, choice.environment, digest([task["fingerprint"], chosen.samples, chosen.denoise])
     direct = kind == "direct"
     common |= {
         "integrator": "path" if direct else config["integrator"],

@@ -75,6 +75,7 @@ class BaseSettings(Strict):
     )
     light_spp: int = Field(default=128, ge=1, le=1_000_000, description="paths per texel of the baked light")
     samples: int = Field(default=8, ge=1, le=64, description="rays per pixel of a base image")
+    denoise: bool = Field(default=True, description="take the grain off base images of kind baked")
     spp: int = Field(default=4, ge=1, le=1_000_000, description="path-traced samples of the kinds direct and path")
 
 
@@ -123,22 +124,54 @@ class Settings(Strict):
     device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="torch device")
 
 
+# The default model, "dnr": it corrects an image of baked light (docs/method.md; figures in docs/experiments.md).
+DNR: dict[str, Any] = {
+    "base": "baked",
+    "guides": True,
+    "filter": 3,
+    "stride": 2,
+    "output": "log",
+    "aggregator": "residual",
+    "modalities": "uv",
+}
+DNR_STEP2: dict[str, Any] = {
+    "start": "fresh",
+    "ema": 0.99,
+    "photometric": "l1",
+    "texture_rate_scale": 3.0,
+    "loss": {"perceptual": 0.03},
+}
 PRESETS: dict[str, dict[str, Any]] = {
     # Minutes on two CPU cores.
     "draft": {
         "cameras": {"train": 40, "val": 4, "test": 12, "width": 128, "height": 128},
         "passes": {"bake_size": 1024},
         "raytrace": {"spp": 128, "evaluation_spp": 512, "denoise": True, "evaluation_denoise": True},
-        "model": {"texture_size": 128, "width": 24, "depth": 3, "aggregator": "residual"},
+        "model": {**DNR, "texture_size": 128, "width": 24, "depth": 3},
         "select": {"step1": {"epochs": 12, "texture_rate_scale": 10.0}},
-        "finetune": {"step2": {"epochs": 50, "texture_rate_scale": 10.0, "photometric": "l1", "perceptual_crop": 64}},
+        "finetune": {"step2": {**DNR_STEP2, "epochs": 40, "perceptual_crop": 32}},
     },
     "standard": {
         "cameras": {"train": 100, "val": 10, "test": 50, "width": 384, "height": 384},
         "raytrace": {"spp": 256, "evaluation_spp": 512, "denoise": True, "evaluation_denoise": True},
-        "model": {"texture_size": 256, "width": 32, "depth": 4, "aggregator": "residual"},
+        "model": {**DNR, "texture_size": 256, "width": 32, "depth": 4},
         "select": {"step1": {"epochs": 30, "texture_rate_scale": 10.0}},
-        "finetune": {"step2": {"epochs": 60, "texture_rate_scale": 10.0, "photometric": "l1", "perceptual_crop": 192}},
+        "finetune": {"step2": {**DNR_STEP2, "epochs": 60, "patch": 192, "perceptual_crop": 64}},
+    },
+    # DNR (Thies et al. 2019) at the paper's sizes: what DNRSelect is compared with.
+    "vanilla": {
+        "model": {"modalities": "uv"},
+        "select": {"step1": {"reward_scale": "raw", "q_target": "plain"}},
+        "effects": {"enable": ["view-dependence"]},
+        "finetune": {
+            "step2": {
+                "start": "fresh",
+                "augment": False,
+                "photometric": "l1",
+                "texture_rate_scale": 10.0,
+                "loss": {name: 0.0 for name in LossWeights.model_fields if name != "photometric"},
+            }
+        },
     },
     # The paper's numbers: every other default of the models above is the paper's.
     "paper": {

@@ -137,6 +137,30 @@ def gbuffer(view: View) -> dict[str, np.ndarray]:
     return {**channels, "coverage": render(view, raytraced=False)["A"]}
 
 
+def base(view: View) -> dict[str, np.ndarray]:
+    """The contract's base file: the raster colour as its diffuse part, twice that on the sphere as the whole, and
+    the mirror path from the sphere to the disk."""
+    colour = render(view, raytraced=False)
+    direction = view.ray_directions().astype(np.float64)
+    hit = intersect(np.broadcast_to(view.position, direction.shape), direction)
+    mirrored = direction - 2 * (direction * hit.normal).sum(-1, keepdims=True) * hit.normal
+    end = intersect(hit.position + 1e-3 * hit.normal, mirrored)
+    found = hit.sphere & end.mask
+    shiny = 1.0 + hit.sphere
+    values = {f"base.{c}": colour[c] * shiny for c in "RGB"} | {"base.A": colour["A"]}
+    values |= {f"diffuse.{c}": colour[c] for c in "RGB"} | {f"albedo.{c}": 0.5 * colour["A"] for c in "RGB"}
+    ends = {"U": end.uv[..., 0], "V": end.uv[..., 1], "mask": np.ones_like(shiny), "weight": np.full_like(shiny, 0.7)}
+    return values | {f"chain.{name}": np.where(found, value, 0) for name, value in ends.items()}
+
+
+def write_bases(folder: Path, views: list[View]) -> list[Path]:
+    """Write base files; returns their paths."""
+    paths = [folder / "base" / f"{view.name}.exr" for view in views]
+    for view, path in zip(views, paths, strict=True):
+        write_exr(path, base(view), {"view": view.name})
+    return paths
+
+
 def write_scene(folder: Path, views: list[View]) -> tuple[list[Path], list[Path]]:
     """Write pass files (with raster colour) and ray-traced files; returns both lists."""
     passes, images = [], []

@@ -21,15 +21,15 @@ import torch
 from conftest import Scene, make_scene
 from dnrtrain.checkpoint import load_model, read_record
 from dnrtrain.contract import ContractError
-from dnrtrain.dataset import ViewSet
+from dnrtrain.dataset import ViewSet, load_views
 from dnrtrain.events import EpochEnd, Event, Note, Selected
 from dnrtrain.metrics import psnr
 from dnrtrain.model import render_views
 from dnrtrain.precision import decide_bfloat16
-from dnrtrain.schedule import learning_rate
+from dnrtrain.schedule import guarded_step, learning_rate
 from dnrtrain.settings import LossWeights, ModelSettings, Step1Settings, Step2Settings
 from dnrtrain.step1 import run_step1
-from dnrtrain.step2 import run_step2
+from dnrtrain.step2 import _Step2, random_patch, run_step2
 
 MODEL = ModelSettings(texture_size=16, width=4, depth=1, aggregator="residual")
 QUICK1 = Step1Settings(epochs=2, embedding=8, precision="float32")
@@ -250,6 +250,98 @@ def test_it_learns_views_it_has_not_seen(tmp_path: Path) -> None:
     assert scores["step1"] > baseline  # the raster lacks shadow and highlight
     assert scores["step2"] > scores["step1"] + 3
     assert scores["step2"] > baseline + 4
+
+
+def best_parts(scene: Scene) -> tuple[ViewSet, ModelSettings, Step2Settings]:
+    """Three views with a raster base, and settings with everything that the default preset uses."""
+    views = synthetic.dome(10, 32)[:3]
+    passes, images = ([scene.folder / kind / f"{v.name}.exr" for v in views] for kind in ("passes", "raytraced"))
+    data = load_views(passes, images, synthetic.FRAME, cameras=views, folder=scene.folder, base="raster")
+    model = ModelSettings(
+        texture_size=16, width=4, depth=1, aggregator="residual", base="raster", guides=True, stride=2
+    )  # fmt: skip
+    settings = Step2Settings(
+        epochs=4, start="fresh", ema=0.9, patch=16, photometric="l1", loss=LossWeights(perceptual=0)
+    )  # fmt: skip
+    return data, model, settings
+
+
+def test_averages_and_patches_resume_bit_for_bit(scene: Scene, tmp_path: Path) -> None:
+    data, model, settings = best_parts(scene)
+    step2(data, tmp_path / "whole", model=model, settings=settings)
+    for _ in range(4):
+        run = run_step2(
+            data, None, tmp_path / "nothing", model, settings, seed=0, device="cpu",
+            checkpoints=tmp_path / "pieces" / "step2", fingerprint="f", weights=None,
+        )  # fmt: skip
+        assert isinstance(next(event for event in run if isinstance(event, EpochEnd)), EpochEnd)
+        assert isinstance(run, Generator)
+        run.close()
+    step2(data, tmp_path / "pieces", model=model, settings=settings)
+    whole, pieces = ((tmp_path / name / "step2" / "model.safetensors").read_bytes() for name in ("whole", "pieces"))
+    assert whole == pieces
+
+
+def test_the_averaged_weights_are_the_model(scene: Scene, tmp_path: Path) -> None:
+    """By hand: the mean of the weights after each step, weighted by decay^age, is what is saved."""
+    data, model, settings = best_parts(scene)
+    settings = settings.model_copy(update={"epochs": 1})
+    step2(data, tmp_path / "averaged", model=model, settings=settings)
+    tracks = []
+    for steps in (1, 2, 3):
+        run = _Step2(data, None, tmp_path, model, settings, 0, "cpu", tmp_path / f"cut{steps}", "f", None)
+        run._restore()
+        run.steps_per_epoch = 3
+        taken = 0
+
+        def stop_after(*args: object, steps: int = steps) -> bool:
+            nonlocal taken
+            taken += 1
+            return guarded_step(*args) if taken <= steps else False  # type: ignore[arg-type]
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("dnrtrain.step2.guarded_step", stop_after)
+            run._epoch(0)
+        tracks.append({name: p.detach().clone() for name, p in run.dnr.named_parameters()})
+    saved = load_model(tmp_path / "averaged" / "step2")
+    ages = torch.tensor([0.9**2, 0.9, 1.0])
+    for name, value in saved.named_parameters():
+        stack = torch.stack([track[name] for track in tracks])
+        expected = torch.einsum("t,t...->...", ages / ages.sum(), stack)
+        assert torch.allclose(value, expected, atol=1e-6), name
+    assert not torch.equal(next(iter(saved.parameters())), next(iter(tracks[-1].values())))
+
+
+def test_patches_bound_what_a_step_sees(scene: Scene) -> None:
+    batch = scene.traced.batch([0])
+    corners = set()
+    for seed in range(20):
+        patch = random_patch(batch, 20, np.random.default_rng(seed))
+        assert patch.mask.shape[-2:] == (20, 20) and patch.target is not None
+        corners.add(patch.view_dir[..., 0, 0].numpy().tobytes())
+    assert len(corners) > 10
+    assert random_patch(batch, 0, np.random.default_rng(0)) is batch
+    assert random_patch(batch, 32, np.random.default_rng(0)) is batch
+    wide = batch._map(lambda tensor: tensor[..., :20, :])
+    assert random_patch(wide, 24, np.random.default_rng(0)).mask.shape[-2:] == (20, 24)
+
+
+def test_a_richer_model_starts_from_the_coarse_one(scene: Scene, tmp_path: Path) -> None:
+    """Step 1 trains the coarse part of the same settings; step 2 takes over what fits and says how much."""
+    data, model, settings = best_parts(scene)
+    step1(scene.raster, tmp_path, policy="random", model=model)
+    coarse = load_model(tmp_path / "step1")
+    assert coarse.settings == model.coarse() != model
+    settings = settings.model_copy(update={"start": "coarse", "epochs": 1, "learning_rate": 1e-12, "ema": 0.0})
+    settings = settings.model_copy(update={"learning_rate_end": 1e-12})
+    events = step2(data, tmp_path, model=model, settings=settings)
+    assert isinstance(events[0], Note | EpochEnd) and any(
+        "from step 1" in e.text for e in events if isinstance(e, Note)
+    )
+    tuned = load_model(tmp_path / "step2")
+    texels = [dict(m.named_parameters())["aggregator.texture_uv.levels.0"] for m in (coarse, tuned)]
+    assert torch.allclose(texels[0], texels[1], atol=1e-6)
+    assert tuned.renderer.head.weight.abs().max() < 1e-6  # still the base image
 
 
 @pytest.mark.slow

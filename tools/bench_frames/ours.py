@@ -16,6 +16,7 @@ import numpy as np
 from dnrpipe.base import light_path
 from dnrpipe.errors import UserError
 from dnrpipe.raytrace.base import BaseRenderer
+from dnrpipe.raytrace.base_worker import denoised
 from dnrpipe.raytrace.light_worker import read_light
 from dnrpipe.raytrace.units import scaled_view
 from dnrtrain.checkpoint import load_model, read_record
@@ -60,7 +61,12 @@ class Ours:
         result: dict[str, dict[str, Any]] = {}
         channels, parts = self._inputs(view, clock)
         if self.renderer is not None:
-            picture = np.stack([channels[f"base.{c}"] for c in "RGBA"], axis=-1)
+            alpha = channels["coverage"]
+            straight = (
+                np.stack([channels[f"base.{c}"] for c in "RGB"], axis=-1)
+                / np.maximum(channels["base.A"], 1e-6)[..., None]
+            )
+            picture = np.concatenate([straight * alpha[..., None], alpha[..., None]], axis=-1)
             result["base"] = {"picture": self.scene.shown(picture), "parts": dict(parts)}
         if self.model is not None:
             data = self._data(view, channels)
@@ -75,7 +81,14 @@ class Ours:
             return channels, {"G-buffer": ms}
         scale = self.scene.engine.unit_scale
         channels, ms = clock.time(partial(self.renderer.frame, scaled_view(view, scale)))
-        return {**channels, "depth.Z": channels["depth.Z"] / scale}, {"base image and G-buffer": ms}
+        mask = channels["mask"] > 0.5
+        coverage, finer = clock.time(partial(self.scene.frames.coverage, view, mask))
+        changed = {"depth.Z": channels["depth.Z"] / scale, "coverage": coverage}
+        parts = {"base image and G-buffer": ms, "silhouettes": finer}
+        if self.scene.settings.base.denoise:
+            clean, parts["denoiser"] = clock.time(partial(denoised, channels, 0))
+            changed |= clean
+        return {**channels, **changed}, parts
 
     def _data(self, view: View, channels: dict[str, np.ndarray]) -> Any:
         with tempfile.TemporaryDirectory() as folder:

@@ -20,6 +20,15 @@ All but R G B A and coverage are sampled at the pixel centre, never filtered.
 
 Channels of a ray-traced file (``raytraced/<split>/<view>.exr``)
     R G B A               linear Rec.709 radiance, premultiplied, box filter, transparent background
+
+Channels of a base file (``base/<split>/<view>.exr``): a cheap image of the same view, which the network corrects
+    base.R/G/B/A          linear Rec.709 radiance, premultiplied, box filter
+    diffuse.R/G/B         the part of base that is diffuse reflection or emission, premultiplied
+    albedo.R/G/B          diffuse reflectance, mean over the pixel, premultiplied
+    chain.U/V             atlas coordinates in [0, 1), V up, of the first rough surface that the mirror and
+                          refraction path through the pixel centre meets; 0 where there is none
+    chain.mask            1 where there is one, else 0
+    chain.weight          throughput of that path, mean over colours, in [0, 1]; 0 where there is none
 """
 
 from __future__ import annotations
@@ -50,6 +59,22 @@ GBUFFER_CHANNELS = (
     "object.Id",
     "mask",
     "coverage",
+)
+BASE_CHANNELS = (
+    "base.R",
+    "base.G",
+    "base.B",
+    "base.A",
+    "diffuse.R",
+    "diffuse.G",
+    "diffuse.B",
+    "albedo.R",
+    "albedo.G",
+    "albedo.B",
+    "chain.U",
+    "chain.V",
+    "chain.mask",
+    "chain.weight",
 )
 SPLITS = ("train", "val", "test")
 Split = Literal["train", "val", "test", "novel"]
@@ -255,8 +280,10 @@ class SceneFrame(BaseModel):
     display_lut: str | None = None
 
 
-def require_channels(path: Path, present: Iterable[str], wanted: Iterable[str]) -> None:
-    """Raise ContractError naming the channels of ``path`` that are missing."""
+def require_channels(
+    path: Path, present: Iterable[str], wanted: Iterable[str], remedy: str = "run `dnrpipe prepare` again"
+) -> None:
+    """Raise ContractError naming the channels of ``path`` that are missing, and the ``remedy``."""
     missing = sorted(set(wanted) - set(present))
     if missing:
-        raise ContractError(f"{path}: channels {', '.join(missing)} are missing; run `dnrpipe prepare` again")
+        raise ContractError(f"{path}: channels {', '.join(missing)} are missing; {remedy}")

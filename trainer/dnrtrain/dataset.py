@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from .contract import RASTER_CHANNELS, ContractError, SceneFrame, View, require_channels
-from .display import DisplayTransform
+from .contract import BASE_CHANNELS, RASTER_CHANNELS, ContractError, SceneFrame, View, require_channels
+from .display import ALPHA_FLOOR, DisplayTransform
 
 INPUT_CHANNELS = ("depth.Z", "normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "mask", "coverage")
+Base = Literal["none", "raster", "baked", "direct", "path"]
 DIHEDRAL_ORDER = 8  # four quarter turns, each mirrored or not
 
 
@@ -28,6 +30,16 @@ class Batch:
     coverage  [N, 1, H, W] fraction of the pixel's area that surfaces cover
     view_dir  [N, 3, H, W] world-space unit vector from the surface towards the camera
     target    [N, 3, H, W] display RGB over white, or None
+
+    Only where a base image was loaded, else None; the base file's channels (see :mod:`dnrtrain.contract`):
+
+    base          [N, 3, H, W] linear Rec.709 radiance, straight (un-premultiplied)
+    diffuse       [N, 3, H, W] its diffuse part, straight
+    albedo        [N, 3, H, W] diffuse reflectance, straight
+    chain_uv      [N, 2, H, W] atlas coordinates at the end of the specular path, as ``uv``
+    chain_mask    [N, 1, H, W] 1 where the specular path ends on a surface
+    chain_weight  [N, 1, H, W] its throughput in [0, 1]
+    display       the scene's display transform (linear -> display RGB)
     """
 
     uv: Tensor
@@ -37,9 +49,20 @@ class Batch:
     coverage: Tensor
     view_dir: Tensor
     target: Tensor | None
+    base: Tensor | None = None
+    diffuse: Tensor | None = None
+    albedo: Tensor | None = None
+    chain_uv: Tensor | None = None
+    chain_mask: Tensor | None = None
+    chain_weight: Tensor | None = None
+    display: DisplayTransform | None = None
 
     def to(self, device: torch.device | str) -> Batch:
         return self._map(lambda tensor: tensor.to(device))
+
+    def crop(self, top: int, left: int, side: int) -> Batch:
+        """The window of ``side`` pixels whose first pixel is (``top``, ``left``), of all maps and the target alike."""
+        return self._map(lambda tensor: tensor[..., top : top + side, left : left + side])
 
     def augment(self, element: int) -> Batch:
         """Apply one of the eight symmetries of the square, inputs and target alike.
@@ -58,7 +81,7 @@ class Batch:
 
     def _map(self, function) -> Batch:  # type: ignore[no-untyped-def]
         values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Batch(**{k: None if v is None else function(v) for k, v in values.items()})  # pyright: ignore[reportArgumentType]
+        return replace(self, **{k: function(v) for k, v in values.items() if isinstance(v, Tensor)})
 
 
 @dataclass(frozen=True)
@@ -148,6 +171,8 @@ def load_views(
     cameras: Sequence[View],
     folder: Path,
     target: bool = True,
+    base: Base = "none",
+    base_files: Sequence[Path] | None = None,
 ) -> ViewSet:
     """Read views from EXR files in the contract's format.
 
@@ -157,6 +182,9 @@ def load_views(
         frame: near/far and display transform; ``folder`` is where its LUT lies.
         cameras: the views, same order as the files; they give names and view directions.
         target: False leaves the target None (inference on novel views).
+        base: the base image (``ModelSettings.base``). raster: the raster colour of the pass files plays its part,
+            all of it diffuse, without albedo and specular path; the other kinds are read from ``base_files``.
+        base_files: one file per view; wanted exactly when ``base`` is neither none nor raster.
 
     Raises:
         ContractError: counts differ, files missing or damaged, channels missing, mixed resolutions,
@@ -164,19 +192,24 @@ def load_views(
     """
     from .exr import read_exr
 
+    if (base in ("baked", "direct", "path")) != (base_files is not None):
+        raise ContractError(f"base image '{base}' with {'no ' if base_files is None else ''}base files: must agree")
+
     if not pass_files:
         raise ContractError("no views to load; run `dnrpipe prepare` first")
     if len(pass_files) != len(cameras) or (image_files is not None and len(image_files) != len(pass_files)):
         count = "none" if image_files is None else len(image_files)
         raise ContractError(f"{len(cameras)} cameras, {len(pass_files)} pass files, {count} images: must agree")
+    if base_files is not None and len(base_files) != len(pass_files):
+        raise ContractError(f"{len(pass_files)} pass files, {len(base_files)} base files: must agree")
     if frame.near >= frame.far:
         raise ContractError(f"frame.json: near {frame.near} is not below far {frame.far}; run `dnrpipe prepare` again")
     display = DisplayTransform(frame, folder)
     size = (cameras[0].height, cameras[0].width)
-    stacks: dict[str, list[Tensor]] = {f.name: [] for f in fields(Batch)}
+    stacks: dict[str, list[Tensor]] = {f.name: [] for f in fields(Batch) if f.name != "display"}
     for index, (pass_file, camera) in enumerate(zip(pass_files, cameras, strict=True)):
         channels, _ = read_exr(pass_file)
-        raster = target and image_files is None
+        raster = base == "raster" or (target and image_files is None)
         require_channels(pass_file, channels, (*INPUT_CHANNELS, *(RASTER_CHANNELS if raster else ())))
         _check_size(pass_file, channels, size, camera)
         inputs = _stack(pass_file, channels, INPUT_CHANNELS)
@@ -188,6 +221,12 @@ def load_views(
         stacks["mask"].append(mask)
         stacks["coverage"].append(inputs[7:8].clamp(0.0, 1.0))
         stacks["view_dir"].append(torch.from_numpy(-camera.ray_directions()).permute(2, 0, 1).contiguous())
+        if base_files is not None:
+            for name, tensor in _read_base(base_files[index], size, camera).items():
+                stacks[name].append(tensor)
+        elif base == "raster":
+            colour = _stack(pass_file, channels, RASTER_CHANNELS)
+            stacks["base"].append(_straight(colour[:3], colour[3:]))
         if not target:
             continue
         image_file = pass_file
@@ -198,8 +237,32 @@ def load_views(
             _check_size(image_file, channels, size, camera)
         colour = _stack(image_file, channels, RASTER_CHANNELS)
         stacks["target"].append(display.over_white(colour[:3], colour[3:]))
-    tensors = Batch(**{k: torch.stack(v) if v else None for k, v in stacks.items()})  # type: ignore[arg-type]
+    maps = {name: torch.stack(values) if values else None for name, values in stacks.items()}
+    tensors = Batch(**maps, display=None if base == "none" else display)  # type: ignore[arg-type]
     return ViewSet(tuple(c.name for c in cameras), np.stack([c.matrix for c in cameras]), tensors)
+
+
+def _read_base(path: Path, size: tuple[int, int], camera: View) -> dict[str, Tensor]:
+    """A base file's maps by their name in :class:`Batch`."""
+    from .exr import read_exr
+
+    channels, _ = read_exr(path)
+    require_channels(path, channels, BASE_CHANNELS, "delete it and run the stage again")
+    _check_size(path, channels, size, camera)
+    values = _stack(path, channels, BASE_CHANNELS)
+    alpha, mask = values[3:4], (values[12:13] > 0.5).float()
+    return {
+        "base": _straight(values[0:3], alpha),
+        "diffuse": _straight(values[4:7], alpha),
+        "albedo": _straight(values[7:10], alpha),
+        "chain_uv": (2.0 * values[10:12] - 1.0) * mask,
+        "chain_mask": mask,
+        "chain_weight": values[13:14].clamp(0.0, 1.0) * mask,
+    }
+
+
+def _straight(premultiplied: Tensor, alpha: Tensor) -> Tensor:
+    return premultiplied / alpha.clamp(ALPHA_FLOOR, 1.0)
 
 
 def _stack(path: Path, channels: dict[str, np.ndarray], names: Sequence[str]) -> Tensor:

@@ -15,8 +15,11 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from .contract import ContractError, SceneFrame
+from .precision import at_least_float32
 
 ALPHA_FLOOR = 1e-6
+GAMMA_FLOOR = 1e-6
+"""Below it Blender's extra gamma is its chord: the power's slope at black is infinite, and so would gradients be."""
 
 
 def srgb_oetf(linear: Tensor) -> Tensor:
@@ -64,9 +67,12 @@ class DisplayTransform:
 
     def __call__(self, radiance: Tensor) -> Tensor:
         """Linear Rec.709 radiance [..., 3, H, W] -> display RGB in [0, 1], same shape, float32."""
-        x = radiance.float() * self.scale
+        x = at_least_float32(radiance) * self.scale
         shown = srgb_oetf(x) if self.lut is None else self._look_up(x)
-        return shown if self.inverse_gamma == 1.0 else shown.clamp_min(0.0) ** self.inverse_gamma
+        if self.inverse_gamma == 1.0:
+            return shown
+        chord = shown * GAMMA_FLOOR ** (self.inverse_gamma - 1.0)
+        return torch.where(shown < GAMMA_FLOOR, chord, shown.clamp_min(GAMMA_FLOOR) ** self.inverse_gamma)
 
     def _look_up(self, x: Tensor) -> Tensor:
         """Trilinear look-up; node coordinate t = log2(1 + k x) / log2(1 + k max) per channel."""
@@ -74,7 +80,7 @@ class DisplayTransform:
         t = torch.log2(1 + self.k * x.clamp(0.0, self.maximum)) / float(np.log2(1 + self.k * self.maximum))
         flat = t.reshape(-1, 3, t.shape[-2] * t.shape[-1])
         grid = (2 * flat - 1).flip(1).permute(0, 2, 1).reshape(1, 1, 1, -1, 3)
-        sampled = F.grid_sample(self.lut.to(x.device), grid, align_corners=True, padding_mode="border")
+        sampled = F.grid_sample(self.lut.to(x), grid, align_corners=True, padding_mode="border")
         return sampled.reshape(3, flat.shape[0], -1).transpose(0, 1).reshape(x.shape).clamp(0.0, 1.0)
 
     def over_white(self, premultiplied: Tensor, alpha: Tensor) -> Tensor:
@@ -83,6 +89,6 @@ class DisplayTransform:
         c = display(rgb / alpha) · alpha + (1 − alpha): un-premultiply, display transform, then composite
         in display space. NeRF-Synthetic's PNGs are composed so (8-bit straight RGBA over white).
         """
-        cover = alpha.float().clamp(0.0, 1.0)
-        straight = premultiplied.float() / cover.clamp_min(ALPHA_FLOOR)
+        cover = at_least_float32(alpha).clamp(0.0, 1.0)
+        straight = at_least_float32(premultiplied) / cover.clamp_min(ALPHA_FLOOR)
         return self(straight) * cover + (1.0 - cover)

@@ -15,6 +15,7 @@ from torch import Tensor
 from .metrics import ssim
 from .model import Output
 from .perceptual import PerceptualLoss
+from .precision import at_least_float32
 from .settings import Step2Settings
 
 
@@ -35,7 +36,7 @@ def frequency(prediction: Tensor, target: Tensor) -> Tensor:
     the complex modulus: the modulus has no gradient at 0, where a good prediction lives. Always float32:
     half-precision transforms give NaN and want powers of two.
     """
-    spectrum = torch.fft.rfft2((prediction - target).float(), norm="ortho")
+    spectrum = torch.fft.rfft2(at_least_float32(prediction - target), norm="ortho")
     return torch.view_as_real(spectrum).abs().sum(dim=-1).mean()
 
 
@@ -50,7 +51,8 @@ def total_variation(prediction: Tensor) -> Tensor:
 
 def texture_regularisation(texture: Tensor) -> Tensor:
     """L_reg(T) = mean T²: keeps the spatial neural texture small."""
-    return texture.square().mean()
+    # Channels last, as it lies in memory: the mean's gradient takes its input's order of dimensions.
+    return texture.permute(0, 2, 3, 1).square().mean()
 
 
 def random_crop(prediction: Tensor, target: Tensor, side: int, random: np.random.Generator) -> tuple[Tensor, Tensor]:

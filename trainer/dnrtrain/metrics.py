@@ -13,6 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from .perceptual import Lpips
+from .precision import at_least_float32
 
 PSNR_CEILING = 100.0
 """dB reported for (nearly) identical images: infinity is neither JSON nor a sensible mean."""
@@ -61,17 +62,20 @@ def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
     Gaussian window 11×11, σ = 1.5, population statistics, data range fixed at 1: a flat pair gives 1, not
     0/0. Sides shorter than 11 use the largest odd window that fits. Differentiable.
     """
-    x, y = prediction.float(), target.float()
-    moments = torch.cat([x, y, x * x, y * y, x * y], dim=1)
-    for axis in (2, 3):
-        moments = _blur(moments, axis)
-    mean_x, mean_y, square_x, square_y, product = moments.chunk(5, dim=1)
+    x, y = at_least_float32(prediction), at_least_float32(target)
+    # The target's own moments apart: in training they need no gradient.
+    mean_y, square_y = _window_means(torch.cat([y, y * y], dim=1)).chunk(2, dim=1)
+    mean_x, square_x, product = _window_means(torch.cat([x, x * x, x * y], dim=1)).chunk(3, dim=1)
     covariance = product - mean_x * mean_y
     # Rounding can make a flat patch's variance slightly negative.
     variance_x = (square_x - mean_x * mean_x).clamp_min(0.0)
     variance_y = (square_y - mean_y * mean_y).clamp_min(0.0)
     numerator = (2 * mean_x * mean_y + SSIM_C1) * (2 * covariance + SSIM_C2)
     return numerator / ((mean_x * mean_x + mean_y * mean_y + SSIM_C1) * (variance_x + variance_y + SSIM_C2))
+
+
+def _window_means(x: Tensor) -> Tensor:
+    return _blur(_blur(x, 2), 3)
 
 
 def _blur(x: Tensor, axis: int) -> Tensor:
@@ -82,7 +86,7 @@ def _blur(x: Tensor, axis: int) -> Tensor:
     """
     side, channels = x.shape[axis], x.shape[1]
     size = min(SSIM_WINDOW, side if side % 2 else side - 1) if side > 1 else 1
-    offsets = torch.arange(size, dtype=torch.float32, device=x.device) - (size - 1) / 2
+    offsets = torch.arange(size, dtype=x.dtype, device=x.device) - (size - 1) / 2
     weights = torch.exp(-0.5 * (offsets / SSIM_SIGMA) ** 2)
     shape = (1, 1, size, 1) if axis == 2 else (1, 1, 1, size)
     kernel = (weights / weights.sum()).view(shape).expand(channels, 1, -1, -1)

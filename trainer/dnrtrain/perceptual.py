@@ -13,6 +13,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from .precision import at_least_float32
+
 Network = Literal["vgg", "alex"]
 
 # (channels, kernel, stride, padding) per convolution; "M" is the network's max-pooling.
@@ -68,28 +70,45 @@ class Features(nn.Module):
             layer.load_state_dict({"weight": weights[f"conv.{index}.weight"], "bias": weights[f"conv.{index}.bias"]})
             self.convolutions.append(layer)
             inputs = channels
+        self.narrow: list[tuple[Tensor, Tensor]] = []
         self.requires_grad_(False)
         self.eval()
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, image: Tensor, *, bfloat16: bool = False) -> list[Tensor]:
         """Display RGB in [0, 1], [N, 3, H, W] -> ReLU features per tap (float32 or bfloat16)."""
-        x = ((2.0 * image.float() - 1.0) - self.shift) / self.scale
+        x = ((2.0 * at_least_float32(image) - 1.0) - self.shift) / self.scale
         x = x.contiguous(memory_format=torch.channels_last)
+        weights = self._weights(x.device, bfloat16=bfloat16)
+        x = x.bfloat16() if bfloat16 else x
         found: list[Tensor] = []
         index = 0
-        with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=bfloat16):
-            for item in LAYOUT[self.network]:
-                if isinstance(item, str):
-                    x = F.max_pool2d(x, POOL[self.network], 2)
-                    continue
-                x = F.relu(self.convolutions[index](x))
-                if index in self.taps:
-                    found.append(x)
-                if index == self.taps[-1]:
-                    break
-                index += 1
+        for item in LAYOUT[self.network]:
+            if isinstance(item, str):
+                x = F.max_pool2d(x, POOL[self.network], 2)
+                continue
+            weight, bias = weights[index]
+            _, _, stride, padding = item
+            x = F.relu(F.conv2d(x, weight, bias, stride=stride, padding=padding))
+            if index in self.taps:
+                found.append(x)
+            if index == self.taps[-1]:
+                break
+            index += 1
         return found
+
+    def _weights(self, device: torch.device, *, bfloat16: bool) -> list[tuple[Tensor, Tensor]]:
+        """Weight and bias of each convolution.
+
+        The bfloat16 ones are rounded once: autocast would round frozen weights anew in every call, a seventh of
+        its time on 64x64 windows.
+        """
+        layers = [(layer.weight, layer.bias) for layer in self.convolutions]
+        if not bfloat16:
+            return layers  # pyright: ignore[reportReturnType]
+        if not self.narrow or self.narrow[0][0].device != device:
+            self.narrow = [(weight.bfloat16(), bias.bfloat16()) for weight, bias in layers]
+        return self.narrow
 
 
 class Lpips(nn.Module):
@@ -143,8 +162,10 @@ class PerceptualLoss(nn.Module):
 
 
 def _weighted_l1(found: Sequence[Tensor], wanted: Sequence[Tensor]) -> Tensor:
-    terms = [weight * (a - b).abs().float().mean() for weight, a, b in zip(LOSS_WEIGHTS, found, wanted, strict=True)]
-    return torch.stack(terms).sum()
+    # The mean's gradient is laid out in the order of its input's dimensions. With channels last as they lie in
+    # memory, the whole backward pass stays in one layout.
+    distances = [at_least_float32((a - b).abs()).permute(0, 2, 3, 1).mean() for a, b in zip(found, wanted, strict=True)]
+    return torch.stack([weight * distance for weight, distance in zip(LOSS_WEIGHTS, distances, strict=True)]).sum()
 
 
 def _unit(feature: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ bfloat16, not float16: it has float32's range, so no loss scaling and no overflo
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 
 def decide_bfloat16(setting: str, device: str) -> bool:
@@ -20,3 +21,8 @@ def decide_bfloat16(setting: str, device: str) -> bool:
         return torch.cuda.is_bf16_supported()
     capabilities = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
     return bool(capabilities.get("amx_bf16") or capabilities.get("avx512_bf16"))
+
+
+def at_least_float32(x: Tensor) -> Tensor:
+    """bfloat16 and float16 -> float32. float32 stays as it is, and so does float64: gradients are checked in it."""
+    return x if x.dtype == torch.float64 else x.float()

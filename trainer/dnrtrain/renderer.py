@@ -6,12 +6,20 @@ layer (it erases absolute colour), no tanh. The output is linear in display spac
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from .precision import at_least_float32
+from .settings import ModelSettings
+
 SLOPE = 0.2
 MAX_CHANNELS = 512
+DETAIL = 16
+"""Full-resolution features per pixel beside the half-resolution U-Net."""
 
 
 class Block(nn.Module):
@@ -28,13 +36,13 @@ class Block(nn.Module):
 
 
 class UNet(nn.Module):
-    """``depth`` halvings, skip connections, 3 outputs.
+    """``depth`` halvings, skip connections.
 
     Level i has width · 2^i channels (at most MAX_CHANNELS). Going up, channels are reduced *before* the
     nearest-neighbour enlargement: four times fewer operations than after it.
     """
 
-    def __init__(self, inputs: int, width: int, depth: int) -> None:
+    def __init__(self, inputs: int, width: int, depth: int, outputs: int = 3) -> None:
         super().__init__()
         channels = [min(width << level, MAX_CHANNELS) for level in range(depth + 1)]
         self.depth = depth
@@ -43,25 +51,97 @@ class UNet(nn.Module):
         self.inner = nn.ModuleList(nn.Conv2d(channels[i + 1], channels[i + 1], 3, padding=1) for i in range(depth))
         self.reduce = nn.ModuleList(nn.Conv2d(channels[i + 1], channels[i], 1) for i in range(depth))
         self.merge = nn.ModuleList(Block(2 * channels[i], channels[i]) for i in range(depth))
-        self.head = nn.Conv2d(channels[0], 3, 1)
+        self.head = nn.Conv2d(channels[0], outputs, 1)
 
-    def forward(self, x: Tensor, *, bfloat16: bool) -> Tensor:
-        """[N, inputs, H, W] -> [N, 3, H, W] float32; any H and W (padded by replication, cropped back)."""
+    def forward(self, groups: Sequence[Tensor], *, bfloat16: bool) -> Tensor:
+        """[N, inputs, H, W] per group -> [N, outputs, H, W] float32; any H and W (padded, cropped back)."""
+        x = torch.cat(list(groups), dim=1)
         height, width = x.shape[-2:]
-        multiple = 1 << self.depth
-        right, bottom = -width % multiple, -height % multiple
-        if right or bottom:
-            x = F.pad(x, (0, right, 0, bottom), mode="replicate")
-        x = x.contiguous(memory_format=torch.channels_last)
+        x = pad_to_multiple(x, 1 << self.depth).contiguous(memory_format=torch.channels_last)
         with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=bfloat16):
-            x = self.stem(x)
-            skips: list[Tensor] = []
-            for down, inner in zip(self.down, self.inner, strict=True):
-                skips.append(x)
-                x = F.leaky_relu(down(x), SLOPE)
-                x = F.leaky_relu(inner(x), SLOPE)
-            for level in reversed(range(self.depth)):
-                x = F.interpolate(self.reduce[level](x), scale_factor=2.0, mode="nearest")
-                x = self.merge[level](torch.cat([x, skips[level]], dim=1))
+            x = self.features(x)
         # bfloat16 would quantise the result to 1/256: the last layer is float32.
-        return self.head(x.float())[..., :height, :width]
+        return self.head(at_least_float32(x))[..., :height, :width]
+
+    def features(self, x: Tensor) -> Tensor:
+        """[N, inputs, H, W] -> [N, width, H, W]; H and W are multiples of 2^depth."""
+        x = self.stem(x)
+        skips: list[Tensor] = []
+        for down, inner in zip(self.down, self.inner, strict=True):
+            skips.append(x)
+            x = F.leaky_relu(down(x), SLOPE)
+            x = F.leaky_relu(inner(x), SLOPE)
+        for level in reversed(range(self.depth)):
+            x = F.interpolate(self.reduce[level](x), scale_factor=2.0, mode="nearest")
+            x = self.merge[level](torch.cat([x, skips[level]], dim=1))
+        return x
+
+
+class HalfUNet(nn.Module):
+    """A U-Net at half resolution between per-pixel layers at full resolution.
+
+    Each pixel's inputs become DETAIL features; the U-Net sees four pixels' features as one (a strided convolution)
+    and answers with DETAIL features for each of the four (pixel-shuffle); the last layers see both, and those of the
+    pixel's neighbours. So the four times cheaper U-Net carries context, and what changes from pixel to pixel (texture,
+    edges, grain) passes by its side.
+
+    The inputs come in groups: one wide map of them all would have to be put together and turned around in memory,
+    which costs as much as the layer that reads it.
+    """
+
+    def __init__(self, groups: Sequence[int], width: int, depth: int, outputs: int) -> None:
+        super().__init__()
+        self.depth = depth
+        self.point = nn.ModuleList(nn.Conv2d(inputs, DETAIL, 1, bias=i == 0) for i, inputs in enumerate(groups))
+        self.gather = nn.Conv2d(DETAIL, width, 2, stride=2)
+        self.unet = UNet(width, width, depth, outputs=4 * DETAIL)
+        self.mix = nn.Conv2d(2 * DETAIL, DETAIL, 3, padding=1)
+        self.head = nn.Conv2d(DETAIL, outputs, 1)
+
+    def forward(self, groups: Sequence[Tensor], *, bfloat16: bool) -> Tensor:
+        """[N, inputs, H, W] per group -> [N, outputs, H, W] float32; any H and W (padded, cropped back)."""
+        first = groups[0]
+        height, width = first.shape[-2:]
+        with torch.autocast(first.device.type, dtype=torch.bfloat16, enabled=bfloat16):
+            detail = self.point[0](first)
+            for layer, maps in zip(self.point[1:], groups[1:], strict=True):
+                detail = detail + layer(maps)
+            detail = pad_to_multiple(F.leaky_relu(detail, SLOPE), 2 << self.depth)
+            context = self.unet.head(self.unet.features(F.leaky_relu(self.gather(detail), SLOPE)))
+            x = torch.cat([detail, F.pixel_shuffle(context, 2)], dim=1)
+            x = F.leaky_relu(self.mix(x), SLOPE)
+        return self.head(at_least_float32(x))[..., :height, :width]
+
+
+class PixelMLP(nn.Module):
+    """Every pixel by itself: three hidden layers of 4 width channels. The U-Net's rival at equal cost."""
+
+    def __init__(self, inputs: int, width: int, outputs: int) -> None:
+        super().__init__()
+        hidden = 4 * width
+        self.layers = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in pairwise([inputs, hidden, hidden, hidden]))
+        self.head = nn.Conv2d(hidden, outputs, 1)
+
+    def forward(self, groups: Sequence[Tensor], *, bfloat16: bool) -> Tensor:
+        """[N, inputs, H, W] per group -> [N, outputs, H, W] float32."""
+        x = torch.cat(list(groups), dim=1).contiguous(memory_format=torch.channels_last)
+        with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=bfloat16):
+            for layer in self.layers:
+                x = F.leaky_relu(layer(x), SLOPE)
+        return self.head(at_least_float32(x))
+
+
+def pad_to_multiple(x: Tensor, multiple: int) -> Tensor:
+    """Replicate the right and bottom border until both sides are multiples."""
+    right, bottom = -x.shape[-1] % multiple, -x.shape[-2] % multiple
+    return F.pad(x, (0, right, 0, bottom), mode="replicate") if right or bottom else x
+
+
+def build_renderer(groups: Sequence[int], settings: ModelSettings) -> UNet | HalfUNet | PixelMLP:
+    """The network that ``settings.network`` and ``settings.stride`` name, for inputs in groups of so many channels."""
+    outputs = 3 if settings.base == "none" else 6 + settings.filter**2
+    if settings.network == "mlp":
+        return PixelMLP(sum(groups), settings.width, outputs)
+    if settings.stride == 2:
+        return HalfUNet(groups, settings.width, settings.depth, outputs)
+    return UNet(sum(groups), settings.width, settings.depth, outputs)

@@ -9,7 +9,8 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -73,6 +74,57 @@ def guarded_step(optimiser: torch.optim.Optimizer, loss: Tensor, rate: float) ->
         group["lr"] = rate * group["scale"]
     optimiser.step()
     return True
+
+
+class Averaged:
+    """Exponential moving average of a module's parameters, bias-corrected as Adam's moments are.
+
+    Late weights of a noisy training differ from step to step; their average is what renders best.
+    """
+
+    def __init__(self, module: nn.Module, decay: float) -> None:
+        self.decay, self.steps = decay, 0
+        self.parameters = dict(module.named_parameters())
+        self.sums = {name: torch.zeros_like(p, requires_grad=False) for name, p in self.parameters.items()}
+
+    @torch.no_grad()
+    def update(self) -> None:
+        """Take in the parameters as they are now (once per optimiser step)."""
+        self.steps += 1
+        torch._foreach_lerp_(list(self.sums.values()), list(self.parameters.values()), 1.0 - self.decay)
+
+    def weights(self) -> dict[str, Tensor]:
+        """The average so far; the parameters themselves before the first step."""
+        if self.steps == 0:
+            return {name: p.detach().clone() for name, p in self.parameters.items()}
+        correction = 1.0 - self.decay**self.steps
+        return {name: value / correction for name, value in self.sums.items()}
+
+    def restore(self, sums: dict[str, Tensor], steps: int) -> None:
+        """Go on from saved ``sums`` and ``steps``."""
+        self.steps = steps
+        for name, value in sums.items():
+            self.sums[name].copy_(value)
+
+
+@contextmanager
+def averaged_weights(module: nn.Module, average: Averaged | None) -> Iterator[None]:
+    """``module`` with the averaged weights inside the block, its own again after it; None changes nothing."""
+    if average is None:
+        yield
+        return
+    own = {name: p.detach().clone() for name, p in module.named_parameters()}
+    _put(module, average.weights())
+    try:
+        yield
+    finally:
+        _put(module, own)
+
+
+@torch.no_grad()
+def _put(module: nn.Module, weights: dict[str, Tensor]) -> None:
+    for name, parameter in module.named_parameters():
+        parameter.copy_(weights[name])
 
 
 @dataclass

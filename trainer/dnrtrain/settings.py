@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 class Strict(BaseModel):
@@ -29,6 +29,39 @@ class ModelSettings(Strict):
     modalities: Literal["uv", "uv+depth", "uv+normal", "uv+depth+normal"] = "uv+depth+normal"
     width: int = Field(default=64, ge=4, le=512, description="channels of the U-Net's first level")
     depth: int = Field(default=4, ge=1, le=6, description="down-samplings of the U-Net")
+    base: Literal["none", "raster", "baked", "direct", "path"] = Field(
+        default="none",
+        description="image that the network corrects; raster: rasterised colour, baked: baked light and specular"
+        " paths, path: a few path-traced samples, denoised",
+    )
+    guides: bool = Field(
+        default=False, description="view and reflection direction, normal, albedo and specular part as network inputs"
+    )
+    chain: bool = Field(default=False, description="look the UV texture up at the end of the specular path, too")
+    stride: Literal[1, 2] = Field(default=1, description="2: U-Net at half resolution between full-resolution layers")
+    network: Literal["unet", "mlp"] = Field(default="unet", description="mlp: pixels by themselves, 4 width channels")
+    filter: Literal[0, 3] = Field(
+        default=0, description="side of the per-pixel kernels that smooth the base image; 0 = none"
+    )
+    output: Literal["display", "log"] = Field(
+        default="display", description="space in which the network corrects the base; log keeps highlights"
+    )
+
+    @model_validator(mode="after")
+    def _fits(self) -> ModelSettings:
+        if self.chain and self.base not in ("baked", "direct", "path"):
+            raise ValueError("chain needs base = baked, direct or path: their files hold the specular path")
+        if self.chain and self.aggregator == "early":
+            raise ValueError("chain needs a neural texture; aggregator = early has none")
+        if self.base == "none" and (self.output == "log" or self.filter):
+            raise ValueError("output = log and filter work on a base image; base is none")
+        return self
+
+    def coarse(self) -> ModelSettings:
+        """The model of step 1, which sees rasterised images only: no base image and nothing that comes with it."""
+        fresh = ModelSettings()
+        parts = ("base", "guides", "chain", "filter", "output")
+        return self.model_copy(update={name: getattr(fresh, name) for name in parts})
 
 
 class Step1Settings(Strict):
@@ -77,6 +110,13 @@ class Step2Settings(Strict):
     learning_rate_end: float = Field(default=1e-4, gt=0)
     texture_rate_scale: float = Field(default=1.0, gt=0, description="learning rate of texels over the networks'")
     photometric: Literal["l1", "mse"] = "mse"
+    start: Literal["coarse", "fresh"] = Field(
+        default="coarse", description="coarse: the weights of step 1, as far as they fit; fresh: new ones"
+    )
+    ema: float = Field(
+        default=0.0, ge=0, lt=1, description="decay per step of the averaged weights that become the model; 0 = off"
+    )
+    patch: int = Field(default=0, ge=0, description="side of the random square to train on; 0 = whole image")
     augment: bool = Field(default=True, description="random flips and quarter turns")
     precision: Literal["auto", "float32", "bfloat16"] = Field(
         default="auto", description="auto: bfloat16 where it is fast"

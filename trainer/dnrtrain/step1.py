@@ -65,6 +65,7 @@ def run_step1(
     Args:
         views: all N candidates, targets = rasterised images.
         val: validation views with rasterised targets, or None.
+        model: of the whole run; step 1 trains its :meth:`~dnrtrain.settings.ModelSettings.coarse` part.
         camera_positions: centres of the candidates' cameras in world space, [N, 3] (policy ``farthest``).
         policy: rl, random or farthest.
         budget: M, the number of views to select, 1 <= M <= N.
@@ -105,6 +106,7 @@ class _Step1:
         self.views, self.val = views.to(device), None if val is None else val.to(device)
         self.settings, self.policy, self.budget, self.seed = settings, policy, budget, seed
         self.device, self.folder, self.fingerprint = device, Path(folder), fingerprint
+        model = model.coarse()
         parts = [model.model_dump(), settings.model_dump(), policy, budget, seed, device]
         self.key = run_key(fingerprint, views, parts)
         self.episodes = -(-len(views) // budget)

@@ -5,20 +5,24 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from . import checkpoint
 from .contract import ContractError
-from .dataset import DIHEDRAL_ORDER, ViewSet
+from .dataset import DIHEDRAL_ORDER, Batch, ViewSet
 from .events import EpochEnd, Event, Note
 from .losses import Step2Loss
+from .model import DNR
 from .perceptual import PerceptualLoss
 from .precision import decide_bfloat16
 from .schedule import (
     STEP2,
+    Averaged,
     EpochBook,
     adam,
+    averaged_weights,
     guarded_step,
     learning_rate,
     require_target,
@@ -47,7 +51,7 @@ def run_step2(
     Args:
         views: the M selected views, targets = ray-traced images.
         val: views with held-out targets, or None.
-        coarse: folder of the finished step 1.
+        coarse: folder of the finished step 1; with ``start = fresh`` it is not read.
         checkpoints: this step's own folder; see :func:`dnrtrain.step1.run_step1` on resuming.
         weights: from :func:`dnrtrain.weights.load_weights`; None drops L_p with a note, and the record says
             ``"perceptual": false``.
@@ -79,16 +83,15 @@ class _Step2:
         self.views, self.val = views.to(device), None if val is None else val.to(device)
         self.settings, self.seed, self.device = settings, seed, device
         self.folder, self.fingerprint = Path(folder), fingerprint
-        self.dnr = checkpoint.load_model(coarse, device)
-        if self.dnr.settings != model:
-            raise ContractError(f"{coarse}: was trained with other model settings; run `dnrpipe select` again")
+        self.notes: list[str] = []
+        self.dnr = DNR(model, seed).to(device) if settings.start == "fresh" else self._from_coarse(coarse, model)
         self.dnr.train()
         self.wants_perceptual = settings.loss.perceptual > 0
         perceptual = None
         if weights is not None and self.wants_perceptual:
             perceptual = PerceptualLoss(weights["vgg"]).to(device)
         self.loss = Step2Loss(settings, perceptual)
-        record = checkpoint.read_record(coarse)
+        record = checkpoint.read_record(coarse) if settings.start == "coarse" else None
         parts = [
             model.model_dump(), settings.model_dump(), seed, device, perceptual is not None,
             None if record is None else record.get("run"),
@@ -96,7 +99,28 @@ class _Step2:
         self.key = run_key(fingerprint, views, parts)
         self.steps_per_epoch = -(-len(views) // settings.batch)
         self.optimiser = adam([self.dnr], settings.learning_rate, device, settings.texture_rate_scale)
+        self.average = Averaged(self.dnr, settings.ema) if settings.ema else None
         self.history: list[dict] = []
+
+    def _from_coarse(self, folder: Path, model: ModelSettings) -> DNR:
+        """Step 1's renderer; where ``model`` has parts that the coarse one lacks, those start fresh."""
+        coarse = checkpoint.load_model(folder, self.device)
+        if coarse.settings == model:
+            return coarse
+        if coarse.settings != model.coarse():
+            raise ContractError(f"{folder}: was trained with other model settings; run `dnrpipe select` again")
+        dnr = DNR(model, self.seed).to(self.device)
+        known, own = coarse.state_dict(), dnr.state_dict()
+        # The last layer says how the picture comes about, which a base image changes.
+        fits = {
+            name: value
+            for name, value in known.items()
+            if name in own and own[name].shape == value.shape and not name.startswith("renderer.head.")
+        }
+        dnr.load_state_dict(fits, strict=False)
+        dnr.use_bfloat16 = coarse.use_bfloat16
+        self.notes.append(f"step 2 takes {len(fits)} of {len(own)} tensors from step 1; the others start fresh")
+        return dnr
 
     def events(self) -> Iterator[Event]:
         record = checkpoint.read_record(self.folder)
@@ -105,6 +129,8 @@ class _Step2:
             return
         if self.wants_perceptual and self.loss.perceptual is None:
             yield Note("perceptual weights are missing: training goes on without the loss term L_p")
+        for text in self.notes:
+            yield Note(text)
         first = self._restore()
         if first:
             yield Note(f"step 2 continues after epoch {first} of {self.settings.epochs}")
@@ -121,7 +147,8 @@ class _Step2:
             "bfloat16": self.dnr.use_bfloat16,
             "history": self.history,
         }
-        checkpoint.save_model(self.folder, self.dnr, info)
+        with averaged_weights(self.dnr, self.average):
+            checkpoint.save_model(self.folder, self.dnr, info)
 
     def _epoch(self, epoch: int) -> EpochEnd:
         s, book = self.settings, EpochBook()
@@ -132,15 +159,20 @@ class _Step2:
             random = step_random(self.seed, STEP2, epoch, step)
             chosen = order[step * s.batch : (step + 1) * s.batch]
             batch = self.views.batch([int(i) for i in chosen])
+            batch = random_patch(batch, s.patch, random)
             if s.augment:
                 batch = batch.augment(int(random.integers(DIHEDRAL_ORDER)))
             assert batch.target is not None
             rate = learning_rate(epoch * self.steps_per_epoch + step, total, s.learning_rate, s.learning_rate_end)
             loss, terms = self.loss(self.dnr(batch), batch.target, random, bfloat16=self.dnr.use_bfloat16)
-            book.count(guarded_step(self.optimiser, loss, rate))
+            taken = guarded_step(self.optimiser, loss, rate)
+            book.count(taken)
+            if taken and self.average is not None:
+                self.average.update()
             values = torch.stack([loss, *terms.values()]).detach().tolist()
             book.add(**dict(zip(["total", *terms], values, strict=True)))
-        scores = validate(self.dnr, self.val, s.validation_views)
+        with averaged_weights(self.dnr, self.average):
+            scores = validate(self.dnr, self.val, s.validation_views)
         entry = book.entry(epoch + 1, rate, scores)
         self.history.append(entry)
         self._save(epoch + 1)
@@ -161,17 +193,35 @@ class _Step2:
         tensors = checkpoint.prefixed("dnr", self.dnr.state_dict())
         tensors |= checkpoint.prefixed("adam", checkpoint.optimiser_tensors(self.optimiser))
         info = {"run": self.key, "epoch": epoch, "bfloat16": self.dnr.use_bfloat16, "history": self.history}
+        if self.average is not None:
+            tensors |= checkpoint.prefixed("average", self.average.sums)
+            info["average_steps"] = self.average.steps
         checkpoint.save_state(self.folder, tensors, info)
 
     def _restore(self) -> int:
         """Load the state of an interrupted run of the same key; -> epochs done. Else start afresh."""
         saved = checkpoint.load_state(self.folder)
         if saved is None or saved.info.get("run") != self.key:
-            if self.settings.precision != "auto":  # auto: as step 1 decided
+            if self.settings.precision != "auto" or self.settings.start == "fresh":  # else as step 1 decided
                 self.dnr.use_bfloat16 = decide_bfloat16(self.settings.precision, self.device)
             self._save(0)
             return 0
         self.dnr.use_bfloat16, self.history = saved.info["bfloat16"], saved.info["history"]
         checkpoint.load_module(self.dnr, checkpoint.unprefixed("dnr", saved.tensors))
         checkpoint.restore_optimiser(self.optimiser, checkpoint.unprefixed("adam", saved.tensors))
+        if self.average is not None:
+            self.average.restore(checkpoint.unprefixed("average", saved.tensors), saved.info["average_steps"])
         return int(saved.info["epoch"])
+
+
+def random_patch(batch: Batch, side: int, random: np.random.Generator) -> Batch:
+    """The same random ``side``×``side`` window of all maps; 0, or no smaller than the image: all of it.
+
+    Memory and time of a step then depend on the window, not on the image.
+    """
+    height, width = batch.mask.shape[-2:]
+    if side == 0 or (side >= height and side >= width):
+        return batch
+    top = int(random.integers(max(1, height - side + 1)))
+    left = int(random.integers(max(1, width - side + 1)))
+    return batch.crop(top, left, side)

@@ -93,6 +93,8 @@ def spherical_harmonics(direction: Tensor) -> Tensor:
 
 def apply_harmonics(texture: Tensor, direction: Tensor) -> Tensor:
     """Multiply channels 4 to 12 (one-based) of ``texture`` [N, C, H, W] by the nine harmonics."""
-    first, last = SH_FIRST_CHANNEL, SH_FIRST_CHANNEL + SH_COUNT
-    shaded = texture[:, first:last] * spherical_harmonics(direction)
-    return torch.cat([texture[:, :first], shaded, texture[:, last:]], dim=1)
+    # One product in the texture's own memory layout: backward, a concatenation of channel ranges takes eight times
+    # as long.
+    factors = torch.ones_like(texture)
+    factors[:, SH_FIRST_CHANNEL : SH_FIRST_CHANNEL + SH_COUNT] = spherical_harmonics(direction)
+    return texture * factors

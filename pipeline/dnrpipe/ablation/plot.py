@@ -12,7 +12,7 @@ from dnrtrain.atomic import atomic_path
 from .tables import Figures
 
 PANELS = (("psnr", "PSNR, dB (higher is better)"), ("lpips_vgg", "LPIPS VGG (lower is better)"))
-SIDE, GAP, HEAD, COLUMNS = 192, 6, 22, 5
+SIDE, GAP, HEAD, COLUMNS = 256, 6, 22, 5
 
 
 def plot(results: Mapping[str, Any], path: Path) -> None:

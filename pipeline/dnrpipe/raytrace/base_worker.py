@@ -16,18 +16,20 @@ from dnrtrain.exr import write_exr
 from .base import BaseRenderer
 from .denoise import denoise
 from .engine import Engine
+from .frames import Frames
 from .light_worker import read_light
 from .units import scaled_view
 
 COLOUR = ("base.R", "base.G", "base.B", "base.A")
+MIRROR = 0.02
+"""Diffuse reflectance below which a surface counts as mirror or glass."""
 
 
 class Worker:
     """Renders base images.
 
-    common: {"bundle", "variant", "kind", "samples"}; kind baked: also "light" (its file); kinds direct and path: also
-    "integrator", "max_depth", "spp", "seed": path-traced samples, denoised with albedo and normal, take the place of
-    the colour.
+    common: {"bundle", "variant", "kind", "samples"}; kind baked: also "light" (its file) and "denoise"; kinds direct
+    and path: also "integrator", "max_depth", "spp", "seed": path-traced samples, denoised, take the colour's place.
     task: {"view": View as JSON, "output", "fingerprint"}
     """
 
@@ -41,6 +43,7 @@ class Worker:
         light = read_light(Path(common["light"])) if baked else np.zeros((2, 2, 2, 3), np.float32)
         scene = self.engine.scenes[str(self.bundle)]
         self.renderer = BaseRenderer(self.engine.mi, scene, light, int(common["samples"]))
+        self.silhouettes: dict[tuple[int, int], Frames] = {}
         self.warm = False
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
@@ -67,9 +70,17 @@ class Worker:
     def _channels(self, view: View) -> dict[str, np.ndarray]:
         channels = self.renderer.frame(scaled_view(view, self.engine.unit_scale))
         channels["depth.Z"] = channels["depth.Z"] / self.engine.unit_scale
+        channels["coverage"] = self._frames(view).coverage(view, channels["mask"] > 0.5)
         if self.common["kind"] != "baked":
-            channels |= self._traced(view, channels)
-        return channels
+            return channels | self._traced(view, channels)
+        return channels | denoised(channels) if self.common["denoise"] else channels
+
+    def _frames(self, view: View) -> Frames:
+        """Finer silhouettes than the base image's few rays give, for views of one size."""
+        size = (view.width, view.height)
+        if size not in self.silhouettes:
+            self.silhouettes[size] = Frames(self.engine, self.bundle, "path", 2, size)
+        return self.silhouettes[size]
 
     def _traced(self, view: View, channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """A few path-traced samples, denoised, as the colour."""
@@ -78,8 +89,21 @@ class Worker:
         sensor = self.engine.sensor(view)
         picture, _ = self.engine.frame(self.bundle, integrator, sensor, view, int(common["spp"]), int(common["seed"]))
         picture = np.where(np.isfinite(picture).all(axis=-1, keepdims=True), picture, 0).astype(np.float32)
-        albedo = np.stack([channels[f"albedo.{c}"] for c in "RGB"], axis=-1).clip(0, 1)
-        normal = np.stack([channels[f"normal.{c}"] for c in "XYZ"], axis=-1)
-        clean = denoise(picture, albedo, normal, threads=1)
-        result = {name: clean[..., i] for i, name in enumerate(COLOUR)}
-        return result | {f"diffuse.{c}": clean[..., i] for i, c in enumerate("RGB")}
+        found = channels | {name: picture[..., i] for i, name in enumerate(COLOUR)}
+        clean = denoised(found)
+        return clean | {"base.A": found["base.A"]} | {f"diffuse.{c}": clean[f"base.{c}"] for c in "RGB"}
+
+
+def denoised(channels: dict[str, np.ndarray], threads: int = 1) -> dict[str, np.ndarray]:
+    """base.R/G/B without grain. One thread: bits repeat.
+
+    The auxiliary images are not called clean: measured, that is better by half a decibel and more (docs/base.md).
+    """
+    image = np.stack([channels[name] for name in COLOUR], axis=-1)
+    albedo = np.stack([channels[f"albedo.{c}"] for c in "RGB"], axis=-1)
+    # Open Image Denoise wants white where there is nothing but mirrors and glass.
+    mirror = (albedo.mean(axis=-1, keepdims=True) < MIRROR) & (channels["mask"][..., None] > 0.5)
+    albedo = np.where(mirror, np.float32(1), albedo).clip(0, 1)
+    normal = np.stack([channels[f"normal.{c}"] for c in "XYZ"], axis=-1)
+    clean = denoise(image, albedo, normal, clean=False, quality="fast", threads=threads)
+    return {name: clean[..., i] for i, name in enumerate(COLOUR[:3])}

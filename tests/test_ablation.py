@@ -1,0 +1,295 @@
+"""`dnrpipe ablate`: rows differ in what they say, tables compute what they claim, and runs resume cell by cell."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+from importlib import util
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dnrpipe.ablation.rows import CLASSIC as CLASSIC_SIZES
+from dnrpipe.ablation.rows import GROUPS, ROWS, choose_rows, needs_coarse, settings_of
+from dnrpipe.ablation.scenes import BENCHMARK, find_scenes
+from dnrpipe.ablation.tables import Figures, markdown, spread
+from dnrpipe.errors import UserError
+from dnrpipe.settings import Settings, resolve
+
+CLASSIC = [row for row in ROWS.values() if row.family == "classic"]
+
+
+def flat(value: Any, prefix: str = "") -> dict[str, Any]:
+    """Nested settings as dotted keys."""
+    if not isinstance(value, dict):
+        return {prefix: value}
+    return {k: v for key, part in value.items() for k, v in flat(part, f"{prefix}.{key}".lstrip(".")).items()}
+
+
+def differences(a: Settings, b: Settings) -> set[str]:
+    left, right = flat(a.model_dump(mode="json")), flat(b.model_dump(mode="json"))
+    return {key for key in left.keys() | right.keys() if left.get(key) != right.get(key)}
+
+
+@pytest.mark.parametrize("preset", CLASSIC_SIZES)
+@pytest.mark.parametrize("row", CLASSIC, ids=lambda row: row.name)
+def test_classic_rows_do_not_depend_on_our_model(row: Any, preset: str) -> None:
+    """Whatever the preset's own model is, vanilla and the paper stay what they are."""
+    base = resolve(preset, {}, environment={})
+    ours = {"model": {"width": 40, "aggregator": "residual"}, "finetune": {"step2": {"epochs": 7, "photometric": "l1"}}}
+    changed = resolve(preset, ours, environment={})
+    assert settings_of(row, base, {}).model == settings_of(row, changed, {}).model
+    assert settings_of(row, base, {}).finetune == settings_of(row, changed, {}).finetune
+    assert settings_of(row, base, {}).select == settings_of(row, changed, {}).select
+
+
+@pytest.mark.parametrize("row", [r for r in CLASSIC if r.against], ids=lambda row: row.name)
+def test_a_row_differs_from_its_counterpart_in_one_thing(row: Any) -> None:
+    base = resolve("draft", {}, environment={})
+    other = ROWS[row.against]
+    changed = differences(settings_of(row, base, {}), settings_of(other, base, {}))
+    parts = {key if key.startswith("model") else key.rsplit(".", 1)[0] for key in changed}
+    if row.views != other.views:
+        assert not changed and row.full_step1 == other.full_step1
+    else:
+        assert len(parts) == 1, parts
+
+
+def test_the_papers_numbers_are_the_papers() -> None:
+    """Implementation details of the paper: weights of the six losses, reward, "RGB absolute loss"."""
+    settings = settings_of(ROWS["paper"], resolve("draft", {}, environment={}), {})
+    loss = settings.finetune.step2.loss
+    assert (loss.photometric, loss.ssim, loss.perceptual) == (1.0, 0.1, 0.1)
+    assert (loss.frequency, loss.total_variation, loss.regularisation) == (0.01, 0.001, 0.1)
+    assert settings.finetune.step2.photometric == "l1"
+    assert settings.model.aggregator == "concat" and settings.model.modalities == "uv+depth+normal"
+    assert settings.model.base == "none" and settings.finetune.step2.start == "coarse"
+    assert settings.select.step1.reward == "neg-loss" and settings.select.step1.reward_scale == "raw"
+    vanilla = settings_of(ROWS["vanilla"], resolve("draft", {}, environment={}), {})
+    assert vanilla.model.modalities == "uv" and not vanilla.finetune.step2.augment
+    assert not needs_coarse(ROWS["vanilla"], vanilla) and needs_coarse(ROWS["paper"], settings)
+
+
+def test_overrides_hold_for_every_row() -> None:
+    base = resolve("draft", {}, environment={})
+    for row in CLASSIC:
+        assert settings_of(row, base, {"finetune": {"step2": {"epochs": 3}}}).finetune.step2.epochs == 3
+
+
+@pytest.mark.parametrize("row", [r for r in ROWS.values() if r.family == "dnr"], ids=lambda row: row.name)
+def test_our_rows_are_settings_that_can_be(row: Any) -> None:
+    base = resolve("draft", {"model": {"base": "baked"}}, environment={})
+    settings = settings_of(row, base, {})
+    assert differences(settings, base) <= set(flat(dict(row.changes)))
+
+
+def test_rows_that_come_to_the_same_are_said_to_be_the_same() -> None:
+    made = results({("a", "dnr", 0): 30.0, ("a", "dnr-chain", 0): 30.0, ("a", "dnr-no-chain", 0): 29.0})
+    made["cells"][1]["key"] = made["cells"][0]["key"]
+    lines = {
+        line.split("`")[1]: line for line in markdown(made).split("### Ingredients")[1].splitlines() if "`" in line
+    }
+    assert "| is `dnr` |" in lines["dnr-chain"] and "| -1.00 |" in lines["dnr-no-chain"]
+
+
+def test_rows_and_groups_by_name() -> None:
+    assert [row.name for row in choose_rows("paper,vanilla")] == ["vanilla", "paper"]
+    assert [row.name for row in choose_rows("all")] == list(ROWS)
+    assert {name for names in GROUPS.values() for name in names} == set(ROWS)
+    with pytest.raises(UserError, match="did you mean 'vanilla'"):
+        choose_rows("vanila")
+    with pytest.raises(UserError, match="names no row"):
+        choose_rows(" , ")
+
+
+def test_scenes_by_name_and_file(tmp_path: Path) -> None:
+    assert [path.stem for path in find_scenes(None)] == list(BENCHMARK)
+    (tmp_path / "materials.blend").write_bytes(b"x")
+    with pytest.raises(UserError, match="two scenes are named materials"):
+        find_scenes(f"materials,{tmp_path / 'materials.blend'}")
+    with pytest.raises(UserError, match="--scenes nowhere"):
+        find_scenes("nowhere")
+
+
+def results(values: dict[tuple[str, str, int], float]) -> dict[str, Any]:
+    """Results whose PSNR is given per (scene, row, seed) and whose LPIPS is a hundredth of it."""
+    cells = [
+        {
+            "scene": scene, "row": row, "seed": seed, "key": f"{scene}{row}{seed}", "psnr": psnr, "psnr_mask": psnr - 5,
+            "ssim": 0.9, "ssim_mask": 0.8, "lpips_vgg": psnr / 100, "lpips_alex": None, "flip": 0.1, "ceiling": 40.0,
+            "views": 25, "epochs": 5, "steps": 125, "train_seconds": 9.0, "train_cpu_seconds": 8.0,
+            "step1_cpu_seconds": None, "frame_ms": 7.0, "base_ms": None, "commit": "abc",
+        }
+        for (scene, row, seed), psnr in values.items()
+    ]  # fmt: skip
+    scenes = list(dict.fromkeys(scene for scene, _, _ in values))
+    return {
+        "schema": 1, "command": "dnrpipe ablate", "commit": "abc", "dirty": False, "date": "2026-01-02T03:04:05+00:00",
+        "machine": {"processor": "p", "cores": 2}, "versions": {"torch": "2"}, "preset": "draft", "budget": 25,
+        "resolution": "128x128", "seconds": None, "scenes": scenes, "cells": cells,
+    }  # fmt: skip
+
+
+def test_means_differences_and_ratios_are_paired_by_seed() -> None:
+    made = results(
+        {("a", "vanilla", 0): 20.0, ("b", "vanilla", 0): 30.0, ("a", "vanilla", 1): 22.0, ("b", "vanilla", 1): 32.0}
+        | {("a", "dnr", 0): 25.0, ("b", "dnr", 0): 33.0, ("a", "dnr", 1): 26.0, ("b", "dnr", 1): 38.0}
+    )
+    figures = Figures(made)
+    assert figures.mean("vanilla", "psnr", ["a", "b"]) == [25.0, 27.0]
+    assert figures.difference("dnr", "vanilla", "psnr", ["a", "b"]) == [4.0, 5.0]
+    assert figures.ratio("dnr", "vanilla", "lpips_vgg", ["a"]) == pytest.approx([1.25, 26 / 22])
+    text = markdown(made)
+    assert "| **mean** | +4.50 ± 0.71 | 1.18 ± 0.01 |" in text  # LPIPS: 1.175 and 1.185
+    assert "| a | 21.00 ± 1.41 | 25.50 ± 0.71 | 40.0 |" in text
+    assert "| – |" in text  # no LPIPS Alex
+
+
+def test_a_seed_that_lacks_a_scene_is_in_no_mean() -> None:
+    figures = Figures(results({("a", "dnr", 0): 20.0, ("b", "dnr", 0): 30.0, ("a", "dnr", 1): 99.0}))
+    assert figures.mean("dnr", "psnr", ["a", "b"]) == [25.0]
+    assert figures.mean("dnr", "psnr", ["a"]) == [20.0, 99.0]
+
+
+@pytest.mark.parametrize(
+    ("ours", "verdict"),
+    [([-1.0, -1.2], "reproduced"), ([0.9, 1.0], "not reproduced"), ([-0.1, 0.2], "within the seeds' spread")],
+)
+def test_the_papers_order_is_judged_against_the_seeds_spread(ours: list[float], verdict: str) -> None:
+    values = {("a", "paper", seed): 25.0 for seed in range(2)}
+    values |= {("a", "paper-uv", seed): 25.0 + gain for seed, gain in enumerate(ours)}
+    line = next(line for line in markdown(results(values)).splitlines() if "no aggregator" in line and "-0.28" in line)
+    assert line.endswith(f"| {verdict} |")
+
+
+@given(st.lists(st.floats(-50, 50), min_size=1, max_size=6))
+def test_spread_is_mean_and_sample_deviation(values: list[float]) -> None:
+    mean, _, deviation = spread(values, 6).partition(" ± ")
+    assert math.isclose(float(mean), np.mean(values), abs_tol=1e-6)
+    if len(values) > 1:
+        assert math.isclose(float(deviation), np.std(values, ddof=1), abs_tol=1e-6)
+    else:
+        assert not deviation
+
+
+def test_the_documents_tables_are_made_from_committed_results(tmp_path: Path) -> None:
+    path = Path(__file__).parents[1] / "tools" / "ablation_docs.py"
+    spec = util.spec_from_file_location("ablation_docs", path)
+    assert spec is not None and spec.loader is not None
+    tool = util.module_from_spec(spec)
+    spec.loader.exec_module(tool)
+    (tmp_path / "r.json").write_text(json.dumps(results({("a", "vanilla", 0): 20.0, ("a", "dnr", 0): 25.5})))
+    page = tmp_path / "page.md"
+    page.write_text("one\n<!-- results r.json -->\nold\n<!-- end -->\ntwo\n<!-- rows -->\n<!-- end -->\n")
+    assert tool.main(["--check", str(page)]) == 1
+    assert tool.main([str(page)]) == 0 and tool.main(["--check", str(page)]) == 0
+    text = page.read_text()
+    assert "+5.50" in text and "old" not in text and text.startswith("one\n") and "| `paper-rl` |" in text
+    page.write_text(text.replace("25.50", "26.50"))
+    assert tool.main(["--check", str(page)]) == 1
+
+
+def ablate(out: Path, *more: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "dnrpipe.cli", "ablate", "--smoke", "--seeds", "1", "--out", str(out), "--json"]
+    environment = {**os.environ, "OMP_WAIT_POLICY": "PASSIVE"}
+    return subprocess.run(
+        [*command, *more], capture_output=True, text=True, timeout=800, env=environment, cwd=out.parent, check=False
+    )
+
+
+@pytest.fixture(scope="module")
+def smoke(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    pytest.importorskip("bpy")
+    pytest.importorskip("mitsuba")
+    out = tmp_path_factory.mktemp("ablation") / "out"
+    done = ablate(out)
+    assert done.returncode == 0, done.stderr
+    return out, json.loads(done.stdout)
+
+
+def stamps(out: Path) -> dict[str, int]:
+    return {str(p.relative_to(out)): p.stat().st_mtime_ns for p in out.rglob("*") if p.suffix in (".json", ".exr")}
+
+
+def made_by_work(out: Path) -> dict[str, int]:
+    """Stamps of all that costs work: cells, step 1, passes, ray-traced views."""
+    return {name: at for name, at in stamps(out).items() if name.startswith(("cells/", "step1/")) or ".exr" in name}
+
+
+@pytest.mark.slow
+def test_smoke_measures_what_its_pictures_show(smoke: tuple[Path, dict[str, Any]]) -> None:
+    from PIL import Image
+
+    out, answer = smoke
+    assert answer == json.loads((out / "results.json").read_text())
+    assert [cell["row"] for cell in answer["cells"]] == ["vanilla", "paper"]
+    assert answer["commit"] and answer["machine"]["cores"] and answer["versions"]["torch"]
+    tables = (out / "tables.md").read_text()
+    for cell in answer["cells"]:
+        assert f"| `{cell['row']}` |" in tables and f" {cell['psnr']:.2f} |" in tables
+        folder = out / "cells" / cell["scene"]
+        details = json.loads((folder / f"{cell['key']}.json").read_text())
+        assert cell["psnr"] == pytest.approx(np.mean([test["psnr"] for test in details["tests"]]), abs=1e-4)
+        assert details["training"]["step2"]["steps"] == 4 * 3 and details["training"]["step2"]["skipped"] == 0
+        assert cell["views"] == 3 and cell["frame_ms"] > 0 and cell["train_cpu_seconds"] > 0
+        assert (cell["step1_cpu_seconds"] is None) == (cell["row"] == "vanilla")
+        shown = [np.asarray(Image.open(folder / f"{name}.png"), np.float64) / 255 for name in ("truth", cell["key"])]
+        psnr = -10 * np.log10(np.mean((shown[0] - shown[1]) ** 2))
+        middle = details["tests"][len(details["tests"]) // 2]
+        assert psnr == pytest.approx(middle["psnr"], abs=0.1)
+        assert 5 < middle["psnr"] < middle["ceiling"] + 1
+    sheet = Image.open(out / "pictures" / "emissive_only.png")
+    assert sheet.width >= 3 * 256 and np.asarray(Image.open(out / "plot.png")).std() > 1
+
+
+@pytest.mark.slow
+def test_a_second_run_does_nothing_and_a_lost_cell_is_made_again_the_same(smoke: tuple[Path, dict[str, Any]]) -> None:
+    out, answer = smoke
+    before = made_by_work(out)
+    assert ablate(out).returncode == 0
+    assert made_by_work(out) == before
+    lost = out / "cells" / "emissive_only" / f"{answer['cells'][1]['key']}.json"
+    first = json.loads(lost.read_text())
+    lost.unlink()
+    done = ablate(out)
+    assert done.returncode == 0, done.stderr
+    after = made_by_work(out)
+    assert {name for name in before if after[name] != before[name]} == {str(lost.relative_to(out))}
+    assert json.loads(lost.read_text())["tests"] == first["tests"]  # bit for bit
+
+
+@pytest.mark.slow
+def test_rows_train_about_the_seconds_asked_for(smoke: tuple[Path, dict[str, Any]]) -> None:
+    out, answer = smoke
+    done = ablate(out, "--rows", "vanilla,paper", "--seconds", "4")
+    assert done.returncode == 0, done.stderr
+    cells = {cell["row"]: cell for cell in json.loads(done.stdout)["cells"]}
+    assert {cell["key"] for cell in cells.values()}.isdisjoint(cell["key"] for cell in answer["cells"])
+    for cell in cells.values():
+        assert cell["epochs"] > 4  # of the preset's, a fraction of a second each
+        assert 1.3 < cell["train_cpu_seconds"] < 12
+    assert cells["paper"]["step1_cpu_seconds"] < cells["paper"]["train_cpu_seconds"] / 2
+
+
+@pytest.mark.slow
+def test_bad_requests_are_one_line_and_leave_nothing(tmp_path: Path) -> None:
+    for arguments, words in (
+        (("--rows", "vanila"), "did you mean 'vanilla'"),
+        (("--scenes", "none"), "--scenes none"),
+        (("--seconds", "0"), "--seconds 0"),
+        (("--seeds", "0"), "--seeds 0"),
+        (("--preset", "drift"), "unknown preset"),
+        (("--set", "finetune.epoch=3"), "finetune.epoch"),
+        (("--rows", "paper-uv-depth", "--set", "model.output=log"), "output = log"),
+    ):
+        done = ablate(tmp_path / "out", *arguments)
+        assert done.returncode == 2, done.stderr
+        assert "Traceback" not in done.stderr and words in done.stderr
+        assert not (tmp_path / "out").exists()

@@ -1,0 +1,81 @@
+"""From the network's outputs and the base image to the picture.
+
+Notation
+    f        log space (see :func:`to_log`) or display space
+    K        per-pixel kernels, k×k weights each, that sum to 1; they start close to the identity
+    a, m     added and multiplied correction, 3 channels each; they start at 0
+
+    f(picture) = K * f(base) · (1 + m) + a
+
+A base image has few fixed directions per pixel: it is grainy on rough metal and jagged at edges. Kernels smooth that
+and keep what is sharp (kernel prediction; Bako et al. 2017); in log space a single bright pixel does not win.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from .contract import ContractError
+from .dataset import Batch
+from .display import DisplayTransform
+from .settings import ModelSettings
+
+LOG_SCALE = 10.0
+"""k of log(1 + k x) / log(1 + k): with 10, the curve is close to display gamma in [0, 1] and keeps going above."""
+IDENTITY = 4.0
+"""What the kernels' middle weight has ahead of the others before the softmax, so it starts with 0.87 of the sum."""
+
+
+def to_log(radiance: Tensor) -> Tensor:
+    """Linear radiance >= 0 -> log(1 + k x) / log(1 + k); 0 stays 0, 1 stays 1."""
+    return torch.log1p(LOG_SCALE * radiance) / torch.log1p(radiance.new_tensor(LOG_SCALE))
+
+
+def from_log(value: Tensor) -> Tensor:
+    """Inverse of :func:`to_log`; below 0 (darker than black) it goes on continuously."""
+    return torch.expm1(value * torch.log1p(value.new_tensor(LOG_SCALE))) / LOG_SCALE
+
+
+def require_base(batch: Batch) -> tuple[Tensor, DisplayTransform]:
+    """The base image and the display transform. Raises ContractError when the views were loaded without."""
+    if batch.base is None or batch.display is None:
+        raise ContractError("this model corrects a base image, but the views were loaded without; load them with it")
+    return batch.base, batch.display
+
+
+def correct(batch: Batch, outputs: Tensor, settings: ModelSettings) -> tuple[Tensor, Tensor | None]:
+    """-> (display RGB [N, 3, H, W], linear straight radiance or None where the output space is display).
+
+    ``outputs``: a, m and the kernels' weights before the softmax, [N, 6 + k², H, W].
+    """
+    base, display = require_base(batch)
+    added, scaled = outputs[:, :6].chunk(2, dim=1)
+    value = to_log(display.scale * base) if settings.output == "log" else display(base)
+    if settings.filter:
+        value = filter_by(value, outputs[:, 6:])
+    value = value * (1.0 + scaled) + added
+    if settings.output == "display":
+        return value, None
+    radiance = from_log(value).clamp_min(0.0) / display.scale
+    return display(radiance), radiance
+
+
+def filter_by(image: Tensor, weights: Tensor) -> Tensor:
+    """``image`` [N, C, H, W] smoothed by kernels of its own in each pixel.
+
+    ``weights`` [N, k², H, W] row by row; their softmax, the middle ahead by IDENTITY, is the kernel. Beyond the border
+    the last pixel continues.
+    """
+    count = weights.shape[1]
+    side = round(count**0.5)
+    ahead = F.one_hot(torch.tensor(count // 2, device=weights.device), count).view(1, count, 1, 1) * IDENTITY
+    kernel = (weights + ahead).softmax(dim=1)
+    height, width = image.shape[-2:]
+    padded = F.pad(image, (side // 2,) * 4, mode="replicate")
+    total = torch.zeros_like(image)
+    for i in range(count):  # shifted views: ten times faster than unfolding the image
+        y, x = divmod(i, side)
+        total = total + kernel[:, i : i + 1] * padded[..., y : y + height, x : x + width]
+    return total
