@@ -46,7 +46,7 @@ def render_novel(
     """
     from dnrtrain.checkpoint import load_model
     from dnrtrain.dataset import load_views
-    from dnrtrain.model import render_views
+    from dnrtrain.model import render_radiance, render_views
 
     require_inputs(STAGES["evaluate"], workspace, settings)  # what evaluate needs is what this needs
     if movie != "none" and len({(view.width, view.height) for view in views}) > 1:
@@ -100,7 +100,8 @@ def render_novel(
             if frames in ("png", "both"):
                 write_png(folder / f"frame_{view.name}.png", picture)
             if frames in ("exr", "both"):
-                write_frame_exr(folder / f"frame_{view.name}.exr", picture, data, view)
+                radiance = render_radiance(model, data)
+                write_frame_exr(folder / f"frame_{view.name}.exr", picture, radiance, data, view)
             workspace.ledger.append(
                 CostRecord(
                     time=time.time(),
@@ -129,19 +130,23 @@ def render_novel(
     return result
 
 
-def write_frame_exr(path: Path, picture: np.ndarray, data: Any, view: View) -> None:
-    """Linear Rec.709 with the coverage as alpha, premultiplied: white is taken out again exactly.
+def write_frame_exr(path: Path, picture: np.ndarray, radiance: Any, data: Any, view: View) -> None:
+    """Linear Rec.709 with the coverage as alpha, premultiplied.
 
-    The network works in display space [0, 1], so nothing above display white comes back.
+    radiance: the network's, straight, [1, 3, H, W], highlights included. None where it works in display space: then
+    white is taken out of ``picture`` exactly, and nothing above display white comes back.
     """
     from dnrtrain.exr import write_exr
 
     alpha = data.coverage[0, 0].cpu().numpy()
-    straight = np.where(
-        alpha[..., None] > 0, (picture - (1 - alpha[..., None])) / np.maximum(alpha[..., None], 1e-3), 0
-    )
-    straight = np.clip(straight, 0, 1)
-    linear = np.where(straight <= 0.04045, straight / 12.92, ((straight + 0.055) / 1.055) ** 2.4)
+    if radiance is not None:
+        linear = radiance[0].float().permute(1, 2, 0).cpu().numpy()
+    else:
+        straight = np.where(
+            alpha[..., None] > 0, (picture - (1 - alpha[..., None])) / np.maximum(alpha[..., None], 1e-3), 0
+        )
+        straight = np.clip(straight, 0, 1)
+        linear = np.where(straight <= 0.04045, straight / 12.92, ((straight + 0.055) / 1.055) ** 2.4)
     rgba = np.concatenate([linear * alpha[..., None], alpha[..., None]], axis=-1)
     write_exr(path, {c: rgba[..., i] for i, c in enumerate("RGBA")}, {"view": view.model_dump(mode="json")})
 

@@ -75,7 +75,9 @@ class BaseSettings(Strict):
     )
     light_spp: int = Field(default=128, ge=1, le=1_000_000, description="paths per texel of the baked light")
     samples: int = Field(default=8, ge=1, le=64, description="rays per pixel of a base image")
-    denoise: bool = Field(default=True, description="take the grain off base images of kind baked")
+    denoise: bool = Field(
+        default=False, description="take the grain off base images of kind baked; the network does it as well"
+    )
     spp: int = Field(default=4, ge=1, le=1_000_000, description="path-traced samples of the kinds direct and path")
 
 

@@ -97,7 +97,7 @@ class Worker:
 def denoised(channels: dict[str, np.ndarray], threads: int = 1) -> dict[str, np.ndarray]:
     """base.R/G/B without grain. One thread: bits repeat.
 
-    The auxiliary images are not called clean: measured, that is better by half a decibel and more (docs/base.md).
+    The auxiliary images are not called clean: measured, that is better by half a decibel and more.
     """
     image = np.stack([channels[name] for name in COLOUR], axis=-1)
     albedo = np.stack([channels[f"albedo.{c}"] for c in "RGB"], axis=-1)
