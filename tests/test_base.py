@@ -14,6 +14,7 @@ from dnrpipe.raytrace import plugins
 from dnrpipe.raytrace.base import CENTRES, MEANS, BaseRenderer
 from dnrpipe.raytrace.lightmap import LightBaker, diffuse_context
 from dnrpipe.raytrace.sensors import sensor_dict
+from dnrpipe.raytrace.texels import grouped_meshes
 from dnrpipe.raytrace.variants import choose_variant
 from dnrtrain.contract import BASE_CHANNELS, View
 
@@ -114,6 +115,32 @@ def test_base_is_the_path_traced_picture_where_all_is_diffuse(tmp_path: Path, ki
     inside = (truth[..., 3] > 0.99) & (ours[..., 3] > 0.99)
     assert ours[inside, :3].mean() == pytest.approx(truth[inside, :3].mean(), rel=0.015)
     assert np.sqrt(np.mean((ours - truth)[inside] ** 2)) < 0.04 * truth[inside, :3].mean()
+
+
+def test_instances_share_the_light_of_the_first(tmp_path: Path) -> None:
+    matte = {"type": "twosided", "b": {"type": "diffuse"}}
+    shape = quad(tmp_path / "q.ply", [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], (0.05, 0.05), matte)
+    moved = np.eye(4)
+    moved[:3, 3] = (0.0, 0.0, 0.25)
+    group, reference = {"type": "shapegroup", "quad": shape}, {"type": "ref", "id": "group"}
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "group": group,
+            "a": {"type": "instance", "to_world": mi.ScalarTransform4f(moved.tolist()), "g": reference},
+            "light": {"type": "constant"},
+        }
+    )
+    light = LightBaker(mi, scene, onwards(), [(tmp_path / "q.ply", moved)]).bake(32, 1024, 0)
+    assert light[0, 4:12, 4:12].mean() == pytest.approx(1, abs=0.02)
+    numbers = " ".join(map(str, moved.ravel()))
+    (tmp_path / "scene.xml").write_text(
+        '<scene version="3.0.0"><shape type="shapegroup" id="g"><shape type="ply">'
+        '<string name="filename" value="q.ply"/></shape></shape><shape type="instance"><ref id="g"/>'
+        f'<transform name="to_world"><matrix value="{numbers}"/></transform></shape></scene>'
+    )
+    ((path, matrix),) = grouped_meshes(tmp_path / "scene.xml")
+    assert path == tmp_path / "q.ply" and np.array_equal(matrix, moved)
 
 
 def test_mirror_shows_the_baked_wall_and_says_where_its_path_ends(tmp_path: Path) -> None:

@@ -67,12 +67,11 @@ class BaseRenderer:
         self.light = [mi.Texture2f(mi.TensorXf(side), wrap_mode=dr.WrapMode.Clamp) for side in light]
         shapes = scene.shapes()
         self.apart = [shape for shape in shapes if shape.id().startswith((LAMP_PREFIX, UNSEEN_PREFIX))]
-        self.lamps = [shape for shape in shapes if shape.id().startswith(LAMP_PREFIX)]
         self.lit = bool(scene.emitters())
-        bsdfs = {str(bsdf): bsdf for bsdf in (shape.bsdf() for shape in shapes) if bsdf is not None}
-        self.whole = [b for text, b in bsdfs.items() if any(f"{name}[" in text for name in IGNORE_CONTEXT)]
+        bsdfs = list({id(b): b for b in [shape.bsdf() for shape in shapes] if b is not None}.values())
+        self.whole = [b for b in bsdfs if any(f"{name}[" in str(b) for name in IGNORE_CONTEXT)]
         self.translucent = bool(self.whole) or any(
-            mi.has_flag(b.flags(), mi.BSDFFlags.DiffuseTransmission) for b in bsdfs.values()
+            mi.has_flag(b.flags(), mi.BSDFFlags.DiffuseTransmission) for b in bsdfs
         )
         order = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]], np.uint32)  # Bayer
         self.tables = mi.UInt32(order.ravel()), mi.Float(np.array(_steps(), np.float32))

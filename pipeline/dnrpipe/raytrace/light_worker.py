@@ -14,6 +14,7 @@ from dnrtrain.atomic import atomic_path
 
 from .engine import Engine
 from .lightmap import LightBaker
+from .texels import grouped_meshes
 from .visibility import ROULETTE_DEPTH
 
 
@@ -33,7 +34,8 @@ class Worker:
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
         started, cpu = time.monotonic(), time.process_time()
-        baker = LightBaker(self.engine.mi, self.engine.scenes[str(self.bundle)], self._onwards(task))
+        scene, groups = self.engine.scenes[str(self.bundle)], grouped_meshes(self.bundle)
+        baker = LightBaker(self.engine.mi, scene, self._onwards(task), groups)
         light = baker.bake(int(task["size"]), int(task["spp"]), int(task["seed"]))
         with atomic_path(task["output"]) as temporary, temporary.open("wb") as file:
             np.savez(file, light=light, fingerprint=np.array(task["fingerprint"]))

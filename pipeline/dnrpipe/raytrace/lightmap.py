@@ -14,6 +14,8 @@ plan's own integrator, from the first bounce on, with all its effects.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -55,12 +57,12 @@ class LightBaker:
     """Bakes E of one scene.
 
     integrator: continues paths from their first bounce on; emitters that it meets first must be hidden. None: direct
-    light alone.
+    light alone. groups: see :class:`.texels.AtlasSurface`.
     """
 
-    def __init__(self, mi: Any, scene: Any, integrator: Any) -> None:
+    def __init__(self, mi: Any, scene: Any, integrator: Any, groups: Sequence[tuple[Path, np.ndarray]] = ()) -> None:
         self.mi, self.scene, self.integrator = mi, scene, integrator
-        self.surface = AtlasSurface(mi, scene)
+        self.surface = AtlasSurface(mi, scene, groups)
         self.lift = float(LIFT * scene.bbox().bounding_sphere().radius)
         self.passing = any(
             mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null) for shape in scene.shapes() if shape.bsdf() is not None
@@ -72,8 +74,10 @@ class LightBaker:
         The denoiser is shown where in space each texel lies and where it faces, so that charts that are neighbours in
         the atlas alone stay apart. The back is traced where it can be seen: of surfaces with a rim.
         """
-        texels, position, normal, thin = self.occupied(size)
         whole = np.zeros((2, size, size, 3), np.float32)
+        if not self.surface.count:
+            return whole
+        texels, position, normal, thin = self.occupied(size)
         if not len(texels):
             return whole
         low, high = position.min(axis=0), position.max(axis=0)
@@ -119,9 +123,14 @@ class LightBaker:
         import drjit as dr
 
         mi, fine = self.mi, 3 * size
-        index = dr.arange(mi.UInt32, fine * fine)
-        uv = mi.Point2f(mi.Float(index % fine) + 0.5, mi.Float(index // fine) + 0.5) / fine
-        found = np.array(self.surface.points(uv)[2]).reshape(size, 3, size, 3).transpose(0, 2, 1, 3).reshape(-1, 9)
+        rows, bands = max(1, MAX_SAMPLES // (9 * size)), []
+        for start in range(0, size, rows):
+            count = min(rows, size - start)
+            index = dr.arange(mi.UInt32, 3 * count * fine) + dr.opaque(mi.UInt32, 3 * start * fine)
+            uv = mi.Point2f(mi.Float(index % fine) + 0.5, mi.Float(index // fine) + 0.5) / fine
+            hits = np.array(self.surface.points(uv)[2]).reshape(count, 3, size, 3)
+            bands.append(hits.transpose(0, 2, 1, 3).reshape(-1, 9))
+        found = np.concatenate(bands)
         texels = np.flatnonzero(found.any(axis=1))
         # The middle of the nine where it lies on a chart, else the first that does.
         pick = np.where(found[texels, 4], 4, found[texels].argmax(axis=1))

@@ -7,6 +7,9 @@ Notation
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,22 +25,23 @@ class AtlasSurface:
     Copies that share a place of the atlas lie on top of each other; one of them answers.
     """
 
-    def __init__(self, mi: Any, scene: Any) -> None:
-        corners, places, found, open_ = [], [], [], []
-        for shape in scene.shapes():
-            if not (shape.is_mesh() and shape.has_attribute(ATTRIBUTE)):
+    def __init__(self, mi: Any, scene: Any, groups: Sequence[tuple[Path, np.ndarray]] = ()) -> None:
+        """groups: meshes that stand in the scene as instances, each with a place (:func:`grouped_meshes`)."""
+        meshes = [(shape, np.eye(4)) for shape in scene.shapes() if shape.is_mesh()]
+        meshes += [(mi.load_dict({"type": "ply", "filename": str(path)}), matrix) for path, matrix in groups]
+        corners, places, open_ = [], [], []
+        for shape, matrix in meshes:
+            if not shape.has_attribute(ATTRIBUTE):
                 continue
             faces = np.array(shape.faces_buffer()).reshape(-1, 3)
-            vertices = np.array(shape.vertex_positions_buffer()).reshape(-1, 3)
+            vertices = np.array(shape.vertex_positions_buffer()).reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
             atlas = np.array(shape.attribute_buffer(ATTRIBUTE)).reshape(-1, 3)
             corners.append(vertices[faces])
             places.append(atlas[faces])
             open_.append(np.full(len(faces), _has_rim(vertices[faces])))
-            found.append(shape)
         self.mi = mi
         self.count = sum(map(len, corners))
-        self.shapes = found
-        if not found:
+        if not self.count:
             return
         unfolded = np.concatenate(places).reshape(-1, 3).astype(np.float32)
         unfolded[:, 2] = 0
@@ -73,6 +77,25 @@ class AtlasSurface:
         mi = self.mi
         hit = self.flat.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(uv.x, uv.y, 1), mi.Vector3f(0, 0, -1)))
         return hit.is_valid() & (dr.gather(mi.Float, self.open, hit.prim_index, hit.is_valid()) > 0.5)
+
+
+def grouped_meshes(bundle: Path) -> list[tuple[Path, np.ndarray]]:
+    """Meshes of the bundle's shape groups, each with the matrix [4, 4] of its first instance.
+
+    All instances share a place in the atlas, and so the light of the first.
+    """
+    root = ET.parse(bundle).getroot()
+    placed: dict[str, np.ndarray] = {}
+    for instance in root.findall("shape[@type='instance']"):
+        (reference,), (matrix,) = instance.findall("ref"), instance.findall("transform/matrix")
+        numbers = [float(part) for part in matrix.attrib["value"].split()]
+        placed.setdefault(reference.attrib["id"], np.array(numbers).reshape(4, 4))
+    found = []
+    for group in root.findall("shape[@type='shapegroup']"):
+        for name in group.findall("shape/string[@name='filename']"):
+            if group.attrib["id"] in placed:
+                found.append((bundle.parent / name.attrib["value"], placed[group.attrib["id"]]))
+    return found
 
 
 def _has_rim(triangles: np.ndarray) -> bool:
