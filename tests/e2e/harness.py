@@ -22,6 +22,9 @@ TINY = {
     "DNRPIPE_FINETUNE__STEP2__EPOCHS": "6",
     "DNRPIPE_RAYTRACE__SPP": "32",
     "DNRPIPE_RAYTRACE__EVALUATION_SPP": "32",
+    "DNRPIPE_BASE__LIGHT_SIZE": "64",
+    "DNRPIPE_BASE__LIGHT_SPP": "16",
+    "DNRPIPE_BASE__SAMPLES": "2",
     "DNRPIPE_PASSES__RASTER": "cycles-direct",
 }
 STAGES = ("prepare", "select", "raytrace-selected", "finetune", "evaluate")

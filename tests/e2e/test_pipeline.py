@@ -20,14 +20,16 @@ pytestmark = [pytest.mark.slow, pytest.mark.e2e]
 
 
 def test_only_the_selected_views_are_traced(tiny: Path) -> None:
-    """selection.json, the files and the ledger name the same views; the path depth pilot is booked apart."""
+    """selection.json, the files and the ledger name the same views; depth pilot and baked light are booked apart."""
     selected = json.loads((tiny / "selection.json").read_text())["views"]
     assert len(selected) == len(set(selected)) == 3
     files = {path.stem for path in (tiny / "raytraced" / "train").glob("*.exr")}
     records = [r for r in Ledger(tiny / "costs.jsonl").read() if r.stage == "raytrace"]
     assert files == set(selected)
-    assert sorted(r.name for r in records if r.unit == "view") == sorted(f"train/{name}" for name in selected)
-    assert [r.name for r in records if r.unit != "view"] == ["path depth pilot"]
+    expected = [f"{kind}train/{name}" for kind in ("", "base/") for name in selected]
+    assert sorted(r.name for r in records if r.unit == "view") == sorted(expected)
+    assert {path.stem for path in (tiny / "base" / "train").glob("*.exr")} == set(selected)
+    assert [r.name for r in records if r.unit != "view"] == ["path depth pilot", "light"]
 
 
 def test_evaluation_is_booked_apart(tiny: Path) -> None:
@@ -82,7 +84,7 @@ def test_a_larger_budget_traces_the_new_views_only(tiny: Path, tmp_path: Path) -
     run("raytrace-selected", folder=copy)
     new = set(json.loads((copy / "selection.json").read_text())["views"])
     traced = [r.name for r in Ledger(copy / "costs.jsonl").read()[before:]]
-    assert sorted(traced) == sorted(f"train/{name}" for name in new - old)
+    assert sorted(traced) == sorted(f"{kind}train/{name}" for kind in ("", "base/") for name in new - old)
 
 
 def test_going_back_after_an_interrupted_change_is_not_up_to_date(tiny: Path, tmp_path: Path) -> None:
