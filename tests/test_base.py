@@ -143,6 +143,17 @@ def test_instances_share_the_light_of_the_first(tmp_path: Path) -> None:
     assert path == tmp_path / "q.ply" and np.array_equal(matrix, moved)
 
 
+def test_copies_that_share_a_place_share_the_mean_of_their_light(tmp_path: Path) -> None:
+    matte = {"type": "twosided", "b": {"type": "diffuse"}}
+    up = quad(tmp_path / "u.ply", [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], (0.05, 0.05), matte)
+    down = quad(tmp_path / "d.ply", [[3, -1, 0], [3, 1, 0], [5, 1, 0], [5, -1, 0]], (0.05, 0.05), matte)
+    sun = {"type": "directional", "direction": [0, 0, -1], "irradiance": rgb(np.pi, np.pi, np.pi)}
+    alone = mi.load_dict({"type": "scene", "up": up, "sun": sun})
+    both = mi.load_dict({"type": "scene", "up": up, "down": down, "sun": sun})
+    means = [LightBaker(mi, scene, None).bake(32, 512, 0)[0, 4:12, 4:12].mean() for scene in (alone, both)]
+    assert means == pytest.approx([1.0, 0.5], abs=0.03)
+
+
 def test_mirror_shows_the_baked_wall_and_says_where_its_path_ends(tmp_path: Path) -> None:
     mirror = {"type": "twosided", "b": {"type": "conductor", "material": "none"}}
     wall = {"type": "twosided", "b": {"type": "diffuse", "reflectance": rgb(0.1, 0.6, 0.2)}}

@@ -28,7 +28,7 @@ def ledger_lines(workspace: Path) -> list[str]:
     records = Ledger(workspace / "costs.jsonl").read()
     lines = []
     passes = [r.detail["gbuffer_seconds"] for r in records if "gbuffer_seconds" in r.detail]
-    traced = [r.seconds for r in records if r.stage == "raytrace"]
+    traced = [r.seconds for r in records if r.stage == "raytrace" and r.unit == "view" and r.spp is not None]
     neural = [r.seconds for r in records if r.name.startswith("neural/")]
     for name, values in (("G-buffer", passes), ("ray-traced view", traced), ("network", neural)):
         if values:

@@ -39,8 +39,9 @@ CENTRES = (
     *("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z", "mask"),
 )
 GBUFFER = ("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z")
-IGNORE_CONTEXT = ("Principled", "PrincipledThin")
-"""Mitsuba's BSDFs that do not split into lobes: all of theirs is taken for diffuse."""
+IGNORE_CONTEXT = "Principled BSDF :"
+"""How Mitsuba's BSDFs ``principled`` and ``principledthin`` print themselves. They do not split into lobes, so all of
+what they do, or what they are nested in does, is taken for diffuse, but for what passes straight on."""
 
 
 def _steps() -> list[float]:
@@ -69,7 +70,8 @@ class BaseRenderer:
         self.apart = [shape for shape in shapes if shape.id().startswith((LAMP_PREFIX, UNSEEN_PREFIX))]
         self.lit = bool(scene.emitters())
         bsdfs = list({id(b): b for b in [shape.bsdf() for shape in shapes] if b is not None}.values())
-        self.whole = [b for b in bsdfs if any(f"{name}[" in str(b) for name in IGNORE_CONTEXT)]
+        self.whole = [b for b in bsdfs if IGNORE_CONTEXT in str(b)]
+        self.cut = any(mi.has_flag(b.flags(), mi.BSDFFlags.Null) for b in self.whole)
         self.translucent = bool(self.whole) or any(
             mi.has_flag(b.flags(), mi.BSDFFlags.DiffuseTransmission) for b in bsdfs
         )
@@ -149,6 +151,8 @@ class BaseRenderer:
         smooth = diffuse_context(mi)
         rest = mi.BSDFContext()
         rest.type_mask = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Diffuse)
+        straight_on = mi.BSDFContext()
+        straight_on.type_mask = mi.BSDFFlags.Null
         glossy = mi.BSDFContext()
         glossy.type_mask = mi.BSDFFlags.Glossy
 
@@ -198,6 +202,12 @@ class BaseRenderer:
             # The mirror-like rest
             pair = mi.Point2f(uniform(s["vertex"], 0), uniform(s["vertex"], 1))
             bounce, factor = bsdf.sample(rest, si, uniform(s["vertex"], 2), pair, onwards)
+            if self.cut:
+                passing = met & ~onwards & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
+                through, share = bsdf.sample(straight_on, si, uniform(s["vertex"], 2), pair, passing)
+                passing &= uniform(s["vertex"], 3) < dr.max(share)
+                bounce, factor = dr.select(passing, through, bounce), dr.select(passing, 1, factor)
+                onwards |= passing
             null = mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Null)
             delta = mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Delta)
             throughput = dr.select(onwards, s["throughput"] * factor, s["throughput"])

@@ -159,7 +159,7 @@ class LightBaker:
         import drjit as dr
 
         mi, scene = self.mi, self.scene
-        place, normal, found = self.surface.points(uv)
+        place, normal, found = self.surface.points(uv, sampler.next_1d())
         up = normal * float(side)
         ray = mi.Ray3f(place + up * self.lift, -up)
         ray.maxt = mi.Float(3 * self.lift)

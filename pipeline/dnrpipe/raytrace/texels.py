@@ -22,7 +22,7 @@ OPEN_MESH = 1e-3
 class AtlasSurface:
     """All meshes of a scene, unfolded: answers (U, V) -> surface point by casting rays onto the unfolded triangles.
 
-    Copies that share a place of the atlas lie on top of each other; one of them answers.
+    Copies that share a place of the atlas lie on top of each other there: any of them may answer.
     """
 
     def __init__(self, mi: Any, scene: Any, groups: Sequence[tuple[Path, np.ndarray]] = ()) -> None:
@@ -51,18 +51,28 @@ class AtlasSurface:
         parameters["faces"] = mi.UInt32(np.arange(len(unfolded), dtype=np.uint32))
         parameters.update()
         self.flat = mi.load_dict({"type": "scene", "atlas": mesh})
+        self.first, self.copies, self.order = map(mi.UInt32, _copies(np.concatenate(places)))
         self.open = mi.Float(np.concatenate(open_).astype(np.float32))
         self.corners = mi.Float(np.concatenate(corners).astype(np.float32).ravel())
 
-    def points(self, uv: Any) -> tuple[Any, Any, Any]:
-        """mi.Point2f (U, V) -> (world position, geometric normal of the triangle, whether there is a surface)."""
+    def points(self, uv: Any, choice: Any = None) -> tuple[Any, Any, Any]:
+        """mi.Point2f (U, V) -> (world position, geometric normal of the triangle, whether there is a surface).
+
+        choice: numbers in [0, 1) that pick one of the copies that share the place; None: the first.
+        """
         import drjit as dr
 
         mi = self.mi
         ray = mi.Ray3f(mi.Point3f(uv.x, uv.y, 1), mi.Vector3f(0, 0, -1))
         hit = self.flat.ray_intersect_preliminary(ray)
         found = hit.is_valid()
-        first = hit.prim_index * 3
+        number = mi.UInt32(0)
+        triangle = hit.prim_index
+        copies = dr.gather(mi.UInt32, self.copies, triangle, found)
+        if choice is not None:
+            number = dr.minimum(mi.UInt32(choice * mi.Float(copies)), dr.maximum(copies, 1) - 1)
+        triangle = dr.gather(mi.UInt32, self.order, dr.gather(mi.UInt32, self.first, triangle, found) + number, found)
+        first = triangle * 3
         a, b, c = (dr.gather(mi.Point3f, self.corners, first + i, found) for i in range(3))
         place = a + (b - a) * hit.prim_uv.x + (c - a) * hit.prim_uv.y
         normal = dr.cross(b - a, c - a)
@@ -77,6 +87,16 @@ class AtlasSurface:
         mi = self.mi
         hit = self.flat.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(uv.x, uv.y, 1), mi.Vector3f(0, 0, -1)))
         return hit.is_valid() & (dr.gather(mi.Float, self.open, hit.prim_index, hit.is_valid()) > 0.5)
+
+
+def _copies(places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Triangles [T, 3, 3] that lie at the same place: (where a triangle's copies begin in the order, how many they
+    are, the order), uint32 [T] each."""
+    keys = np.ascontiguousarray(places[..., :2], np.float32).reshape(len(places), -1).view(np.dtype((np.void, 24)))
+    _, group, count = np.unique(keys.ravel(), return_inverse=True, return_counts=True)
+    start = np.cumsum(count) - count
+    order = np.argsort(group, kind="stable")
+    return start[group].astype(np.uint32), count[group].astype(np.uint32), order.astype(np.uint32)
 
 
 def grouped_meshes(bundle: Path) -> list[tuple[Path, np.ndarray]]:
