@@ -63,18 +63,6 @@ def render_novel(
     write_cameras(folder / "cameras.json", views, name)
     paths = _inputs(workspace, settings, console, views, folder, run_id)
     kind = settings.model.base
-    bases = [folder / "base" / f"{view.name}.exr" for view in views]
-    base_views(
-        workspace,
-        settings,
-        console,
-        run_id,
-        views=views,
-        split="novel",
-        stage="render",
-        purpose="inference",
-        paths=bases,
-    )
     device = torch_device(settings)
     model = load_model(workspace.checkpoints("step2"), device)
     frame = read_frame(workspace)

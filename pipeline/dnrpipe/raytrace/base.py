@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from .lightmap import diffuse_context, reflectance
+from .paths import power_heuristic
 from .texels import ATTRIBUTE
 from .visibility import LAMP_PREFIX, UNSEEN_PREFIX, is_one_of
 
@@ -169,7 +170,7 @@ class BaseRenderer:
             source = mi.DirectionSample3f(scene, si, s["before"])
             seen = going & (si.is_valid() | ~straight)
             chance = scene.pdf_emitter_direction(s["before"], source, seen & s["sampled"])
-            weight = dr.select(s["sampled"], _power(s["density"], chance), 1)
+            weight = dr.select(s["sampled"], power_heuristic(s["density"], chance), 1)
             emitted = dr.select(seen, s["throughput"] * weight * source.emitter.eval(si, seen), 0)
             # Baked light
             met = going & si.is_valid()
@@ -196,7 +197,7 @@ class BaseRenderer:
                 pair = mi.Point2f(uniform(s["vertex"], 3), uniform(s["vertex"], 4))
                 toward, arriving = scene.sample_emitter_direction(si, pair, True, rough)
                 value, other = bsdf.eval_pdf(glossy, si, si.to_local(toward.d), rough & (toward.pdf > 0))
-                share = dr.select(toward.delta, 1, _power(toward.pdf, other))
+                share = dr.select(toward.delta, 1, power_heuristic(toward.pdf, other))
                 direct = dr.select(rough & (toward.pdf > 0), s["throughput"] * value * arriving * share, 0)
                 total += dr.select(dr.all(dr.isfinite(direct)), direct, 0)
             # The mirror-like rest
@@ -274,14 +275,6 @@ def _fraction(x: Any) -> Any:
     import drjit as dr
 
     return x - dr.floor(x)
-
-
-def _power(a: Any, b: Any) -> Any:
-    """Power heuristic; 0 where both are 0."""
-    import drjit as dr
-
-    total = a * a + b * b
-    return dr.select(total > 0, a * a / total, 0)
 
 
 def _has(mi: Any, bsdf: Any, members: list[Any]) -> Any:

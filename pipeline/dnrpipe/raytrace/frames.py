@@ -60,6 +60,7 @@ class Frames:
         self.engine, self.mi, self.size = engine, engine.mi, size
         self.scene = engine.scenes[str(bundle)]
         self.integrator, self.name = engine.integrator(bundle, integrator, max_depth)
+        self.passing = lets_through(self.mi, self.scene)
         self._path: dict[int, Any] = {}
         self._auxiliary: dict[int, Any] = {}
         self._centre: Any = None
@@ -103,10 +104,11 @@ class Frames:
         neighbour are looked at (a tenth, as a rule); where surfaces let light straight through, all are, at random.
         """
         if rays not in self._cover:
-            kernel = self._cover_kernel(rays) if lets_through(self.mi, self.scene) else self._edge_kernel(rays)
-            self._cover[rays] = self._warmed(kernel, view, rays) if lets_through(self.mi, self.scene) else kernel
+            self._cover[rays] = (
+                self._warmed(self._cover_kernel(rays), view, rays) if self.passing else self._edge_kernel(rays)
+            )
         kernel = self._cover[rays]
-        if lets_through(self.mi, self.scene):
+        if self.passing:
             return self._image(kernel(*self._inputs(view, 0, rays)))[..., 0]
         edges = np.flatnonzero(_differs(mask))
         result = mask.astype(np.float32)

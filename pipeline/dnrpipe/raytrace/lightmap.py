@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from .denoise import denoise, filled
+from .frames_rays import lets_through
 from .texels import AtlasSurface
 
 MAX_SAMPLES = 4_000_000
@@ -64,11 +65,9 @@ class LightBaker:
         self.mi, self.scene, self.integrator = mi, scene, integrator
         self.surface = AtlasSurface(mi, scene, groups)
         self.lift = float(LIFT * scene.bbox().bounding_sphere().radius)
-        self.passing = any(
-            mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null) for shape in scene.shapes() if shape.bsdf() is not None
-        )
+        self.passing = lets_through(mi, scene)
 
-    def bake(self, size: int, spp: int, seed: int, progress: Any = None) -> np.ndarray:
+    def bake(self, size: int, spp: int, seed: int) -> np.ndarray:
         """E of the front and of the back, float32 [2, size, size, 3], row 0 at V = 0; denoised, gaps filled.
 
         The denoiser is shown where in space each texel lies and where it faces, so that charts that are neighbours in
@@ -86,7 +85,7 @@ class LightBaker:
             wanted = np.ones(len(texels), bool) if side > 0 else thin
             if not wanted.any():
                 continue
-            sums = self._traced(texels[wanted], size, spp, seed * 2 + number, side, progress)
+            sums = self._traced(texels[wanted], size, spp, seed * 2 + number, side)
             light, rho = sums[:, :3], sums[:, 3:]
             found = rho.max(axis=1) > LEAST_RHO * spp
             if not found.any():
@@ -107,15 +106,13 @@ class LightBaker:
             whole[number] = denoise(images[0], images[1], images[2], threads=1)
         return whole
 
-    def _traced(self, texels: np.ndarray, size: int, spp: int, seed: int, side: int, progress: Any) -> np.ndarray:
+    def _traced(self, texels: np.ndarray, size: int, spp: int, seed: int, side: int) -> np.ndarray:
         """[T, 6]: B and rho, summed over ``spp`` samples of each texel."""
         sums = np.zeros((len(texels), 6))
         chunk = max(1, MAX_SAMPLES // spp)
         for number, start in enumerate(range(0, len(texels), chunk)):
             part = slice(start, start + chunk)
             sums[part] = self._part(texels[part], size, spp, seed * 4096 + number, side)
-            if progress is not None:
-                progress(side, min(1.0, (start + chunk) / len(texels)))
         return sums
 
     def occupied(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
