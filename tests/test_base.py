@@ -12,7 +12,8 @@ import pytest
 from dnrpipe.blender.bundle.ply import weld, write_ply
 from dnrpipe.raytrace import plugins
 from dnrpipe.raytrace.base import CENTRES, MEANS, BaseRenderer
-from dnrpipe.raytrace.lightmap import LightBaker, diffuse_context
+from dnrpipe.raytrace.lightmap import LightBaker
+from dnrpipe.raytrace.lobes import diffuse_context
 from dnrpipe.raytrace.sensors import sensor_dict
 from dnrpipe.raytrace.texels import grouped_meshes
 from dnrpipe.raytrace.variants import choose_variant
@@ -48,7 +49,9 @@ def quad(path: Path, corners: list[list[float]], place: tuple[float, float], bsd
     return {"type": "ply", "filename": str(path), "bsdf": bsdf}
 
 
-def corner_room(folder: Path, floor: dict[str, Any], wall: dict[str, Any], light: dict[str, Any]) -> Any:
+def corner_room(
+    folder: Path, floor: dict[str, Any], wall: dict[str, Any], light: dict[str, Any], **more: dict[str, Any]
+) -> Any:
     """A floor and a wall behind it."""
     return mi.load_dict(
         {
@@ -56,6 +59,7 @@ def corner_room(folder: Path, floor: dict[str, Any], wall: dict[str, Any], light
             "floor": quad(folder / "f.ply", [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], (0.05, 0.05), floor),
             "wall": quad(folder / "w.ply", [[-1, 1, 0], [1, 1, 0], [1, 1, 1.5], [-1, 1, 1.5]], (0.55, 0.05), wall),
             "light": light,
+            **more,
         }
     )
 
@@ -73,12 +77,12 @@ def camera(azimuth: float = 0.3) -> View:
     return View(name="v", width=SIZE, height=SIZE, fl_x=70, fl_y=70, cx=SIZE / 2, cy=SIZE / 2, c2w=rows)
 
 
-def onwards(depth: int = 7) -> Any:
-    return mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 5, "hide_emitters": True})
+def onwards(depth: int = 7, kind: str = "path") -> Any:
+    return mi.load_dict({"type": kind, "max_depth": depth, "rr_depth": 5, "hide_emitters": True})
 
 
-def traced(scene: Any, view: View, spp: int = 2048) -> np.ndarray:
-    integrator = mi.load_dict({"type": "path", "max_depth": 8, "hide_emitters": True})
+def traced(scene: Any, view: View, spp: int = 2048, kind: str = "path", depth: int = 8) -> np.ndarray:
+    integrator = mi.load_dict({"type": kind, "max_depth": depth, "hide_emitters": True})
     sensor = mi.load_dict(sensor_dict(mi, view))
     return np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=3))
 
@@ -115,6 +119,33 @@ def test_base_is_the_path_traced_picture_where_all_is_diffuse(tmp_path: Path, ki
     inside = (truth[..., 3] > 0.99) & (ours[..., 3] > 0.99)
     assert ours[inside, :3].mean() == pytest.approx(truth[inside, :3].mean(), rel=0.015)
     assert np.sqrt(np.mean((ours - truth)[inside] ** 2)) < 0.04 * truth[inside, :3].mean()
+
+
+def test_cutouts_of_translucent_sheets_are_lit_and_light_what_is_behind(tmp_path: Path) -> None:
+    sides = {"a": {"type": "twosided", "b": {"type": "diffuse"}}, "b": {"type": "dnr_translucent"}}
+    leaf = {"type": "mask", "opacity": 0.6, "b": {"type": "blendbsdf", "weight": 0.5, **sides}}
+    floor = {"type": "twosided", "b": {"type": "diffuse", "reflectance": rgb(0.9, 0.5, 0.1)}}
+    light = {"type": "point", "position": [0.0, 3.0, 2.0], "intensity": rgb(40, 40, 40)}  # behind the sheet
+    scene = corner_room(tmp_path, floor, leaf, light)
+    baked = LightBaker(mi, scene, onwards(kind="volpath")).bake(128, 256, 0)
+    ours, truth = colour(rendered(scene, baked, camera(), 16)), traced(scene, camera(), kind="volpath")
+    assert ours.mean(axis=(0, 1)) == pytest.approx(truth.mean(axis=(0, 1)), rel=0.03)
+    wall = np.array(rendered(scene, baked, camera())["uv.U"]) > 0.5  # red light that the floor throws onto the sheet
+    assert ours[wall, 0].mean() == pytest.approx(truth[wall, 0].mean(), rel=0.04)
+
+
+def test_water_takes_its_share_of_the_light_on_the_way(tmp_path: Path) -> None:
+    water = {"type": "homogeneous", "albedo": 0.0, "sigma_t": rgb(1.0, 0.2, 0.07), "scale": 1.5}
+    place = mi.ScalarTransform4f().translate([0, 0, 0.4]).scale([0.9, 0.9, 0.3])
+    basin = {"type": "cube", "to_world": place, "b": {"type": "dielectric", "int_ior": 1.33}, "interior": water}
+    matte = {"type": "twosided", "b": {"type": "diffuse", "reflectance": rgb(0.8, 0.8, 0.8)}}
+    scene = corner_room(tmp_path, matte, matte, {"type": "constant"}, basin=basin)
+    baked = LightBaker(mi, scene, onwards(23, kind="volpath")).bake(64, 512, 0)
+    ours, truth = colour(rendered(scene, baked, camera(), 32)), traced(scene, camera(), kind="volpath", depth=24)
+    middle = (slice(20, 30), slice(18, 30))  # through the water
+    ours, truth = ours[middle].mean(axis=(0, 1)), truth[middle].mean(axis=(0, 1))
+    assert truth[0] < 0.75 * truth[2]
+    assert ours == pytest.approx(truth, rel=0.06)
 
 
 def test_instances_share_the_light_of_the_first(tmp_path: Path) -> None:

@@ -29,6 +29,9 @@ HALF_THERE = """<shape type="sphere"><transform name="to_world"><scale value="1.
 MIRROR = """<shape type="sphere"><transform name="to_world"><scale value="1.3"/></transform>
   <bsdf type="conductor"/></shape>"""
 
+GLASS = """<shape type="sphere"><transform name="to_world"><scale value="1.3"/></transform>
+  <bsdf type="dielectric"><float name="int_ior" value="1.05"/></bsdf></shape>"""
+
 SCRIPT = """
 import json, sys
 from pathlib import Path
@@ -115,11 +118,26 @@ note(albedo=np.abs(guide.albedo[inside] - [0.6, 0.4, 0.2]).max(), inside=inside.
     assert found["outside"] == 0
 
 
+def test_auxiliary_images_show_what_is_behind_glass(tmp_path: Path) -> None:
+    code = """
+kept = frames.auxiliary(views[0], 64, 3).albedo
+albedo, normal = engine.auxiliary(folder / "scene.xml", views[0], 64)
+half = len(albedo) // 2
+for name, image in (("frames", kept), ("engine", albedo)):
+    note(**{name + colour: image[half, half, i] for i, colour in enumerate("RGB")})
+note(normal=np.linalg.norm(normal[half, half]))
+"""
+    found = _run(tmp_path, GLASS, code, views=1)
+    for name in ("frames", "engine"):  # a few of the rays are mirrored away, to where nothing is: albedo 1
+        assert [found[name + colour] for colour in "RGB"] == pytest.approx([0.6, 0.4, 0.2], abs=0.01)
+    assert found["normal"] > 0.9
+
+
 def test_mirrors_have_albedo_one_and_half_transparent_surfaces_are_half_there(tmp_path: Path) -> None:
     mirror = _run(
         tmp_path, MIRROR, "g = frames.auxiliary(views[0], 16, 3); note(a=g.albedo[g.coverage == 1].min())", views=1
     )
-    assert mirror["a"] == 1
+    assert mirror["a"] == pytest.approx(1)
     code = """
 g = frames.auxiliary(views[0], 256, 3)
 rim = ~(np.abs(g.coverage - 1) < 1e-6) & (g.coverage > 0)

@@ -181,3 +181,14 @@ def test_unknown_profile_and_missing_parts_are_refused() -> None:
         mi.load_dict(bent([0, 0, 1], diffuse(0.5), space="object"))
     with pytest.raises(RuntimeError, match="exactly two"):
         mi.load_dict({"type": "dnr_add", "a": diffuse(0.5)})
+
+
+def test_translucency_keeps_the_energy_of_its_colour() -> None:
+    """A ball of it in light from everywhere: what leaves the wall came through a wall, over and over, share c each."""
+    assert furnace({"type": "dnr_translucent", "color": rgb(1.0, 1.0, 1.0)}) == pytest.approx(1.0, abs=0.03)
+    sheet = mi.load_dict({"type": "dnr_translucent", "color": rgb(0.6, 0.7, 0.3)})
+    si = mi.SurfaceInteraction3f()
+    si.wi = mi.Vector3f(0, 0, 1)
+    same, across = (sheet.eval(mi.BSDFContext(), si, mi.Vector3f(0, 0, z)) for z in (1, -1))
+    assert np.array(same).ravel() == pytest.approx([0, 0, 0])
+    assert np.array(across).ravel() * np.pi == pytest.approx([0.6, 0.7, 0.3], abs=1e-5)

@@ -19,17 +19,19 @@ from typing import Any
 
 import numpy as np
 
-from .lightmap import diffuse_context, reflectance
+from .lobes import diffuse_context, ignores_context, is_among, mirrors_and_refracts, reflectance
 from .paths import power_heuristic
 from .texels import ATTRIBUTE
 from .visibility import LAMP_PREFIX, UNSEEN_PREFIX, is_one_of
 
-TILE = 4
+TILE = 3
 MAX_VERTICES = 8
 GOLDEN = (0.7548776662466927, 0.5698402909980532)
 """Steps of the two-dimensional R2 sequence (Roberts 2018)."""
 NUMBERS = 5
 """Random numbers per vertex: two for the direction, one for the lobe, two for the emitter."""
+MIRRORED = 0.25
+"""Share of the samples that the first glass reflects. By Fresnel's share, a lamp in the water would be a few specks."""
 LEAST_THROUGHPUT = 1e-3
 MEANS = (
     *("base.R", "base.G", "base.B", "base.A", "diffuse.R", "diffuse.G", "diffuse.B"),
@@ -40,9 +42,6 @@ CENTRES = (
     *("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z", "mask"),
 )
 GBUFFER = ("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z")
-IGNORE_CONTEXT = "Principled BSDF :"
-"""How Mitsuba's BSDFs ``principled`` and ``principledthin`` print themselves. They do not split into lobes, so all of
-what they do, or what they are nested in does, is taken for diffuse, but for what passes straight on."""
 
 
 def _steps() -> list[float]:
@@ -70,13 +69,15 @@ class BaseRenderer:
         shapes = scene.shapes()
         self.apart = [shape for shape in shapes if shape.id().startswith((LAMP_PREFIX, UNSEEN_PREFIX))]
         self.lit = bool(scene.emitters())
+        self.media = any(shape.is_medium_transition() for shape in shapes)
         bsdfs = list({id(b): b for b in [shape.bsdf() for shape in shapes] if b is not None}.values())
-        self.whole = [b for b in bsdfs if IGNORE_CONTEXT in str(b)]
+        self.whole = [b for b in bsdfs if ignores_context(b)]
         self.cut = any(mi.has_flag(b.flags(), mi.BSDFFlags.Null) for b in self.whole)
         self.translucent = bool(self.whole) or any(
             mi.has_flag(b.flags(), mi.BSDFFlags.DiffuseTransmission) for b in bsdfs
         )
-        order = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]], np.uint32)  # Bayer
+        order = np.array([[0, 5, 7], [3, 8, 1], [6, 2, 4]], np.uint32)  # neighbours far apart
+        self.glassy = any(mirrors_and_refracts(mi, b.flags()) for b in bsdfs)
         self.tables = mi.UInt32(order.ravel()), mi.Float(np.array(_steps(), np.float32))
         # Recorded at the first call: tracing the plugins anew would take longer than the frame itself.
         self.kernel = dr.freeze(self._kernel)
@@ -140,6 +141,17 @@ class BaseRenderer:
         found = [mi.Spectrum(*texture.eval(uv, active)) for texture in light]
         return dr.select(front, found[0], found[1]), uv
 
+    def _passed(self, medium: Any, ray: Any, si: Any, active: Any) -> Any:
+        """What ``medium`` lets through of the light along the ray's segment; what it scatters counts as passed."""
+        import drjit as dr
+
+        mi = self.mi
+        inside = active & si.is_valid() & (medium != dr.zeros(mi.MediumPtr))
+        middle = dr.zeros(mi.MediumInteraction3f)
+        middle.p = ray(0.5 * si.t)
+        scattered, _, lost = medium.get_scattering_coefficients(middle, inside)
+        return dr.select(inside, dr.exp((scattered - lost) * si.t), 1)
+
     def _follow(self, scene: Any, light: Any, steps: Any, ray: Any, forward: Any, number: Any) -> list[Any]:
         """One sample along each ray: the values named by MEANS and CENTRES.
 
@@ -157,6 +169,10 @@ class BaseRenderer:
         glossy = mi.BSDFContext()
         glossy.type_mask = mi.BSDFFlags.Glossy
 
+        sides = [mi.BSDFContext(), mi.BSDFContext()]
+        sides[0].type_mask = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.GlossyReflection)
+        sides[1].type_mask = int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.GlossyTransmission)
+
         def uniform(vertex: Any, dimension: int) -> Any:
             step = dr.gather(mi.Float, steps, vertex * NUMBERS + dimension)
             return _fraction(0.5 + number * step)
@@ -166,6 +182,8 @@ class BaseRenderer:
             si = scene.ray_intersect(s["ray"], mi.RayFlags.All, True, active)
             passed = active & straight & is_one_of(mi, si, self.apart) if self.apart else mi.Mask(False)
             going = active & ~passed
+            if self.media:
+                s["throughput"] *= self._passed(s["medium"], s["ray"], si, going)
             # Light that is hit
             source = mi.DirectionSample3f(scene, si, s["before"])
             seen = going & (si.is_valid() | ~straight)
@@ -191,7 +209,7 @@ class BaseRenderer:
             chain_uv = dr.select(ends, uv, s["chain_uv"])
             chain_weight = dr.select(ends, dr.mean(s["throughput"]), s["chain_weight"])
             # Emitters, once, through glossy lobes: measured, further vertices cost more than they bring
-            onwards = met & ~_has(mi, bsdf, self.whole)
+            onwards = met & ~is_among(mi, bsdf, self.whole)
             rough = onwards & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) & ~s["lit"]
             if self.lit:
                 pair = mi.Point2f(uniform(s["vertex"], 3), uniform(s["vertex"], 4))
@@ -203,6 +221,14 @@ class BaseRenderer:
             # The mirror-like rest
             pair = mi.Point2f(uniform(s["vertex"], 0), uniform(s["vertex"], 1))
             bounce, factor = bsdf.sample(rest, si, uniform(s["vertex"], 2), pair, onwards)
+            forked = mi.Mask(False)
+            if self.glassy:
+                forked = onwards & s["whole"] & mirrors_and_refracts(mi, bsdf.flags())
+                chosen = [bsdf.sample(part, si, uniform(s["vertex"], 2), pair, forked) for part in sides]
+                mirrored = (number + 0.5) / (self.samples * TILE * TILE) >= 1 - MIRRORED
+                side = dr.select(mirrored, chosen[0][0], chosen[1][0])
+                share = dr.select(mirrored, chosen[0][1] / MIRRORED, chosen[1][1] / (1 - MIRRORED))
+                bounce, factor = dr.select(forked, side, bounce), dr.select(forked, share, factor)
             if self.cut:
                 passing = met & ~onwards & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
                 through, share = bsdf.sample(straight_on, si, uniform(s["vertex"], 2), pair, passing)
@@ -215,7 +241,13 @@ class BaseRenderer:
             throughput = dr.select(dr.all(dr.isfinite(throughput)), throughput, 0)
             next_ray = si.spawn_ray(dr.select(passed, s["ray"].d, si.to_world(bounce.wo)))
             alive = onwards & (bounce.pdf > 0) & (dr.max(throughput) > LEAST_THROUGHPUT)
-            return {
+            more = {}
+            if self.media:
+                crossed = onwards & si.is_medium_transition() & (si.wi.z * bounce.wo.z < 0)
+                more["medium"] = dr.select(crossed, si.target_medium(next_ray.d), s["medium"])
+            if self.glassy:
+                more["whole"] = s["whole"] & ~forked
+            return more | {
                 "active": passed | (alive & (s["vertex"] < MAX_VERTICES)),
                 "ray": dr.select(passed | onwards, next_ray, s["ray"]),
                 "straight": straight & (passed | (null & onwards)),
@@ -258,6 +290,10 @@ class BaseRenderer:
             "chain_weight": mi.Float(0.0),
             "ended": mi.Mask(False),
         }
+        if self.media:
+            state["medium"] = dr.zeros(mi.MediumPtr, dr.width(number))
+        if self.glassy:
+            state["whole"] = mi.Mask(True) & (number >= 0)
         names = list(state)
 
         def unpacked(*values: Any) -> tuple[Any, ...]:
@@ -275,10 +311,3 @@ def _fraction(x: Any) -> Any:
     import drjit as dr
 
     return x - dr.floor(x)
-
-
-def _has(mi: Any, bsdf: Any, members: list[Any]) -> Any:
-    found = mi.Mask(False)
-    for member in members:
-        found |= bsdf == mi.BSDFPtr(member)
-    return found

@@ -13,6 +13,7 @@ from dnrpipe.errors import UserError
 from dnrtrain.contract import View
 
 from . import paths, plugins
+from .auxiliary import auxiliary_integrator
 from .sensors import sensor_dict
 from .units import scaled_lens, scaled_view, unit_scale
 from .visibility import camera_integrator
@@ -73,11 +74,13 @@ class Engine:
         return self.mi.load_dict(sensor_dict(self.mi, view, lens))
 
     def auxiliary(self, bundle: Path, view: View, spp: int) -> tuple[np.ndarray, np.ndarray]:
-        """(albedo, shading normal in world space) of what is seen first, [H, W, 3] each, for the denoiser."""
-        integrator = self.mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
-        part = self.mi.render(
-            self.scenes[str(bundle)], sensor=self.sensor(view), integrator=integrator, spp=spp, seed=0
-        )
+        """(albedo, shading normal in world space), [H, W, 3] each, for the denoiser: see :mod:`.auxiliary`."""
+        scene = self.scenes[str(bundle)]
+        if self.compiled:
+            integrator = auxiliary_integrator(self.mi, scene)
+        else:  # scalar variants, one ray at a time: the first surface, whatever it is
+            integrator = self.mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
+        part = self.mi.render(scene, sensor=self.sensor(view), integrator=integrator, spp=spp, seed=0)
         channels = np.nan_to_num(np.array(part, dtype=np.float32)[..., -6:], posinf=0.0, neginf=0.0)
         return channels[..., :3].clip(0, 1), channels[..., 3:].clip(-1, 1)
 

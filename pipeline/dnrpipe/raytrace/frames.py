@@ -20,6 +20,7 @@ import numpy as np
 from dnrpipe.errors import UserError
 from dnrtrain.contract import View
 
+from .auxiliary import shown_first
 from .engine import Engine
 from .frames_rays import lets_through, pinhole, seen_first
 from .texels import ATTRIBUTE
@@ -31,10 +32,9 @@ WARM_FRAMES = 3
 
 @dataclass(frozen=True)
 class Auxiliary:
-    """What a pixel shows first, as :mod:`.denoise` wants it; float32, means over primary rays.
+    """Auxiliary images as :mod:`.auxiliary` defines them; float32, means over primary rays.
 
-    albedo    [H, W, 3] diffuse reflectance; 1 on surfaces without a diffuse lobe (Open Image Denoise asks for it on
-              mirrors and glass); 0 where nothing is
+    albedo    [H, W, 3] diffuse reflectance, behind mirrors and glass, too
     normal    [H, W, 3] world-space shading normal
     coverage  [H, W] share of the rays that meet a surface
     """
@@ -200,20 +200,14 @@ class Frames:
 
         mi, scene = self.mi, self.scene
         rays, means, prototype = self._rays, self._means, mi.load_dict({"type": "independent"})
-        seen, cells = seen_first(self.mi, self.scene), math.isqrt(count) if math.isqrt(count) ** 2 == count else 1
-        diffuse = mi.BSDFFlags.Diffuse
+        shown, cells = shown_first(self.mi, self.scene), math.isqrt(count) if math.isqrt(count) ** 2 == count else 1
 
         @dr.freeze
         def kernel(camera: list[Any], seed: Any, samples: Any) -> list[Any]:
             sampler = prototype.fork()
-            hit = seen(scene, rays(sampler, camera, seed, samples, count, cells), sampler)
-            found = hit.is_valid()
-            bsdf = hit.bsdf()
-            albedo = mi.Color3f(bsdf.eval_diffuse_reflectance(hit, found))
-            albedo = dr.select(mi.has_flag(bsdf.flags(), diffuse), dr.clip(albedo, 0, 1), 1)
-            albedo, normal = dr.select(found, albedo, 0), dr.select(found, hit.sh_frame.n, 0)
-            values = [albedo.x, albedo.y, albedo.z, normal.x, normal.y, normal.z]
-            return means([*values, dr.select(found, mi.Float(1), mi.Float(0))], count)
+            ray = rays(sampler, camera, seed, samples, count, cells)
+            albedo, normal, met = shown(scene, ray, sampler, mi.Bool(True))
+            return means([*albedo, *normal, dr.select(met, mi.Float(1), mi.Float(0))], count)
 
         return kernel
 

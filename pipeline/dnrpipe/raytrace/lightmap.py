@@ -22,6 +22,7 @@ import numpy as np
 
 from .denoise import denoise, filled
 from .frames_rays import lets_through
+from .lobes import diffuse_context, reflectance
 from .texels import AtlasSurface
 
 MAX_SAMPLES = 4_000_000
@@ -31,27 +32,6 @@ LEAST_RHO = 1e-3
 """Texels that reflect less hold no light worth knowing."""
 MAX_LAYERS = 16
 """Surfaces that a shadow ray passes at most."""
-
-
-def diffuse_context(mi: Any) -> Any:
-    """Context of the diffuse lobes alone."""
-    context = mi.BSDFContext()
-    context.type_mask = mi.BSDFFlags.Diffuse
-    return context
-
-
-def reflectance(mi: Any, bsdf: Any, context: Any, si: Any, active: Any, translucent: bool = True) -> Any:
-    """rho of the notation, per colour. ``si.wi`` decides which layers above attenuate it.
-
-    translucent: False where no surface of the scene transmits diffusely, which spares half the work.
-    """
-    import drjit as dr
-
-    same = mi.Vector3f(0, 0, dr.select(si.wi.z < 0, -1.0, 1.0))
-    value = bsdf.eval(context, si, same, active)
-    if translucent:
-        value += bsdf.eval(context, si, -same, active)
-    return value * dr.pi
 
 
 class LightBaker:
@@ -66,6 +46,8 @@ class LightBaker:
         self.surface = AtlasSurface(mi, scene, groups)
         self.lift = float(LIFT * scene.bbox().bounding_sphere().radius)
         self.passing = lets_through(mi, scene)
+        inner = [shape.interior_medium() for shape in scene.shapes() if shape.is_medium_transition()]
+        self.media = list({id(medium): medium for medium in inner if medium is not None}.values())
 
     def bake(self, size: int, spp: int, seed: int) -> np.ndarray:
         """E of the front and of the back, float32 [2, size, size, 3], row 0 at V = 0; denoised, gaps filled.
@@ -183,14 +165,37 @@ class LightBaker:
         import drjit as dr
 
         mi, scene = self.mi, self.scene
-        bounce, weight = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), active)
-        going = active & (bounce.pdf > 0) & (dr.max(weight) > 0)
-        onwards = si.spawn_ray(si.to_world(bounce.wo))
+        # Not bsdf.sample: Mitsuba's mask gives nothing when it is asked for the diffuse lobes alone.
+        wo = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
+        across = (sampler.next_1d() < 0.5) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseTransmission)
+        density = wo.z * dr.inv_pi * dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseTransmission), 0.5, 1)
+        wo.z = dr.select((si.wi.z < 0) ^ across, -wo.z, wo.z)
+        weight = bsdf.eval(context, si, wo, active) / density
+        going = active & (density > 0) & (dr.max(weight) > 0)
+        onwards = si.spawn_ray(si.to_world(wo))
         # What glows is counted by the emitter sample; the integrator would look through it instead of stopping there.
         behind = scene.ray_intersect_preliminary(onwards, going)
         going &= ~(behind.is_valid() & behind.shape.is_emitter())
-        light, _, _ = self.integrator.sample(scene, sampler, mi.RayDifferential3f(onwards), None, going)
+        light = mi.Spectrum(0.0)
+        for medium, starts in self._around(onwards, going):
+            found, _, _ = self.integrator.sample(scene, sampler, mi.RayDifferential3f(onwards), medium, starts)
+            light = dr.select(starts, found, light)
         return dr.select(going, weight * light, 0)
+
+    def _around(self, ray: Any, active: Any) -> list[tuple[Any, Any]]:
+        """Media (None: empty space) with the rays that start in them: those that would leave a medium at the first
+        surface that they hit. What starts in a medium and hits something else in it counts as outside.
+        """
+        import drjit as dr
+
+        if not self.media:
+            return [(None, active)]
+        mi = self.mi
+        hit = self.scene.ray_intersect(ray, active)
+        leaves = active & hit.is_valid() & hit.is_medium_transition() & (dr.dot(hit.n, ray.d) > 0)
+        around = dr.select(leaves, hit.shape.interior_medium(), dr.zeros(mi.MediumPtr))
+        members = [(medium, active & (around == mi.MediumPtr(medium))) for medium in self.media]
+        return [(None, active & (around == dr.zeros(mi.MediumPtr))), *members]
 
     def _transmittance(self, si: Any, toward: Any, active: Any) -> Any:
         """Product of what the surfaces between ``si`` and the emitter's point let straight through."""

@@ -27,7 +27,7 @@ from .engine import Engine
 from .sensors import sensor_dict
 
 REPAIR_ROUNDS = 3
-AUXILIARY_SPP = 16
+AUXILIARY_SPP = 64
 
 
 class Worker:

@@ -106,13 +106,9 @@ class LobeShaders(NormalShaders):
         return self._bent(element, node, scope)
 
     def _translucent(self, node: Any, scope: Scope) -> Surface:
-        """Translucent BSDF -> ``principledthin`` with all diffuse light transmitted."""
-        self.note("approximated", "Translucent BSDF", "thin sheet with diffuse transmission only")
-        element = xmltree.plugin("bsdf", "principledthin")
-        self._put_colour(element, "base_color", self._colour(node, scope, "Color"))
-        xmltree.number(element, "roughness", 1.0)
-        xmltree.number(element, "eta", 1.01)
-        xmltree.number(element, "diff_trans", 2.0)
+        """Translucent BSDF -> ``dnr_translucent``."""
+        element = xmltree.plugin("bsdf", "dnr_translucent")
+        self._put_colour(element, "color", self._colour(node, scope, "Color"))
         return self._bent(element, node, scope, both_sides=True)
 
     def _subsurface(self, node: Any, scope: Scope) -> Surface:

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from . import emitters, layers, lookups, normals, refraction, sums, transparency, views
+from . import emitters, layers, lookups, normals, refraction, sums, translucency, transparency, views
 
-FAMILIES = (lookups, views, normals, sums, transparency, refraction, emitters, layers)
+FAMILIES = (lookups, views, normals, sums, transparency, translucency, refraction, emitters, layers)
 
 
 def register(mi: Any) -> None:

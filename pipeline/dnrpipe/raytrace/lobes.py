@@ -1,0 +1,50 @@
+"""Parts of a BSDF: its diffuse lobes apart from those that mirror and refract."""
+
+from __future__ import annotations
+
+from typing import Any
+
+IGNORE_CONTEXT = "Principled BSDF :"
+"""How Mitsuba's BSDFs ``principled`` and ``principledthin`` print themselves. They do not split into lobes, so all of
+what they do, or what they are nested in does, is taken for diffuse, but for what passes straight on."""
+
+
+def ignores_context(bsdf: Any) -> bool:
+    """Whether the BSDF, or one nested in it, evaluates all its lobes whatever it is asked for."""
+    return IGNORE_CONTEXT in str(bsdf)
+
+
+def diffuse_context(mi: Any) -> Any:
+    """Context of the diffuse lobes alone."""
+    context = mi.BSDFContext()
+    context.type_mask = mi.BSDFFlags.Diffuse
+    return context
+
+
+def reflectance(mi: Any, bsdf: Any, context: Any, si: Any, active: Any, translucent: bool = True) -> Any:
+    """rho of the notation, per colour. ``si.wi`` decides which layers above attenuate it.
+
+    translucent: False where no surface of the scene transmits diffusely, which spares half the work.
+    """
+    import drjit as dr
+
+    same = mi.Vector3f(0, 0, dr.select(si.wi.z < 0, -1.0, 1.0))
+    value = bsdf.eval(context, si, same, active)
+    if translucent:
+        value += bsdf.eval(context, si, -same, active)
+    return value * dr.pi
+
+
+def mirrors_and_refracts(mi: Any, flags: Any) -> Any:
+    """Of a BSDF's flags: whether it has lobes other than diffuse both of reflection and of transmission."""
+    mirrors = int(mi.BSDFFlags.DeltaReflection) | int(mi.BSDFFlags.GlossyReflection)
+    refracts = int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.GlossyTransmission)
+    return ((flags & mirrors) != 0) & ((flags & refracts) != 0)
+
+
+def is_among(mi: Any, bsdf: Any, members: list[Any]) -> Any:
+    """Whether ``bsdf`` is one of ``members``, lane by lane."""
+    found = mi.Mask(False)
+    for member in members:
+        found |= bsdf == mi.BSDFPtr(member)
+    return found
