@@ -12,6 +12,7 @@ import os
 import statistics
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +62,8 @@ def precision_line() -> str:
 def network_lines(workspace: Path) -> list[str]:
     """One frame of the workspace's network at other sizes: its own first test view, enlarged.
 
-    Wall clock and CPU time; the two apart say how busy the machine is with other things.
+    Wall clock and CPU time; the two apart say how busy the machine is with other things. Then the shares of texture
+    sampling, the network proper and the rest (guides, correction, display, composition) in the wall clock.
     """
     import torch
 
@@ -72,29 +74,55 @@ def network_lines(workspace: Path) -> list[str]:
             if device == "cuda" and not torch.cuda.is_available():
                 lines.append(f"{name:18} not measured (no CUDA device here)")
                 continue
-            wall, cpu = _network(workspace, size, device)
+            wall, cpu, parts = _network(workspace, size, device)
             lines.append(f"{name:18} median {wall:8.1f} ms, {cpu:.1f} ms of CPU time")
+            shares = ", ".join(f"{part} {100 * milliseconds / wall:.0f}%" for part, milliseconds in parts.items())
+            rest = wall - sum(parts.values())
+            lines.append(f"{'':18} {shares}, guides, correction and composition {100 * rest / wall:.0f}%")
     return lines
 
 
-def _network(workspace: Path, size: int, device: str) -> tuple[float, float]:
-    """Medians of (wall, CPU) milliseconds of one frame of size² pixels."""
+def _network(workspace: Path, size: int, device: str) -> tuple[float, float, dict[str, float]]:
+    """Medians of (wall, CPU) milliseconds of one frame of size² pixels, and the wall clock of its parts."""
     import torch
 
     from dnrtrain.checkpoint import load_model
 
     model = load_model(workspace / "checkpoints" / "step2", device)
     batch = _enlarged(_first_view(workspace, model.settings.base), size).to(device)
+    wait = torch.cuda.synchronize if device == "cuda" else lambda: None
+    parts: dict[str, list[float]] = {}
     seconds = []
     with torch.no_grad():
         for _ in range(REPEATS + 2):
             wall, cpu = time.perf_counter(), time.process_time()
             model(batch)
-            if device == "cuda":
-                torch.cuda.synchronize()
+            wait()
             seconds.append((time.perf_counter() - wall, time.process_time() - cpu))
+        # In frames of their own: waiting for a GPU between the parts slows it down.
+        for part, module in (("textures", model.aggregator), ("network", model.renderer)):
+            _time_calls(module, parts.setdefault(part, []), wait)
+        for _ in range(REPEATS + 2):
+            model(batch)
     wall, cpu = (1000 * statistics.median(values) for values in zip(*seconds[2:], strict=True))
-    return wall, cpu
+    return wall, cpu, {part: 1000 * statistics.median(values[2:]) for part, values in parts.items()}
+
+
+def _time_calls(module: Any, seconds: list[float], wait: Callable[[], None]) -> None:
+    """Append the wall clock of every call of ``module`` to ``seconds``."""
+    started = 0.0
+
+    def before(*_: object) -> None:
+        nonlocal started
+        wait()
+        started = time.perf_counter()
+
+    def after(*_: object) -> None:
+        wait()
+        seconds.append(time.perf_counter() - started)
+
+    module.register_forward_pre_hook(before)
+    module.register_forward_hook(after)
 
 
 def _first_view(workspace: Path, base: Any) -> Any:

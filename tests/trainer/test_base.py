@@ -19,6 +19,7 @@ from dnrtrain.dataset import DIHEDRAL_ORDER, Batch, ViewSet, load_views
 from dnrtrain.display import DisplayTransform
 from dnrtrain.exr import read_exr, write_exr
 from dnrtrain.model import DNR, compose, render_radiance, render_views
+from dnrtrain.renderer import add_pointwise, planes
 from dnrtrain.settings import ModelSettings
 
 SMALL = {"texture_size": 16, "width": 4, "depth": 2, "aggregator": "residual", "modalities": "uv"}
@@ -122,7 +123,7 @@ def test_the_chain_looks_up_what_it_reaches(baked: ViewSet) -> None:
     assert (seen * (1 - batch.chain_mask) == 0).all()
     swapped = dataclasses.replace(batch, uv=batch.chain_uv, mask=batch.chain_mask)
     inside = batch.chain_mask.expand_as(seen) > 0.5
-    expected = model.aggregator(swapped, bfloat16=False)[inside] * 0.7
+    expected = model.aggregator(swapped, bfloat16=False)[0][inside] * 0.7
     assert torch.allclose(seen[inside], expected, atol=1e-6)
 
 
@@ -187,6 +188,33 @@ def test_half_resolution_takes_any_size(height: int, width: int, depth: int) -> 
     settings = ModelSettings.model_validate({**SMALL, "depth": depth, "stride": 2, "guides": True})
     out = DNR(settings, seed=0)(batch)
     assert out.rgb.shape == (2, 3, height, width) and torch.isfinite(out.rgb).all()
+
+
+def test_pointwise_layers_equal_convolutions() -> None:
+    """They read and write other memory layouts than the convolutions that they stand for, and compute the same."""
+    generator = torch.Generator().manual_seed(0)
+    maps, total = (torch.randn(2, channels, 5, 7, generator=generator) for channels in (6, 4))
+    total = total.contiguous(memory_format=torch.channels_last)
+    plain, biased = torch.nn.Conv2d(6, 4, 1, bias=False), torch.nn.Conv2d(4, 3, 1)
+    assert torch.allclose(add_pointwise(total, plain, maps), total + plain(maps), atol=1e-5)
+    assert add_pointwise(total, plain, maps).is_contiguous(memory_format=torch.channels_last)
+    assert torch.allclose(planes(biased, total), biased(total), atol=1e-5)
+    assert planes(biased, total).is_contiguous()
+
+
+@pytest.mark.parametrize(("bfloat16", "tolerance"), [(False, 1e-5), (True, 0.03)])
+def test_inference_equals_training(baked: ViewSet, bfloat16: bool, tolerance: float) -> None:
+    """Without gradients textures are sampled in another way; bfloat16 may round the last bit otherwise."""
+    model = DNR(WHOLE.model_copy(update={"filter": 3, "output": "log"}), seed=0)
+    model.use_bfloat16 = bfloat16
+    with torch.no_grad():
+        model.renderer.head.weight.add_(0.05)
+        inferred = model.eval()(baked.batch([0, 3]))
+    assert model.aggregator.texture_uv._merged is not None
+    trained = model.train()(baked.batch([0, 3]))
+    assert (inferred.texture - trained.texture).abs().max() < 1e-6
+    assert (inferred.rgb - trained.rgb).abs().max() < tolerance
+    assert (inferred.rgb - trained.rgb).abs().mean() < tolerance / 30
 
 
 def test_the_mlp_sees_one_pixel_and_the_half_net_its_neighbours(baked: ViewSet) -> None:

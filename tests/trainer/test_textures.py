@@ -34,8 +34,7 @@ def test_aggregator_equals_the_reference(scene: Scene) -> None:
     everywhere = random_directions(32 * 32).t().reshape(1, 3, 32, 32) * batch.mask  # both hemispheres
     batch = dataclasses.replace(batch, normal=everywhere)
     with torch.no_grad():
-        texture = model.aggregator(batch, bfloat16=False)
-        shaded = apply_harmonics(texture, batch.view_dir)
+        texture, shaded = model.eval().aggregator(batch, bfloat16=False)
     weights = {name: value.double().numpy() for name, value in model.state_dict().items()}
     view = {k: getattr(batch, k)[0].double().numpy() for k in ("uv", "depth", "normal", "mask")}
     expected = reference.spatial_texture(weights, 3, view)
@@ -112,3 +111,33 @@ def test_gather_and_scatter_are_inverse(scene: Scene) -> None:
     batch = scene.traced.batch([0, 3])
     inside = Inside(batch.mask)
     assert torch.equal(inside.scatter(inside.gather(batch.normal)), batch.normal)
+
+
+@pytest.mark.parametrize("dimensions", [1, 2])
+@pytest.mark.parametrize(("size", "levels", "merges"), [(16, 4, True), (8, 4, True), (5, 1, True), (12, 4, False)])
+def test_merged_levels_sample_as_the_sum_does(size: int, levels: int, merges: bool, dimensions: int) -> None:
+    """To float32 rounding: between texels, on centres, at and beyond the border; and after every change of a texel."""
+    pyramid = TexturePyramid(size, levels, 3, dimensions=dimensions, generator=torch.Generator().manual_seed(0))
+    random = 2.4 * torch.rand(500, 2, generator=torch.Generator().manual_seed(1)) - 1.2
+    knots = torch.linspace(-1.0, 1.0, 2 * size + 1)
+    points = torch.cat([random, torch.cartesian_prod(knots, knots)])
+    optimiser = torch.optim.Adam(pyramid.parameters(), lr=0.1, fused=True)
+
+    def difference() -> float:
+        with torch.no_grad():
+            return float((pyramid(points) - plain).abs().max())
+
+    for _ in range(2):
+        plain = pyramid.eval()(points)
+        assert difference() < 1e-6 and plain.std() > 0.01
+        pyramid.train()(points).square().sum().backward()
+        optimiser.step()
+    plain = pyramid.eval()(points)
+    assert difference() < 1e-6
+    before = pyramid._merged
+    assert difference() < 1e-6 and pyramid._merged is before
+    pyramid.load_state_dict({name: 2.0 * texels for name, texels in pyramid.state_dict().items()})
+    assert difference() > 0.01
+    plain = pyramid(points)
+    assert difference() < 1e-6
+    assert pyramid.mergeable == merges == (pyramid._merged is not None)

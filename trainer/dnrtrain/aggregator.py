@@ -20,7 +20,7 @@ from .contract import ContractError
 from .dataset import Batch
 from .precision import at_least_float32
 from .settings import ModelSettings
-from .textures import TexturePyramid, depth_coordinate, octahedral
+from .textures import TexturePyramid, apply_harmonics, depth_coordinate, octahedral
 
 SLOPE = 0.2
 GEOMETRY_TEXELS = 128
@@ -72,6 +72,7 @@ class Aggregator(nn.Module):
         self.modalities = settings.modalities.split("+")
         channels = settings.texture_channels
         self.channels = channels
+        self.harmonics = settings.spherical_harmonics
         if self.strategy == "early":
             inputs = {"uv": 3, "depth": 3, "normal": 3}
             self.fusion: FusionCNN | None = FusionCNN(sum(inputs[m] for m in self.modalities), channels)
@@ -96,11 +97,23 @@ class Aggregator(nn.Module):
             assert self.fusion.conv.bias is not None
             nn.init.zeros_(self.fusion.conv.bias)
 
-    def forward(self, batch: Batch, *, bfloat16: bool) -> Tensor:
-        """-> T [N, C, H, W] float32, 0 outside the mask. Only the fusion's convolutions may be bfloat16."""
+    def forward(self, batch: Batch, *, bfloat16: bool) -> tuple[Tensor, Tensor]:
+        """-> T and what the renderer sees of it, T with the harmonics of the view direction if wanted.
+
+        [N, C, H, W] float32 each, 0 outside the mask. Only the fusion's convolutions may be bfloat16.
+        """
         inside = Inside(batch.mask)
         if inside.index.numel() == 0:
-            return batch.mask.new_zeros(batch.mask.shape[0], self.channels, *batch.mask.shape[-2:])
+            texture = batch.mask.new_zeros(batch.mask.shape[0], self.channels, *batch.mask.shape[-2:])
+            return texture, texture
+        if self.fusion is None and self.harmonics:
+            (features,) = self._sampled(batch, inside)
+            seen = apply_harmonics(features, inside.gather(batch.view_dir))
+            return inside.scatter(features), inside.scatter(seen)
+        texture = self._fused(batch, inside, bfloat16)
+        return texture, apply_harmonics(texture, batch.view_dir) if self.harmonics else texture
+
+    def _fused(self, batch: Batch, inside: Inside, bfloat16: bool) -> Tensor:
         features = self._raw(batch, inside) if self.strategy == "early" else self._sampled(batch, inside)
         if self.fusion is None:
             return inside.scatter(features[0])

@@ -13,6 +13,8 @@ and keep what is sharp (kernel prediction; Bako et al. 2017); in log space a sin
 
 from __future__ import annotations
 
+import math
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -30,12 +32,12 @@ IDENTITY = 4.0
 
 def to_log(radiance: Tensor) -> Tensor:
     """Linear radiance >= 0 -> log(1 + k x) / log(1 + k); 0 stays 0, 1 stays 1."""
-    return torch.log1p(LOG_SCALE * radiance) / torch.log1p(radiance.new_tensor(LOG_SCALE))
+    return torch.log1p(LOG_SCALE * radiance) * (1.0 / math.log1p(LOG_SCALE))
 
 
 def from_log(value: Tensor) -> Tensor:
     """Inverse of :func:`to_log`; below 0 (darker than black) it goes on continuously."""
-    return torch.expm1(value * torch.log1p(value.new_tensor(LOG_SCALE))) / LOG_SCALE
+    return torch.expm1(value * math.log1p(LOG_SCALE)) / LOG_SCALE
 
 
 def require_base(batch: Batch) -> tuple[Tensor, DisplayTransform]:
@@ -55,7 +57,7 @@ def correct(batch: Batch, outputs: Tensor, settings: ModelSettings) -> tuple[Ten
     value = to_log(display.scale * base) if settings.output == "log" else display(base)
     if settings.filter:
         value = filter_by(value, outputs[:, 6:])
-    value = value * (1.0 + scaled) + added
+    value = torch.addcmul(value + added, value, scaled)
     if settings.output == "display":
         return value, None
     radiance = from_log(value).clamp_min(0.0) / display.scale
@@ -74,8 +76,8 @@ def filter_by(image: Tensor, weights: Tensor) -> Tensor:
     kernel = (weights + ahead).softmax(dim=1)
     height, width = image.shape[-2:]
     padded = F.pad(image, (side // 2,) * 4, mode="replicate")
-    total = torch.zeros_like(image)
-    for i in range(count):  # shifted views: ten times faster than unfolding the image
+    total = kernel[:, :1] * padded[..., :height, :width]
+    for i in range(1, count):  # shifted views: ten times faster than unfolding the image
         y, x = divmod(i, side)
-        total = total + kernel[:, i : i + 1] * padded[..., y : y + height, x : x + width]
+        total = torch.addcmul(total, kernel[:, i : i + 1], padded[..., y : y + height, x : x + width])
     return total

@@ -26,7 +26,8 @@ def srgb_oetf(linear: Tensor) -> Tensor:
     """Linear Rec.709 -> sRGB code values in [0, 1]; negatives become 0, values above 1 become 1."""
     x = linear.clamp(0.0, 1.0)
     # The power's argument is kept above the linear segment: its slope at 0 is infinite.
-    return torch.where(x <= 0.0031308, 12.92 * x, 1.055 * x.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
+    curve = (x.clamp_min(0.0031308) ** (1 / 2.4)).mul_(1.055).sub_(0.055)
+    return torch.where(x <= 0.0031308, 12.92 * x, curve)
 
 
 class DisplayTransform:
@@ -67,7 +68,8 @@ class DisplayTransform:
 
     def __call__(self, radiance: Tensor) -> Tensor:
         """Linear Rec.709 radiance [..., 3, H, W] -> display RGB in [0, 1], same shape, float32."""
-        x = at_least_float32(radiance) * self.scale
+        x = at_least_float32(radiance)
+        x = x * self.scale if self.scale != 1.0 else x
         shown = srgb_oetf(x) if self.lut is None else self._look_up(x)
         if self.inverse_gamma == 1.0:
             return shown

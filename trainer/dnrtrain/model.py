@@ -14,7 +14,6 @@ from .dataset import Batch, ViewSet
 from .guides import guide_channels, guide_maps
 from .renderer import SLOPE, build_renderer
 from .settings import ModelSettings
-from .textures import apply_harmonics
 
 
 @dataclass(frozen=True)
@@ -66,10 +65,7 @@ class DNR(nn.Module):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, batch: Batch) -> Output:
-        texture = self.aggregator(batch, bfloat16=self.use_bfloat16)
-        seen = texture
-        if self.settings.spherical_harmonics:
-            seen = apply_harmonics(texture, batch.view_dir)
+        texture, seen = self.aggregator(batch, bfloat16=self.use_bfloat16)
         settings = self.settings
         groups = [seen, torch.cat([batch.mask, *guide_maps(batch, settings)], dim=1)]
         if settings.chain:
@@ -83,7 +79,7 @@ class DNR(nn.Module):
 
 def compose(rgb: Tensor, coverage: Tensor) -> Tensor:
     """Composite display RGB [N, 3, H, W] over white by the geometric coverage [N, 1, H, W]."""
-    return coverage * rgb + (1.0 - coverage)
+    return torch.lerp(torch.ones_like(coverage), rgb, coverage)
 
 
 def initialise(module: nn.Module, generator: torch.Generator) -> None:
