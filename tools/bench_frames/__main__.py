@@ -21,7 +21,7 @@ def main() -> int:
 
     if options.only_result is not None:
         return _one(options)
-    results: list[dict[str, Any]] = []
+    results: list[dict[str, Any]] = _kept(options)
     for root in options.workspaces:
         with tempfile.TemporaryDirectory() as folder:
             result = Path(folder) / "result.json"
@@ -54,6 +54,7 @@ def _one(options: argparse.Namespace) -> int:
             samples=tuple(options.samples),
             orbit=options.orbit,
             orbit_spp=options.orbit_spp,
+            rays=tuple(options.rays),
         )
         result = bench(root, chosen, lambda line: print(line, file=sys.stderr))
     except UserError as error:
@@ -63,11 +64,19 @@ def _one(options: argparse.Namespace) -> int:
     return 0
 
 
+def _kept(options: argparse.Namespace) -> list[dict[str, Any]]:
+    if not (options.keep and options.out.exists()):
+        return []
+    names = {root.resolve().stem for root in options.workspaces}
+    return [scene for scene in json.loads(options.out.read_text())["scenes"] if scene["scene"] not in names]
+
+
 def _passed(options: argparse.Namespace) -> list[str]:
     """The options that decide a scene's figures, as arguments."""
     names = ("cache", "views", "reference_spp", "reference", "clock", "threads", "orbit", "orbit_spp")
     given = [text for name in names for text in (f"--{name.replace('_', '-')}", str(getattr(options, name)))]
-    return [*given, "--samples", *map(str, options.samples)]
+    rays = ["--rays", *map(str, options.rays)] if options.rays else []
+    return [*given, "--samples", *map(str, options.samples), *rays]
 
 
 def _options() -> argparse.Namespace:
@@ -77,6 +86,8 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--cache", type=Path, default=Path(".cache/frames"), help="where references are kept")
     parser.add_argument("--views", type=int, default=6, help="test views measured")
     parser.add_argument("--samples", type=int, nargs="+", default=[1, 2, 4, 8, 16, 64], help="the rival's ladder")
+    parser.add_argument("--rays", type=int, nargs="+", default=[], help="rays per pixel of our base images")
+    parser.add_argument("--keep", action="store_true", help="scenes that --out has from before stay in it")
     parser.add_argument("--reference-spp", type=int, default=1024, help="samples of a reference, in two halves")
     parser.add_argument("--reference", choices=("auto", "raw", "denoised"), default="auto")
     parser.add_argument("--clock", choices=("wall", "cpu"), default="wall", help="cpu: CPU time over the threads")

@@ -14,13 +14,17 @@ from typing import Any
 
 from dnrtrain.atomic import atomic_path, write_json
 
+from .ours import BASE, NEURAL
+
 PACKAGES = ("mitsuba", "drjit", "mitsuba-oidn", "torch", "numpy")
-NAMES = {"ours": "neural", "base": "base image alone"}
 
 
 def write(results: list[dict[str, Any]], path: Path) -> None:
     """``path`` (.json) and its Markdown beside it, atomically."""
-    record = {"made": _made(), "scenes": results}
+    made = _made()
+    for scene in results:
+        scene.setdefault("made", made)  # scenes that were measured before keep theirs
+    record = {"made": made, "scenes": results}
     write_json(path, record)
     with atomic_path(path.with_suffix(".md")) as temporary:
         temporary.write_text(markdown(record), encoding="utf-8")
@@ -85,7 +89,7 @@ def _overview(scenes: list[dict[str, Any]]) -> list[str]:
             level = standing["crossover_ms"]
             end = f"{level:.0f} ms" if level is not None else f"not by {standing['ladder_end_ms']:.0f} ms"
             lines.append(
-                f"| {scene['scene']} | {NAMES[name]} | {row['ms']:.1f} | {row['psnr']:.2f} | {row['ssim']:.4f} |"
+                f"| {scene['scene']} | {name} | {row['ms']:.1f} | {row['psnr']:.2f} | {row['ssim']:.4f} |"
                 f" {_number(row.get('lpips_vgg'), 4)} | {at} | {standing['lead_db']:+.2f} | {end} |"
             )
     return lines
@@ -108,7 +112,7 @@ def _scene(scene: dict[str, Any]) -> list[str]:
     for name in sorted(shown, key=lambda name: scene["rows"][name]["ms"]):
         row = scene["rows"][name]
         parts = ", ".join(f"{part} {ms:.1f}" for part, ms in row["parts"].items() if ms > 0)
-        label = f"**{NAMES[name]}**" if name in NAMES else name
+        label = f"**{name}**" if _own(name) else name
         lines.append(
             f"| {label} | {row['ms']:.1f} | {parts} | {row['psnr']:.2f} | {_number(row.get('psnr_mask'), 2)} |"
             f" {row['ssim']:.4f} | {_number(row.get('lpips_vgg'), 4)} |"
@@ -116,10 +120,10 @@ def _scene(scene: dict[str, Any]) -> list[str]:
     lines += ["", "| at most | best rival | dB | neural | base image alone |", "|---|---|---|---|---|"]
     per = {name: standing["classes"] for name, standing in scene["standing"].items()}
     for index, row in enumerate(next(iter(per.values()))):
-        mine = {name: _number(rows[index]["ours_db"], 2) for name, rows in per.items()}
+        mine = [_best(per, index, kind) for kind in (NEURAL, BASE)]
         lines.append(
             f"| {row['limit_ms']:.0f} ms | {row['rival'] or 'none'} | {_number(row['rival_db'], 2)} |"
-            f" {mine.get('ours', '-')} | {mine.get('base', '-')} |"
+            f" {_number(mine[0], 2)} | {_number(mine[1], 2)} |"
         )
     if "stability" in scene:
         lines += ["", *_stability(scene)]
@@ -139,9 +143,19 @@ def _stability(scene: dict[str, Any]) -> list[str]:
         "|---|---|---|",
     ]
     for name, row in sorted(rows.items(), key=lambda item: item[1]["flicker"]):
-        label = f"**{NAMES[name]}**" if name in NAMES else name
+        label = f"**{name}**" if _own(name) else name
         lines.append(f"| {label} | {1000 * row['change']:.2f} | {1000 * row['flicker']:.2f} |")
     return lines
+
+
+def _own(name: str) -> bool:
+    return name.startswith((NEURAL, BASE))
+
+
+def _best(per: dict[str, list[dict[str, Any]]], index: int, kind: str) -> float | None:
+    """Our best within a class, among all numbers of rays."""
+    found = [rows[index]["ours_db"] for name, rows in per.items() if name.startswith(kind)]
+    return max((value for value in found if value is not None), default=None)
 
 
 def _number(value: float | None, digits: int) -> str:

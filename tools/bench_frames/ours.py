@@ -29,16 +29,19 @@ from .scene import BenchScene, Clock
 
 TIMED = ("none", "baked")
 """Base images that this benchmark can render frame by frame."""
+NEURAL, BASE = "neural", "base image alone"
 
 
 class Ours:
     """The workspace's fine-tuned model on the CPU, and its base image.
 
-    model is None, and frames have no ``ours``, where the workspace has none: the base image alone is measured then.
+    model is None, and frames have nothing neural, where the workspace has none: the base image alone is measured then.
+    samples: rays per pixel of base images, each a renderer of its own with the same model, whatever it was trained
+    with; none: the workspace's.
     Raises UserError: the model has a base image that is not timed here, or its light is not baked.
     """
 
-    def __init__(self, scene: BenchScene) -> None:
+    def __init__(self, scene: BenchScene, samples: tuple[int, ...] = ()) -> None:
         folder = scene.workspace.checkpoints("step2")
         self.scene = scene
         self.model = load_model(folder) if read_record(folder) is not None else None
@@ -47,40 +50,51 @@ class Ours:
         )
         if self.base not in TIMED:
             raise UserError(f"{folder}: base image '{self.base}' cannot be timed here, only {', '.join(TIMED)}")
-        self.renderer = None
+        self.renderers: dict[int, BaseRenderer] = {}
         if self.base == "baked":
             light = light_path(scene.workspace)
             if not light.exists():
                 raise UserError(f"{light}: the light is not baked; run `dnrpipe finetune` with model.base=baked first")
             mitsuba_scene = scene.engine.scenes[str(scene.bundle)]
-            samples = scene.settings.base.samples
-            self.renderer = BaseRenderer(scene.engine.mi, mitsuba_scene, read_light(light), samples)
+            baked = read_light(light)
+            for count in samples or (scene.settings.base.samples,):
+                self.renderers[count] = BaseRenderer(scene.engine.mi, mitsuba_scene, baked, count)
 
     def frame(self, view: View, clock: Clock) -> dict[str, dict[str, Any]]:
-        """By "ours" and "base": {"picture": display RGB over white [1, 3, H, W], "parts": {name: ms}}."""
+        """By NEURAL and BASE, and the rays per pixel: {"picture": display RGB over white [1, 3, H, W], "parts":
+        {name: ms}}."""
         result: dict[str, dict[str, Any]] = {}
-        channels, parts = self._inputs(view, clock)
-        if self.renderer is not None:
+        for renderer in self.renderers.values() or (None,):
+            result |= self._frame(renderer, view, clock)
+        return result
+
+    def _frame(self, renderer: BaseRenderer | None, view: View, clock: Clock) -> dict[str, dict[str, Any]]:
+        result: dict[str, dict[str, Any]] = {}
+        channels, parts = self._inputs(renderer, view, clock)
+        rays = "" if renderer is None else f", {renderer.samples} rays"
+        if renderer is not None:
             alpha = channels["coverage"]
             straight = (
                 np.stack([channels[f"base.{c}"] for c in "RGB"], axis=-1)
                 / np.maximum(channels["base.A"], 1e-6)[..., None]
             )
             picture = np.concatenate([straight * alpha[..., None], alpha[..., None]], axis=-1)
-            result["base"] = {"picture": self.scene.shown(picture), "parts": dict(parts)}
+            result[BASE + rays] = {"picture": self.scene.shown(picture), "parts": dict(parts)}
         if self.model is not None:
             data = self._data(view, channels)
             picture, parts["network"] = clock.time(partial(render_views, self.model, data))
-            result["ours"] = {"picture": picture.float(), "parts": parts}
+            result[NEURAL + rays] = {"picture": picture.float(), "parts": parts}
         return result
 
-    def _inputs(self, view: View, clock: Clock) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    def _inputs(
+        self, renderer: BaseRenderer | None, view: View, clock: Clock
+    ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
         """(channels that the network sees, ms by part). The base image's kernel gives the G-buffer, too."""
-        if self.renderer is None:
+        if renderer is None:
             channels, ms = clock.time(partial(self.scene.frames.gbuffer, view))
             return channels, {"G-buffer": ms}
         scale = self.scene.engine.unit_scale
-        channels, ms = clock.time(partial(self.renderer.frame, scaled_view(view, scale)))
+        channels, ms = clock.time(partial(renderer.frame, scaled_view(view, scale)))
         mask = channels["mask"] > 0.5
         coverage, finer = clock.time(partial(self.scene.frames.coverage, view, mask))
         changed = {"depth.Z": channels["depth.Z"] / scale, "coverage": coverage}
@@ -102,5 +116,5 @@ class Ours:
                 folder=self.scene.workspace.scene,
                 target=False,
                 base=self.base,
-                base_files=None if self.renderer is None else [path],
+                base_files=[path] if self.renderers else None,
             )

@@ -39,6 +39,7 @@ class Options:
     samples: tuple[int, ...] = SAMPLES
     orbit: int = 12
     orbit_spp: int = 512
+    rays: tuple[int, ...] = ()
 
 
 @dataclass
@@ -59,7 +60,7 @@ def bench(root: Path, options: Options, tell: Callable[[str], None]) -> dict[str
     torch.set_num_threads(options.threads)
     clock = Clock(options.clock, options.threads)
     folder = options.cache / scene.name
-    ours = Ours(scene)
+    ours = Ours(scene, options.rays)
     reference = make_references(scene, scene.views, "test", options.reference_spp, options.reference, folder, tell)
     for turn in range(WARM):
         climb(scene, scene.views[0], turn, clock, make_rungs(options.samples))
