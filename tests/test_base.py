@@ -100,8 +100,8 @@ def test_light_in_a_white_furnace_is_one_on_both_sides(tmp_path: Path) -> None:
     shape = quad(tmp_path / "f.ply", [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], (0.05, 0.05), floor)
     scene = mi.load_dict({"type": "scene", "floor": shape, "light": {"type": "constant"}})
     light = LightBaker(mi, scene, onwards()).bake(32, 4096, 0)
-    assert light.shape == (2, 32, 32, 3)
-    chart = light[:, 4:12, 4:12]
+    assert light.shape == (2, 2, 32, 32, 3)
+    chart = light[0, :, 4:12, 4:12]
     assert np.abs(chart - 1).max() < 0.1
     assert chart.mean() == pytest.approx(1, abs=0.01)
 
@@ -163,7 +163,7 @@ def test_instances_share_the_light_of_the_first(tmp_path: Path) -> None:
         }
     )
     light = LightBaker(mi, scene, onwards(), [(tmp_path / "q.ply", moved)]).bake(32, 1024, 0)
-    assert light[0, 4:12, 4:12].mean() == pytest.approx(1, abs=0.02)
+    assert light[0, 0, 4:12, 4:12].mean() == pytest.approx(1, abs=0.02)
     numbers = " ".join(map(str, moved.ravel()))
     (tmp_path / "scene.xml").write_text(
         '<scene version="3.0.0"><shape type="shapegroup" id="g"><shape type="ply">'
@@ -181,8 +181,25 @@ def test_copies_that_share_a_place_share_the_mean_of_their_light(tmp_path: Path)
     sun = {"type": "directional", "direction": [0, 0, -1], "irradiance": rgb(np.pi, np.pi, np.pi)}
     alone = mi.load_dict({"type": "scene", "up": up, "sun": sun})
     both = mi.load_dict({"type": "scene", "up": up, "down": down, "sun": sun})
-    means = [LightBaker(mi, scene, None).bake(32, 512, 0)[0, 4:12, 4:12].mean() for scene in (alone, both)]
+    means = [LightBaker(mi, scene, None).bake(32, 512, 0)[0, 0, 4:12, 4:12].mean() for scene in (alone, both)]
     assert means == pytest.approx([1.0, 0.5], abs=0.03)
+
+
+def test_rough_metal_shows_what_its_lobe_sees_of_the_wall_without_grain(tmp_path: Path) -> None:
+    metal = {"type": "dnr_principled", "base_color": rgb(0.9, 0.9, 0.9), "metallic": 1.0, "roughness": 0.8}
+    wall = {"type": "twosided", "b": {"type": "diffuse", "reflectance": rgb(0.1, 0.8, 0.2)}}
+    light = {"type": "point", "position": [0.0, 0.0, 1.5], "intensity": rgb(6, 6, 6)}
+    scene = corner_room(tmp_path, {"type": "twosided", "b": metal}, wall, light)
+    baked = LightBaker(mi, scene, onwards()).bake(64, 256, 0)
+    channels, truth = rendered(scene, baked, camera(0.0), 1), traced(scene, camera(0.0))
+    ours, floor = colour(channels), (channels["uv.U"] < 0.5) & (truth[..., 3] > 0.99)
+    near = floor & (np.arange(SIZE)[:, None] < SIZE // 2 + 4)  # where the floor shows the wall
+    assert near.sum() > 50
+    # At this view the lobe sees more of the wall than in the mean over views.
+    assert 0.75 * truth[near, 1].mean() < ours[near, 1].mean() < truth[near, 1].mean()
+    assert baked[1, 0, 4:12, 4:12, 1].mean() > 3 * baked[1, 0, 4:12, 4:12, 0].mean()  # it is green
+    rough = np.abs(np.diff(ours[..., 1], axis=1))[near[:, 1:] & near[:, :-1]].mean()
+    assert rough < 0.1 * ours[near, 1].mean()
 
 
 def test_mirror_shows_the_baked_wall_and_says_where_its_path_ends(tmp_path: Path) -> None:
@@ -207,7 +224,7 @@ def test_frames_repeat_bit_for_bit_and_views_share_one_kernel(tmp_path: Path) ->
     glossy = {"type": "twosided", "b": {"type": "roughconductor", "alpha": 0.2}}
     wall = {"type": "twosided", "b": {"type": "diffuse"}}
     scene = corner_room(tmp_path, glossy, wall, {"type": "constant"})
-    renderer = BaseRenderer(mi, scene, np.ones((2, 8, 8, 3), np.float32), 2)
+    renderer = BaseRenderer(mi, scene, np.ones((2, 2, 8, 8, 3), np.float32), 2)
     first = renderer.frame(camera(0.3))
     other = renderer.frame(camera(0.5))
     recorded = renderer.kernel.n_recordings

@@ -2,10 +2,12 @@
 
 Notation
     E        light map (see :mod:`.lightmap`), rho the diffuse reflectance of the point at hand
+    S        what a rough lobe sees of other surfaces (ibid.): its directions end at emitters
     chain    the path that follows the non-diffuse lobes: mirror reflection, refraction, glossy lobes, cut-outs
     sample   one of S rays through a pixel; the same S places in every pixel, so that nothing flickers
 
-    base     = mean over samples of the sum over the chain's vertices of throughput (emission + rho E)
+    base     = mean over samples of the sum over the chain's vertices of throughput (emission + rho E), and of S where
+               the chain ends at a rough lobe
     diffuse  = the first vertex's share of it
 
 A glossy lobe is sampled by numbers of a fixed low-discrepancy sequence, which repeats over tiles of TILE² pixels. Where
@@ -19,7 +21,15 @@ from typing import Any
 
 import numpy as np
 
-from .lobes import diffuse_context, ignores_context, is_among, mirrors_and_refracts, reflectance
+from .lobes import (
+    diffuse_context,
+    ignores_context,
+    is_among,
+    is_rough,
+    mirrors_and_refracts,
+    other_context,
+    reflectance,
+)
 from .paths import power_heuristic
 from .texels import ATTRIBUTE
 from .visibility import LAMP_PREFIX, UNSEEN_PREFIX, is_one_of
@@ -57,7 +67,7 @@ class BaseRenderer:
     """Renders base images of one scene.
 
     Args:
-        light: E of the front and of the back, float32 [2, size, size, 3], row 0 at V = 0.
+        light: E and S of the front and of the back, float32 [2, 2, size, size, 3], row 0 at V = 0.
         samples: S, rays per pixel.
     """
 
@@ -65,7 +75,8 @@ class BaseRenderer:
         import drjit as dr
 
         self.mi, self.scene, self.samples = mi, scene, samples
-        self.light = [mi.Texture2f(mi.TensorXf(side), wrap_mode=dr.WrapMode.Clamp) for side in light]
+        sides = [np.concatenate([light[0, i], light[1, i]], axis=-1) for i in range(2)]
+        self.light = [mi.Texture2f(mi.TensorXf(side), wrap_mode=dr.WrapMode.Clamp) for side in sides]
         shapes = scene.shapes()
         self.apart = [shape for shape in shapes if shape.id().startswith((LAMP_PREFIX, UNSEEN_PREFIX))]
         self.lit = bool(scene.emitters())
@@ -77,6 +88,7 @@ class BaseRenderer:
             mi.has_flag(b.flags(), mi.BSDFFlags.DiffuseTransmission) for b in bsdfs
         )
         order = np.array([[0, 5, 7], [3, 8, 1], [6, 2, 4]], np.uint32)  # neighbours far apart
+        self.rough = any(mi.has_flag(b.flags(), mi.BSDFFlags.GlossyReflection) for b in bsdfs)
         self.glassy = any(mirrors_and_refracts(mi, b.flags()) for b in bsdfs)
         self.tables = mi.UInt32(order.ravel()), mi.Float(np.array(_steps(), np.float32))
         # Recorded at the first call: tracing the plugins anew would take longer than the frame itself.
@@ -130,16 +142,16 @@ class BaseRenderer:
         ray = mi.Ray3f(mi.Point3f(axes[3]), dr.normalize(direction))
         return self._follow(scene, light, tables[1], ray, -axes[2], number)
 
-    def _baked(self, light: Any, si: Any, active: Any) -> Any:
-        """E at the surface point, on the side that is seen."""
+    def _baked(self, light: Any, si: Any, active: Any) -> tuple[Any, Any, Any]:
+        """(E, S, atlas coordinates) at the surface point, on the side that is seen."""
         import drjit as dr
 
         mi = self.mi
         place = si.shape.eval_attribute_3(ATTRIBUTE, si, active & si.shape.has_attribute(ATTRIBUTE, active))
         front = dr.dot(si.n, si.to_world(si.wi)) >= 0
         uv = mi.Point2f(place.x, place.y)
-        found = [mi.Spectrum(*texture.eval(uv, active)) for texture in light]
-        return dr.select(front, found[0], found[1]), uv
+        found = [dr.select(front, *pair) for pair in zip(*(texture.eval(uv, active) for texture in light), strict=True)]
+        return mi.Spectrum(*found[:3]), mi.Spectrum(*found[3:]), uv
 
     def _passed(self, medium: Any, ray: Any, si: Any, active: Any) -> Any:
         """What ``medium`` lets through of the light along the ray's segment; what it scatters counts as passed."""
@@ -166,6 +178,7 @@ class BaseRenderer:
         rest.type_mask = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Diffuse)
         straight_on = mi.BSDFContext()
         straight_on.type_mask = mi.BSDFFlags.Null
+        glossy_or_sharp = other_context(mi)
         glossy = mi.BSDFContext()
         glossy.type_mask = mi.BSDFFlags.Glossy
 
@@ -182,6 +195,7 @@ class BaseRenderer:
             si = scene.ray_intersect(s["ray"], mi.RayFlags.All, True, active)
             passed = active & straight & is_one_of(mi, si, self.apart) if self.apart else mi.Mask(False)
             going = active & ~passed
+            last = s["last"]
             if self.media:
                 s["throughput"] *= self._passed(s["medium"], s["ray"], si, going)
             # Light that is hit
@@ -191,10 +205,10 @@ class BaseRenderer:
             weight = dr.select(s["sampled"], power_heuristic(s["density"], chance), 1)
             emitted = dr.select(seen, s["throughput"] * weight * source.emitter.eval(si, seen), 0)
             # Baked light
-            met = going & si.is_valid()
+            met = going & ~last & si.is_valid()
             bsdf = si.bsdf()
             rho = dr.select(met, reflectance(mi, bsdf, smooth, si, met, self.translucent), 0)
-            baked, uv = self._baked(light, si, met)
+            baked, around, uv = self._baked(light, si, met)
             here = emitted + dr.select(met, s["throughput"] * rho * baked, 0)
             primary = straight
             total = s["total"] + here
@@ -210,7 +224,8 @@ class BaseRenderer:
             chain_weight = dr.select(ends, dr.mean(s["throughput"]), s["chain_weight"])
             # Emitters, once, through glossy lobes: measured, further vertices cost more than they bring
             onwards = met & ~is_among(mi, bsdf, self.whole)
-            rough = onwards & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) & ~s["lit"]
+            wide = is_rough(mi, bsdf, glossy_or_sharp, si, onwards) if self.rough else mi.Mask(False)
+            rough = onwards & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) & (~s["lit"] | wide)
             if self.lit:
                 pair = mi.Point2f(uniform(s["vertex"], 3), uniform(s["vertex"], 4))
                 toward, arriving = scene.sample_emitter_direction(si, pair, True, rough)
@@ -239,6 +254,7 @@ class BaseRenderer:
             delta = mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Delta)
             throughput = dr.select(onwards, s["throughput"] * factor, s["throughput"])
             throughput = dr.select(dr.all(dr.isfinite(throughput)), throughput, 0)
+            total += dr.select(wide, throughput * around, 0)
             next_ray = si.spawn_ray(dr.select(passed, s["ray"].d, si.to_world(bounce.wo)))
             alive = onwards & (bounce.pdf > 0) & (dr.max(throughput) > LEAST_THROUGHPUT)
             more = {}
@@ -263,6 +279,7 @@ class BaseRenderer:
                 "density": dr.select(null, s["density"], bounce.pdf),
                 "sampled": dr.select(null, s["sampled"], rough & ~delta),
                 "lit": s["lit"] | (rough & ~null),
+                "last": wide,
                 "vertex": s["vertex"] + 1,
                 "chain_uv": chain_uv,
                 "chain_weight": chain_weight,
@@ -285,6 +302,7 @@ class BaseRenderer:
             "density": mi.Float(1.0),
             "sampled": mi.Mask(False),
             "lit": mi.Mask(False),
+            "last": mi.Mask(False),
             "vertex": mi.UInt32(0),
             "chain_uv": mi.Point2f(0.0),
             "chain_weight": mi.Float(0.0),

@@ -23,7 +23,7 @@ class Worker:
 
     common: {"bundle", "variant"}
     task: {"output", "size", "spp", "integrator", "max_depth", "seed", "fingerprint"}; the file is an ``npz`` with
-    ``light`` (float32 [2, size, size, 3]: E of front and back, row 0 at V = 0) and ``fingerprint``.
+    ``light`` (float32 [2, 2, size, size, 3]: E and G of front and back, row 0 at V = 0) and ``fingerprint``.
     """
 
     def __init__(self, common: dict[str, Any]) -> None:
@@ -43,7 +43,7 @@ class Worker:
             "seconds": time.monotonic() - started,
             "cpu_seconds": time.process_time() - cpu,
             "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-            "texels": int((light[0].sum(axis=-1) > 0).sum()),
+            "texels": int((light[0, 0].sum(axis=-1) > 0).sum()),
             "spp": int(task["spp"]),
         }
 
@@ -60,7 +60,7 @@ class Worker:
 
 
 def read_light(path: Path) -> np.ndarray:
-    """float32 [2, size, size, 3]. Raises UserError when it is missing or damaged."""
+    """float32 [2, 2, size, size, 3]. Raises UserError when it is missing or damaged."""
     try:
         with np.load(path, allow_pickle=False) as data:
             return np.asarray(data["light"], np.float32)

@@ -1,4 +1,4 @@
-"""Baked light: the diffusely reflected light of every atlas texel, path-traced once for all views.
+"""Baked light: the light that every atlas texel sends back, path-traced once for all views.
 
 Notation
     x        a point of the surface; n its geometric normal; side +1 or -1: lit and seen from n's side or the other
@@ -6,9 +6,12 @@ Notation
     rho      pi (f_d(n, n) + f_d(n, -n)): the diffuse reflectance, transmittance included
     B        ∫ f_d(n, w) L(x, w) |cos w| dw: what the surface sends back diffusely, view-independent
     E        B / rho, the light map: W sr^-1 m^-2, linear Rec.709
+    S        the light that comes from surfaces, not from emitters, in the mean over what a rough glossy lobe sees, for
+             cosine-weighted directions of view: W sr^-1 m^-2
 
 At a view, B is E times the reflectance of that very point (:mod:`.base`), so that the map holds light alone, which is
-smooth, and textures stay as sharp as they are. Direct light is sampled at the emitters; the rest of the path is the
+smooth, and textures stay as sharp as they are. In the same way S is multiplied by what the lobe reflects at that view:
+a lobe so wide sees about the same from everywhere. Direct light is sampled at the emitters; the rest of the path is the
 plan's own integrator, from the first bounce on, with all its effects.
 """
 
@@ -22,7 +25,7 @@ import numpy as np
 
 from .denoise import denoise, filled
 from .frames_rays import lets_through
-from .lobes import diffuse_context, reflectance
+from .lobes import diffuse_context, ignores_context, is_among, is_rough, other_context, reflectance
 from .texels import AtlasSurface
 
 MAX_SAMPLES = 4_000_000
@@ -46,16 +49,19 @@ class LightBaker:
         self.surface = AtlasSurface(mi, scene, groups)
         self.lift = float(LIFT * scene.bbox().bounding_sphere().radius)
         self.passing = lets_through(mi, scene)
+        bsdfs = list({id(b): b for b in [shape.bsdf() for shape in scene.shapes()] if b is not None}.values())
+        self.whole = [b for b in bsdfs if ignores_context(b)]
+        self.glossy = any(mi.has_flag(b.flags(), mi.BSDFFlags.Glossy) for b in bsdfs)
         inner = [shape.interior_medium() for shape in scene.shapes() if shape.is_medium_transition()]
         self.media = list({id(medium): medium for medium in inner if medium is not None}.values())
 
     def bake(self, size: int, spp: int, seed: int) -> np.ndarray:
-        """E of the front and of the back, float32 [2, size, size, 3], row 0 at V = 0; denoised, gaps filled.
+        """E and S of the front and of the back, float32 [2, 2, size, size, 3], row 0 at V = 0; denoised, gaps filled.
 
         The denoiser is shown where in space each texel lies and where it faces, so that charts that are neighbours in
         the atlas alone stay apart. The back is traced where it can be seen: of surfaces with a rim.
         """
-        whole = np.zeros((2, size, size, 3), np.float32)
+        whole = np.zeros((2, 2, size, size, 3), np.float32)
         if not self.surface.count:
             return whole
         texels, position, normal, thin = self.occupied(size)
@@ -67,35 +73,47 @@ class LightBaker:
             wanted = np.ones(len(texels), bool) if side > 0 else thin
             if not wanted.any():
                 continue
-            sums = self._traced(texels[wanted], size, spp, seed * 2 + number, side)
-            light, rho = sums[:, :3], sums[:, 3:]
-            found = rho.max(axis=1) > LEAST_RHO * spp
-            if not found.any():
-                continue
-            chosen = texels[wanted][found]
-            rows = [
-                np.divide(light[found], rho[found], out=np.zeros_like(light[found]), where=rho[found] > 1e-6 * spp),
-                place[wanted][found],
-                normal[wanted][found] * side,
-            ]
-            valid = np.zeros(size * size, bool)
-            valid[chosen] = True
-            images = []
-            for values in rows:
-                image = np.zeros((size * size, 3), np.float32)
-                image[chosen] = values
-                images.append(filled(image.reshape(size, size, 3), valid.reshape(size, size)))
-            whole[number] = denoise(images[0], images[1], images[2], threads=1)
+            guides = place[wanted], normal[wanted] * side
+            sums = self._traced(self._light, texels[wanted], size, spp, seed * 4 + number, side)
+            found = sums[:, 3:].max(axis=1) > LEAST_RHO * spp
+            whole[0, number] = self._smooth(sums[:, :3], sums[:, 3:], 1e-6 * spp, texels[wanted], found, guides, size)
+            if self.glossy:
+                sums = self._traced(self._gloss, texels[wanted], size, spp, seed * 4 + 2 + number, side)
+                found = sums[:, 3:].max(axis=1) > 0
+                whole[1, number] = self._smooth(sums[:, :3], sums[:, 3:], 0, texels[wanted], found, guides, size)
         return whole
 
-    def _traced(self, texels: np.ndarray, size: int, spp: int, seed: int, side: int) -> np.ndarray:
-        """[T, 6]: B and rho, summed over ``spp`` samples of each texel."""
-        sums = np.zeros((len(texels), 6))
+    @staticmethod
+    def _smooth(
+        total: np.ndarray,
+        weight: np.ndarray,
+        least: float,
+        texels: np.ndarray,
+        found: np.ndarray,
+        guides: tuple[np.ndarray, np.ndarray],
+        size: int,
+    ) -> np.ndarray:
+        """[size, size, 3]: total / weight, [T, 3] each, of the texels ``found``, denoised, the rest filled."""
+        if not found.any():
+            return np.zeros((size, size, 3), np.float32)
+        mean = np.divide(total[found], weight[found], out=np.zeros_like(total[found]), where=weight[found] > least)
+        valid = np.zeros(size * size, bool)
+        valid[texels[found]] = True
+        images = []
+        for values in (mean, *(guide[found] for guide in guides)):
+            image = np.zeros((size * size, 3), np.float32)
+            image[texels[found]] = values
+            images.append(filled(image.reshape(size, size, 3), valid.reshape(size, size)))
+        return denoise(images[0], images[1], images[2], threads=1)
+
+    def _traced(self, sample: Any, texels: np.ndarray, size: int, spp: int, seed: int, side: int) -> np.ndarray:
+        """[T, channels]: what ``sample`` (:meth:`_light` or :meth:`_gloss`) gives, summed over ``spp`` samples."""
         chunk = max(1, MAX_SAMPLES // spp)
-        for number, start in enumerate(range(0, len(texels), chunk)):
-            part = slice(start, start + chunk)
-            sums[part] = self._part(texels[part], size, spp, seed * 4096 + number, side)
-        return sums
+        parts = [
+            self._part(sample, texels[start : start + chunk], size, spp, seed * 4096 + number, side)
+            for number, start in enumerate(range(0, len(texels), chunk))
+        ]
+        return np.concatenate(parts)
 
     def occupied(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Texels that a chart touches, on a grid three times as fine: (numbers, positions, normals, have two sides)."""
@@ -119,7 +137,7 @@ class LightBaker:
         position, normal, _ = self.surface.points(place)
         return texels, np.array(position).T, np.array(normal).T, np.array(self.surface.thin(place))
 
-    def _part(self, texels: np.ndarray, size: int, spp: int, seed: int, side: int) -> np.ndarray:
+    def _part(self, sample: Any, texels: np.ndarray, size: int, spp: int, seed: int, side: int) -> np.ndarray:
         """As :meth:`_traced`, of texels that fit in memory."""
         import drjit as dr
 
@@ -129,21 +147,50 @@ class LightBaker:
         texel = dr.repeat(mi.UInt32(texels.astype(np.uint32)), spp)
         jitter = sampler.next_2d()
         uv = mi.Point2f(mi.Float(texel % size) + jitter.x, mi.Float(texel // size) + jitter.y) / size
-        channels = [*(channel for colour in self._light(sampler, uv, side) for channel in colour)]
+        channels = sample(sampler, uv, side)
         dr.eval(channels)  # together: block_sum would run the whole kernel for each channel
         return np.stack([np.array(dr.block_sum(channel, spp)) for channel in channels], axis=1)
 
-    def _light(self, sampler: Any, uv: Any, side: int) -> tuple[Any, Any]:
-        """One sample of (B, rho) at each (U, V)."""
+    def _surface(self, sampler: Any, uv: Any, side: int) -> tuple[Any, Any]:
+        """(surface interaction at each (U, V), seen straight on, whether there is a surface)."""
         import drjit as dr
 
-        mi, scene = self.mi, self.scene
+        mi = self.mi
         place, normal, found = self.surface.points(uv, sampler.next_1d())
         up = normal * float(side)
         ray = mi.Ray3f(place + up * self.lift, -up)
         ray.maxt = mi.Float(3 * self.lift)
-        si = scene.ray_intersect(ray, found)
-        found &= si.is_valid() & (dr.norm(si.p - place) < 2 * self.lift)
+        si = self.scene.ray_intersect(ray, found)
+        return si, found & si.is_valid() & (dr.norm(si.p - place) < 2 * self.lift)
+
+    def _gloss(self, sampler: Any, uv: Any, side: int) -> list[Any]:
+        """One sample of S's numerator and of its denominator at each (U, V)."""
+        import drjit as dr
+
+        mi = self.mi
+        si, found = self._surface(sampler, uv, side)
+        bsdf, context = si.bsdf(), other_context(mi)
+        found &= ~is_among(mi, bsdf, self.whole) & is_rough(mi, bsdf, context, si, found)
+        seen = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
+        seen.z = dr.select(si.wi.z < 0, -seen.z, seen.z)
+        si.wi = seen
+        bounce, weight = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), found)
+        found &= (bounce.pdf > 0) & dr.all(dr.isfinite(weight))
+        onwards = si.spawn_ray(si.to_world(bounce.wo))
+        light = mi.Spectrum(0.0)
+        if self.integrator is not None:
+            behind = self.scene.ray_intersect_preliminary(onwards, found)
+            going = found & ~(behind.is_valid() & behind.shape.is_emitter())
+            light = dr.select(going, self._arriving(sampler, onwards, going), 0)
+        found &= dr.all(dr.isfinite(light))
+        return [*dr.select(found, weight * light, 0), *dr.select(found, weight, 0)]
+
+    def _light(self, sampler: Any, uv: Any, side: int) -> list[Any]:
+        """One sample of B and of rho at each (U, V)."""
+        import drjit as dr
+
+        mi, scene = self.mi, self.scene
+        si, found = self._surface(sampler, uv, side)
         context, bsdf = diffuse_context(mi), si.bsdf()
         rho = reflectance(mi, bsdf, context, si, found)
         found &= dr.all(dr.isfinite(rho))
@@ -158,7 +205,7 @@ class LightBaker:
         if self.integrator is not None:
             b += self._bounced(sampler, si, bsdf, context, found)
         fine = found & dr.all(dr.isfinite(b))
-        return dr.select(fine, b, 0), dr.select(fine, rho, 0)
+        return [*dr.select(fine, b, 0), *dr.select(fine, rho, 0)]
 
     def _bounced(self, sampler: Any, si: Any, bsdf: Any, context: Any, active: Any) -> Any:
         """One sample of what comes by way of other surfaces."""
@@ -176,11 +223,17 @@ class LightBaker:
         # What glows is counted by the emitter sample; the integrator would look through it instead of stopping there.
         behind = scene.ray_intersect_preliminary(onwards, going)
         going &= ~(behind.is_valid() & behind.shape.is_emitter())
-        light = mi.Spectrum(0.0)
-        for medium, starts in self._around(onwards, going):
-            found, _, _ = self.integrator.sample(scene, sampler, mi.RayDifferential3f(onwards), medium, starts)
+        return dr.select(going, weight * self._arriving(sampler, onwards, going), 0)
+
+    def _arriving(self, sampler: Any, ray: Any, active: Any) -> Any:
+        """One sample of the light that comes along the ray from surfaces."""
+        import drjit as dr
+
+        mi, light = self.mi, self.mi.Spectrum(0.0)
+        for medium, starts in self._around(ray, active):
+            found, _, _ = self.integrator.sample(self.scene, sampler, mi.RayDifferential3f(ray), medium, starts)
             light = dr.select(starts, found, light)
-        return dr.select(going, weight * light, 0)
+        return light
 
     def _around(self, ray: Any, active: Any) -> list[tuple[Any, Any]]:
         """Media (None: empty space) with the rays that start in them: those that would leave a medium at the first

@@ -9,6 +9,10 @@ IGNORE_CONTEXT = "Principled BSDF :"
 what they do, or what they are nested in does, is taken for diffuse, but for what passes straight on."""
 
 
+WIDE = 1.0
+"""Density, 1/sr, below which a lobe is wide."""
+
+
 def ignores_context(bsdf: Any) -> bool:
     """Whether the BSDF, or one nested in it, evaluates all its lobes whatever it is asked for."""
     return IGNORE_CONTEXT in str(bsdf)
@@ -19,6 +23,25 @@ def diffuse_context(mi: Any) -> Any:
     context = mi.BSDFContext()
     context.type_mask = mi.BSDFFlags.Diffuse
     return context
+
+
+def other_context(mi: Any) -> Any:
+    """Context of the lobes that mirror and refract, sharp or rough."""
+    context = mi.BSDFContext()
+    context.type_mask = int(mi.BSDFFlags.Glossy) | int(mi.BSDFFlags.Delta)
+    return context
+
+
+def is_rough(mi: Any, bsdf: Any, context: Any, si: Any, active: Any) -> Any:
+    """Whether the lobes of ``context`` are one wide glossy reflection: from roughness 0.5 of GGX on.
+
+    By the density of a direction from the middle of the lobe.
+    """
+    glossy = mi.has_flag(bsdf.flags(), mi.BSDFFlags.GlossyReflection)
+    others = int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.GlossyTransmission)
+    active = active & glossy & ((bsdf.flags() & others) == 0)
+    middle, _ = bsdf.sample(context, si, 0.5, mi.Point2f(0.5, 0.5), active)
+    return active & (middle.pdf > 0) & (middle.pdf < WIDE)
 
 
 def reflectance(mi: Any, bsdf: Any, context: Any, si: Any, active: Any, translucent: bool = True) -> Any:
