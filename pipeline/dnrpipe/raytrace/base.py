@@ -31,6 +31,7 @@ from .lobes import (
     reflectance,
 )
 from .paths import power_heuristic
+from .recorded import Recorded
 from .texels import ATTRIBUTE
 from .visibility import LAMP_PREFIX, UNSEEN_PREFIX, is_one_of
 
@@ -92,47 +93,38 @@ class BaseRenderer:
         self.glassy = any(mirrors_and_refracts(mi, b.flags()) for b in bsdfs)
         self.tables = mi.UInt32(order.ravel()), mi.Float(np.array(_steps(), np.float32))
         # Recorded at the first call: tracing the plugins anew would take longer than the frame itself.
-        self.kernel = dr.freeze(self._kernel)
+        self.kernel = Recorded(self._kernel)
 
     def frame(self, view: Any) -> dict[str, np.ndarray]:
         """Channels of BASE_CHANNELS and of the G-buffer, float32 [H, W], for a view in the bundle's units.
 
         ``coverage`` is base.A, and ``depth.Z`` in the bundle's units, too.
         """
-        height, width = view.height, view.width
-        values = self._sampled(view)
-        means, first = values.mean(axis=1), values[:, 0]  # the first sample is the pixel's centre
-        table = np.concatenate([means[:, : len(MEANS)], first[:, len(MEANS) :]], axis=1).astype(np.float32)
-        channels = {name: table[:, i].reshape(height, width) for i, name in enumerate(MEANS + CENTRES)}
+        import drjit as dr
+
+        mi, m = self.mi, view.matrix
+        axes = [mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in m[:3, i])) for i in range(4)]
+        film = [dr.opaque(mi.Float, float(v)) for v in (view.fl_x, view.fl_y, view.cx, view.cy)]
+        values = self.kernel(self.scene, self.light, self.tables, axes, film, view.width, view.height)
+        dr.eval(values)
+        names = MEANS + CENTRES
+        channels = {
+            name: np.array(value).reshape(view.height, view.width) for name, value in zip(names, values, strict=True)
+        }
         for name in GBUFFER:
             channels[name] = channels[name] * channels["mask"]
         return channels | {"coverage": channels["base.A"]}
 
-    def _sampled(self, view: Any) -> np.ndarray:
-        """[H * W, S, channels]."""
+    def _kernel(self, scene: Any, light: Any, tables: Any, axes: Any, film: Any, width: int, height: int) -> list[Any]:
+        """The frame. All that varies comes in as data: recorded once, replayed for every view of that size.
+
+        A pixel's samples lie side by side; the first goes through the pixel's centre.
+        """
         import drjit as dr
 
-        mi = self.mi
-        pixels = view.width * view.height
-        pixel = np.repeat(np.arange(pixels, dtype=np.uint32), self.samples)
-        sample = np.tile(np.arange(self.samples, dtype=np.uint32), pixels)
-        m = view.matrix
-        axes = [mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in m[:3, i])) for i in range(4)]
-        film = [dr.opaque(mi.Float, float(v)) for v in (view.fl_x, view.fl_y, view.cx, view.cy)]
-        # Memory of Dr.Jit's own: where numpy's is aligned otherwise, the kernel would be recorded once more.
-        lanes = [mi.UInt32(values) + dr.opaque(mi.UInt32, 0) for values in (pixel, sample)]
-        dr.eval(lanes)
-        channels = self.kernel(self.scene, self.light, self.tables, *lanes, axes, film, view.width)
-        dr.eval(channels)
-        return np.stack([np.array(channel) for channel in channels], axis=-1).reshape(pixels, self.samples, -1)
-
-    def _kernel(
-        self, scene: Any, light: Any, tables: Any, pixel: Any, sample: Any, axes: Any, film: Any, width: int
-    ) -> list[Any]:
-        """One sample of each pixel named. All that varies comes in as data: recorded once, replayed for every view."""
-        import drjit as dr
-
-        mi = self.mi
+        mi, samples = self.mi, self.samples
+        index = dr.arange(mi.UInt32, width * height * samples)
+        pixel, sample = index // samples, index % samples
         x, y = pixel % width, pixel // width
         tile = dr.gather(mi.UInt32, tables[0], (y % TILE) * TILE + x % TILE)
         number, place = mi.Float(sample * (TILE * TILE) + tile), mi.Float(sample)
@@ -140,7 +132,13 @@ class BaseRenderer:
         down = mi.Float(y) + _fraction(0.5 + place * GOLDEN[1]) - film[3]
         direction = axes[0] * (right / film[0]) - axes[1] * (down / film[1]) - axes[2]
         ray = mi.Ray3f(mi.Point3f(axes[3]), dr.normalize(direction))
-        return self._follow(scene, light, tables[1], ray, -axes[2], number)
+        values = self._follow(scene, light, tables[1], ray, -axes[2], number)
+        if samples == 1:
+            return values
+        dr.eval(values)  # together: each sum alone would run it all again
+        means = [dr.block_sum(value, samples) / samples for value in values[: len(MEANS)]]
+        first = dr.arange(mi.UInt32, width * height) * samples
+        return [*means, *(dr.gather(mi.Float, value, first) for value in values[len(MEANS) :])]
 
     def _baked(self, light: Any, si: Any, active: Any) -> tuple[Any, Any, Any]:
         """(E, S, atlas coordinates) at the surface point, on the side that is seen."""

@@ -1,8 +1,8 @@
 """Frames in a hurry: path tracing at a few samples and auxiliary images, by kernels that are traced once and kept.
 
 Python that describes a frame to Dr.Jit (our integrators and BSDFs) takes ten times longer than the kernel of a frame at
-one sample per pixel. ``dr.freeze`` records it once. What differs between frames goes in as opaque numbers: camera,
-seed, samples; a Mitsuba sensor per view would be recorded anew each time, so rays are made here.
+one sample per pixel. :class:`.recorded.Recorded` keeps it. What differs between frames goes in as opaque numbers:
+camera, seed, samples; a Mitsuba sensor per view would be recorded anew each time, so rays are made here.
 
 Notation
     n     rays of a launch: H x W x samples, those of a pixel side by side
@@ -23,6 +23,7 @@ from dnrtrain.contract import View
 from .auxiliary import shown_first
 from .engine import Engine
 from .frames_rays import lets_through, pinhole, seen_first
+from .recorded import Recorded
 from .texels import ATTRIBUTE
 from .units import scaled_view
 
@@ -134,7 +135,7 @@ class Frames:
         if cells * cells != count:
             raise ValueError(f"rays: is {count}, expected a square number")
 
-        @dr.freeze
+        @Recorded
         def kernel(camera: list[Any], pixel: Any, place: Any) -> list[Any]:
             offset = (mi.Point2f(place % cells, place // cells) + 0.5) / cells
             hit = seen(scene, pinhole(mi, camera, pixel, offset, width), None)
@@ -148,7 +149,7 @@ class Frames:
         mi, scene, seen = self.mi, self.scene, seen_first(self.mi, self.scene)
         rays, prototype = self._rays, self.mi.load_dict({"type": "independent"})
 
-        @dr.freeze
+        @Recorded
         def kernel(camera: list[Any], seed: Any, samples: Any) -> list[Any]:
             sampler = prototype.fork()
             ray = rays(sampler, camera, seed, samples, 1, 0)
@@ -171,7 +172,7 @@ class Frames:
         rays, means, prototype = self._rays, self._means, self.mi.load_dict({"type": "independent"})
         cells = math.isqrt(count) if math.isqrt(count) ** 2 == count else 1
 
-        @dr.freeze
+        @Recorded
         def kernel(camera: list[Any], seed: Any, samples: Any) -> list[Any]:
             sampler = prototype.fork()
             hit = seen(scene, rays(sampler, camera, seed, samples, count, cells), sampler)
@@ -185,7 +186,7 @@ class Frames:
         mi, scene, integrator = self.mi, self.scene, self.integrator
         rays, means, prototype = self._rays, self._means, mi.load_dict({"type": "independent"})
 
-        @dr.freeze
+        @Recorded
         def kernel(camera: list[Any], seed: Any, samples: Any) -> list[Any]:
             sampler = prototype.fork()
             ray = rays(sampler, camera, seed, samples, spp, cells=1)
@@ -202,7 +203,7 @@ class Frames:
         rays, means, prototype = self._rays, self._means, mi.load_dict({"type": "independent"})
         shown, cells = shown_first(self.mi, self.scene), math.isqrt(count) if math.isqrt(count) ** 2 == count else 1
 
-        @dr.freeze
+        @Recorded
         def kernel(camera: list[Any], seed: Any, samples: Any) -> list[Any]:
             sampler = prototype.fork()
             ray = rays(sampler, camera, seed, samples, count, cells)
