@@ -7,7 +7,6 @@ import math
 import os
 import subprocess
 import sys
-from importlib import util
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from tools import result_tables
 
 from dnrpipe.ablation.rows import CLASSIC as CLASSIC_SIZES
 from dnrpipe.ablation.rows import GROUPS, ROWS, choose_rows, needs_coarse, settings_of
@@ -180,20 +180,15 @@ def test_spread_is_mean_and_sample_deviation(values: list[float]) -> None:
 
 
 def test_the_documents_tables_are_made_from_committed_results(tmp_path: Path) -> None:
-    path = Path(__file__).parents[1] / "tools" / "ablation_docs.py"
-    spec = util.spec_from_file_location("ablation_docs", path)
-    assert spec is not None and spec.loader is not None
-    tool = util.module_from_spec(spec)
-    spec.loader.exec_module(tool)
     (tmp_path / "r.json").write_text(json.dumps(results({("a", "vanilla", 0): 20.0, ("a", "dnr", 0): 25.5})))
     page = tmp_path / "page.md"
     page.write_text("one\n<!-- results r.json -->\nold\n<!-- end -->\ntwo\n<!-- rows -->\n<!-- end -->\n")
-    assert tool.main(["--check", str(page)]) == 1
-    assert tool.main([str(page)]) == 0 and tool.main(["--check", str(page)]) == 0
+    assert result_tables.main(["--check", str(page)]) == 1
+    assert result_tables.main([str(page)]) == 0 and result_tables.main(["--check", str(page)]) == 0
     text = page.read_text()
     assert "+5.50" in text and "old" not in text and text.startswith("one\n") and "| `paper-rl` |" in text
     page.write_text(text.replace("25.50", "26.50"))
-    assert tool.main(["--check", str(page)]) == 1
+    assert result_tables.main(["--check", str(page)]) == 1
 
 
 def ablate(out: Path, *more: str) -> subprocess.CompletedProcess[str]:

@@ -1,0 +1,72 @@
+"""Write the generated parts of docs/ablation.md and docs/frames.md: rows from the code, tables from committed results.
+
+A part stands between ``<!-- rows -->``, ``<!-- results FILE -->`` (of `dnrpipe ablate`) or ``<!-- frames FILE -->``
+(of tools.bench_frames), FILE beside docs/, and ``<!-- end -->``.
+
+python -m tools.result_tables [--check] docs/ablation.md docs/frames.md
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+from tools.bench_frames.document import markdown as frames_markdown
+
+from dnrpipe.ablation.results import read_results
+from dnrpipe.ablation.rows import GROUPS, ROWS
+from dnrpipe.ablation.tables import markdown
+
+PART = re.compile(r"(<!-- (rows|results|frames)(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def rows_table() -> str:
+    """All rows: name, what they are, how their views are chosen, groups they belong to."""
+    lines = ["| row | what | views | groups |", "| --- | --- | --- | --- |"]
+    for name, row in ROWS.items():
+        groups = ", ".join(group for group, names in GROUPS.items() if name in names and group != "all")
+        lines.append(f"| `{name}` | {row.what} | {row.views} | {groups} |")
+    return "\n".join(lines)
+
+
+def generate(text: str, folder: Path) -> str:
+    """``text`` with every marked part made anew. Raises UserError for results that cannot be read."""
+
+    def part(match: re.Match[str]) -> str:
+        if match[2] == "rows":
+            body = rows_table()
+        elif match[2] == "results":
+            body = markdown(read_results(folder / match[3])).rstrip()
+        else:
+            body = frames_tables(json.loads((folder / match[3]).read_text(encoding="utf-8")))
+        return f"{match[1]}{body}\n{match[4]}"
+
+    return PART.sub(part, text)
+
+
+def frames_tables(record: dict[str, Any]) -> str:
+    """The benchmark's own tables, one heading lower and without its title."""
+    _, _, body = frames_markdown(record).partition("\n")
+    return body.strip().replace("\n## ", "\n### ")
+
+
+def main(arguments: list[str]) -> int:
+    stale = []
+    for path in (Path(argument) for argument in arguments if argument != "--check"):
+        old = path.read_text(encoding="utf-8")
+        new = generate(old, path.parent)
+        if old == new:
+            continue
+        stale.append(path)
+        if "--check" in arguments:
+            print(f"{path} is out of date: run `make docs`", file=sys.stderr)
+        else:
+            path.write_text(new, encoding="utf-8")
+    return 1 if stale and "--check" in arguments else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))
