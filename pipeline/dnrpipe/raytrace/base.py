@@ -85,6 +85,7 @@ class BaseRenderer:
         bsdfs = list({id(b): b for b in [shape.bsdf() for shape in shapes] if b is not None}.values())
         self.whole = [b for b in bsdfs if ignores_context(b)]
         self.cut = any(mi.has_flag(b.flags(), mi.BSDFFlags.Null) for b in self.whole)
+        self.holes = any(mi.has_flag(b.flags(), mi.BSDFFlags.Null) for b in bsdfs)
         self.translucent = bool(self.whole) or any(
             mi.has_flag(b.flags(), mi.BSDFFlags.DiffuseTransmission) for b in bsdfs
         )
@@ -98,7 +99,8 @@ class BaseRenderer:
     def frame(self, view: Any) -> dict[str, np.ndarray]:
         """Channels of BASE_CHANNELS and of the G-buffer, float32 [H, W], for a view in the bundle's units.
 
-        ``coverage`` is base.A, and ``depth.Z`` in the bundle's units, too.
+        ``coverage`` is base.A, at most 1, and ``depth.Z`` in the bundle's units, too. Where cut-outs stand one behind
+        the other base.A can be above 1 as the colours are: of each surface met its opaque share is counted.
         """
         import drjit as dr
 
@@ -113,7 +115,7 @@ class BaseRenderer:
         }
         for name in GBUFFER:
             channels[name] = channels[name] * channels["mask"]
-        return channels | {"coverage": channels["base.A"]}
+        return channels | {"coverage": np.minimum(channels["base.A"], 1)}
 
     def _kernel(self, scene: Any, light: Any, tables: Any, axes: Any, film: Any, width: int, height: int) -> list[Any]:
         """The frame. All that varies comes in as data: recorded once, replayed for every view of that size.
@@ -150,6 +152,14 @@ class BaseRenderer:
         uv = mi.Point2f(place.x, place.y)
         found = [dr.select(front, *pair) for pair in zip(*(texture.eval(uv, active) for texture in light), strict=True)]
         return mi.Spectrum(*found[:3]), mi.Spectrum(*found[3:]), uv
+
+    def _opacity(self, bsdf: Any, si: Any, active: Any) -> Any:
+        """Share of a surface's light that does not pass straight on; what the surface adds has the same weight."""
+        import drjit as dr
+
+        if not self.holes:
+            return dr.select(active, self.mi.Float(1), 0)
+        return dr.select(active, 1 - dr.mean(bsdf.eval_null_transmission(si, active)), 0)
 
     def _passed(self, medium: Any, ray: Any, si: Any, active: Any) -> Any:
         """What ``medium`` lets through of the light along the ray's segment; what it scatters counts as passed."""
@@ -273,6 +283,7 @@ class BaseRenderer:
                 "uv": place,
                 "depth": depth,
                 "covered": s["covered"] | (met & ~(null & alive)),
+                "opacity": s["opacity"] + self._opacity(bsdf, si, met & straight),
                 "before": dr.select(onwards & ~null, si, s["before"]),
                 "density": dr.select(null, s["density"], bounce.pdf),
                 "sampled": dr.select(null, s["sampled"], rough & ~delta),
@@ -296,6 +307,7 @@ class BaseRenderer:
             "uv": mi.Point2f(0.0),
             "depth": mi.Float(0.0),
             "covered": mi.Mask(False),
+            "opacity": mi.Float(0.0),
             "before": dr.zeros(mi.SurfaceInteraction3f),
             "density": mi.Float(1.0),
             "sampled": mi.Mask(False),
@@ -320,7 +332,17 @@ class BaseRenderer:
         s = dict(zip(names, done, strict=True))
         covered, ended = (dr.select(s[name], mi.Float(1), 0) for name in ("covered", "ended"))
         chain = [*s["chain_uv"], ended, s["chain_weight"]]
-        return [*s["total"], covered, *s["diffuse"], *s["albedo"], *chain, *s["normal"], *s["uv"], s["depth"], covered]
+        return [
+            *s["total"],
+            s["opacity"],
+            *s["diffuse"],
+            *s["albedo"],
+            *chain,
+            *s["normal"],
+            *s["uv"],
+            s["depth"],
+            covered,
+        ]
 
 
 def _fraction(x: Any) -> Any:
