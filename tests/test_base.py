@@ -130,6 +130,9 @@ def test_cutouts_of_translucent_sheets_are_lit_and_light_what_is_behind(tmp_path
     baked = LightBaker(mi, scene, onwards(kind="volpath")).bake(128, 256, 0)
     ours, truth = colour(rendered(scene, baked, camera(), 16)), traced(scene, camera(), kind="volpath")
     assert ours.mean(axis=(0, 1)) == pytest.approx(truth.mean(axis=(0, 1)), rel=0.03)
+    # Not premultiplied, colours stay what surfaces have: holes are counted in colour and alpha alike.
+    straight = ours[..., :3] / np.maximum(ours[..., 3:], 1e-6)
+    assert straight.max() < 3 * truth[..., :3].max()
     wall = np.array(rendered(scene, baked, camera())["uv.U"]) > 0.5  # red light that the floor throws onto the sheet
     assert ours[wall, 0].mean() == pytest.approx(truth[wall, 0].mean(), rel=0.04)
 

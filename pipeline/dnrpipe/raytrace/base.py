@@ -16,7 +16,6 @@ light sources can be hit, emitter sampling serves the first glossy vertex, and m
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -32,13 +31,11 @@ from .lobes import (
 )
 from .paths import power_heuristic
 from .recorded import Recorded
+from .sequence import GOLDEN, ORDER, TILE, fraction, steps
 from .texels import ATTRIBUTE
 from .visibility import LAMP_PREFIX, UNSEEN_PREFIX, is_one_of
 
-TILE = 3
 MAX_VERTICES = 8
-GOLDEN = (0.7548776662466927, 0.5698402909980532)
-"""Steps of the two-dimensional R2 sequence (Roberts 2018)."""
 NUMBERS = 5
 """Random numbers per vertex: two for the direction, one for the lobe, two for the emitter."""
 MIRRORED = 0.25
@@ -53,15 +50,6 @@ CENTRES = (
     *("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z", "mask"),
 )
 GBUFFER = ("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z")
-
-
-def _steps() -> list[float]:
-    """Steps of Kronecker sequences, one per number that a path needs: independent, so that no bounce follows another.
-
-    The first two are the R2 sequence's, the others the roots of primes.
-    """
-    primes = [n for n in range(5, 300) if all(n % d for d in range(2, math.isqrt(n) + 1))]
-    return [*GOLDEN, *(math.sqrt(prime) % 1 for prime in primes)][: NUMBERS * (MAX_VERTICES + 1)]
 
 
 class BaseRenderer:
@@ -89,10 +77,10 @@ class BaseRenderer:
         self.translucent = bool(self.whole) or any(
             mi.has_flag(b.flags(), mi.BSDFFlags.DiffuseTransmission) for b in bsdfs
         )
-        order = np.array([[0, 5, 7], [3, 8, 1], [6, 2, 4]], np.uint32)  # neighbours far apart
         self.rough = any(mi.has_flag(b.flags(), mi.BSDFFlags.GlossyReflection) for b in bsdfs)
         self.glassy = any(mirrors_and_refracts(mi, b.flags()) for b in bsdfs)
-        self.tables = mi.UInt32(order.ravel()), mi.Float(np.array(_steps(), np.float32))
+        numbers = steps(NUMBERS * (MAX_VERTICES + 1))
+        self.tables = mi.UInt32(ORDER.ravel()), mi.Float(numbers)
         # Recorded at the first call: tracing the plugins anew would take longer than the frame itself.
         self.kernel = Recorded(self._kernel)
 
@@ -130,8 +118,8 @@ class BaseRenderer:
         x, y = pixel % width, pixel // width
         tile = dr.gather(mi.UInt32, tables[0], (y % TILE) * TILE + x % TILE)
         number, place = mi.Float(sample * (TILE * TILE) + tile), mi.Float(sample)
-        right = mi.Float(x) + _fraction(0.5 + place * GOLDEN[0]) - film[2]
-        down = mi.Float(y) + _fraction(0.5 + place * GOLDEN[1]) - film[3]
+        right = mi.Float(x) + fraction(0.5 + place * GOLDEN[0]) - film[2]
+        down = mi.Float(y) + fraction(0.5 + place * GOLDEN[1]) - film[3]
         direction = axes[0] * (right / film[0]) - axes[1] * (down / film[1]) - axes[2]
         ray = mi.Ray3f(mi.Point3f(axes[3]), dr.normalize(direction))
         values = self._follow(scene, light, tables[1], ray, -axes[2], number)
@@ -172,7 +160,7 @@ class BaseRenderer:
         scattered, _, lost = medium.get_scattering_coefficients(middle, inside)
         return dr.select(inside, dr.exp((scattered - lost) * si.t), 1)
 
-    def _follow(self, scene: Any, light: Any, steps: Any, ray: Any, forward: Any, number: Any) -> list[Any]:
+    def _follow(self, scene: Any, light: Any, table: Any, ray: Any, forward: Any, number: Any) -> list[Any]:
         """One sample along each ray: the values named by MEANS and CENTRES.
 
         forward: where the camera looks. number: the sample's place in the sequence.
@@ -195,8 +183,8 @@ class BaseRenderer:
         sides[1].type_mask = int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.GlossyTransmission)
 
         def uniform(vertex: Any, dimension: int) -> Any:
-            step = dr.gather(mi.Float, steps, vertex * NUMBERS + dimension)
-            return _fraction(0.5 + number * step)
+            step = dr.gather(mi.Float, table, vertex * NUMBERS + dimension)
+            return fraction(0.5 + number * step)
 
         def step(s: dict[str, Any]) -> dict[str, Any]:
             active, straight = s["active"], s["straight"]
@@ -332,20 +320,5 @@ class BaseRenderer:
         s = dict(zip(names, done, strict=True))
         covered, ended = (dr.select(s[name], mi.Float(1), 0) for name in ("covered", "ended"))
         chain = [*s["chain_uv"], ended, s["chain_weight"]]
-        return [
-            *s["total"],
-            s["opacity"],
-            *s["diffuse"],
-            *s["albedo"],
-            *chain,
-            *s["normal"],
-            *s["uv"],
-            s["depth"],
-            covered,
-        ]
-
-
-def _fraction(x: Any) -> Any:
-    import drjit as dr
-
-    return x - dr.floor(x)
+        means = [*s["total"], s["opacity"], *s["diffuse"], *s["albedo"]]
+        return [*means, *chain, *s["normal"], *s["uv"], s["depth"], covered]
