@@ -14,7 +14,7 @@ from dnrtrain.contract import SceneFrame
 from .errors import UserError
 from .workspace import Workspace, digest, file_sha256
 
-SCENE_VERSION = 5  # raise when the conversion or the G-buffer scene changes what it writes
+SCENE_VERSION = 6  # raise when the conversion or the G-buffer scene changes what it writes
 
 
 def read_json(path: Path) -> Any:

@@ -21,7 +21,7 @@ from .tasks import is_made, run_view_tasks, view_record, worker_count
 from .training import read_selection
 from .workspace import Workspace, digest
 
-TRACE_VERSION = 2
+TRACE_VERSION = 3
 
 
 def run(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
