@@ -28,7 +28,7 @@ from .settings import Settings
 from .tasks import run_view_tasks, task_name, view_record
 from .workspace import Workspace, digest
 
-LIGHT_VERSION, BASE_VERSION = 5, 10
+LIGHT_VERSION, BASE_VERSION = 5, 11
 RENDERED = ("baked", "direct", "path")
 """Kinds of base images that are rendered into files of their own."""
 AUTOMATIC_TEXELS = 4

@@ -35,12 +35,17 @@ def other_context(mi: Any) -> Any:
 def is_rough(mi: Any, bsdf: Any, context: Any, si: Any, active: Any) -> Any:
     """Whether the lobes of ``context`` are one wide glossy reflection: from roughness 0.5 of GGX on.
 
-    By the density of a direction from the middle of the lobe.
+    By the density of a direction from the middle of the lobe seen straight on, whatever ``si.wi`` is: baked light and
+    views must agree.
     """
+    import drjit as dr
+
     glossy = mi.has_flag(bsdf.flags(), mi.BSDFFlags.GlossyReflection)
     others = int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.GlossyTransmission)
     active = active & glossy & ((bsdf.flags() & others) == 0)
-    middle, _ = bsdf.sample(context, si, 0.5, mi.Point2f(0.5, 0.5), active)
+    ahead = mi.SurfaceInteraction3f(si)
+    ahead.wi = mi.Vector3f(0, 0, dr.select(si.wi.z < 0, -1.0, 1.0))
+    middle, _ = bsdf.sample(context, ahead, 0.5, mi.Point2f(0.5, 0.5), active)
     return active & (middle.pdf > 0) & (middle.pdf < WIDE)
 
 
