@@ -81,7 +81,14 @@ def _choose(workspace: Workspace, settings: Settings, console: Console, run_id: 
     positions = np.stack([view.position for view in views])
     directions = np.stack([-view.matrix[:3, 2] for view in views])
     sightings = _look(workspace, console, views) if rule.looks else None
-    choice = rule.choose(Candidates(positions, directions, sightings), settings.select.budget, settings.select.seed)
+    candidates = Candidates(positions, directions, sightings)
+    with console.bar(f"choosing by {policy}", len(views) * rule.effort) as bar:
+
+        def tick(weighed: int) -> None:
+            bar.advance(min(weighed, bar.total - bar.done))  # the effort is an estimate
+
+        choice = rule.choose(candidates, settings.select.budget, settings.select.seed, tick)
+        tick(bar.total)
     workspace.ledger.append(
         CostRecord(
             time=time.time(),

@@ -72,6 +72,13 @@ def test_distinct_views_and_a_reason_for_each(pool: Candidates, name: str, budge
 
 
 @pytest.mark.parametrize("name", UNTRAINED_NAMES)
+def test_progress_is_told_where_there_is_work(pool: Candidates, name: str) -> None:
+    weighed: list[int] = []
+    UNTRAINED[name].choose(pool, 5, 0, weighed.append)
+    assert (sum(weighed) >= 12) == (UNTRAINED[name].effort > 0)
+
+
+@pytest.mark.parametrize("name", UNTRAINED_NAMES)
 def test_budgets_out_of_range_are_refused(pool: Candidates, name: str) -> None:
     for budget in (0, 17):
         with pytest.raises(ContractError, match="choose 1 to 16"):

@@ -11,7 +11,7 @@ from .explain import explained
 from .kmedoids import camera_problem, medoids
 from .medoids import Facilities, build, swap
 from .pool import choose_useful
-from .protocol import Candidates, Choice
+from .protocol import Candidates, Choice, Tick
 
 GEOMETRY = 0.5
 """Weight of the cameras' part of the cost; the surface's has the rest. Both are in units of their cost at the start."""
@@ -29,14 +29,15 @@ class AutoPolicy:
     """
 
     looks: ClassVar[bool] = True
+    effort: ClassVar[int] = 11
 
-    def choose(self, candidates: Candidates, budget: int, seed: int) -> Choice:
-        return choose_useful(candidates, budget, _choose)
+    def choose(self, candidates: Candidates, budget: int, seed: int, tick: Tick | None = None) -> Choice:
+        return choose_useful(candidates, budget, lambda some, count: _choose(some, count, tick))
 
 
-def _choose(candidates: Candidates, budget: int) -> Choice:
+def _choose(candidates: Candidates, budget: int, tick: Tick | None) -> Choice:
     cameras = camera_problem(candidates)
-    start = medoids(cameras, budget)
+    start = medoids(cameras, budget, tick)
     sightings = candidates.sightings
     if sightings is None or not len(sightings.cells):
         views, gains = build(cameras, budget, start)
@@ -46,7 +47,7 @@ def _choose(candidates: Candidates, budget: int) -> Choice:
     surface = demand_problem(sightings, demand_of(sightings))
     costs = {"cameras": cameras.cost(start), "surface": surface.cost(start)}
     both = combined(cameras, surface, costs)
-    views, gains = build(both, budget, swap(both, start))
+    views, gains = build(both, budget, swap(both, start, tick))
     why, facts = explained(sightings, views, [""] * len(views))
     details = {
         "measure": "decrease of cameras' and surface's cost together, 1 = the cost of the k-medoids start",

@@ -7,15 +7,16 @@ from typing import ClassVar
 import numpy as np
 
 from .geometry import camera_features
-from .protocol import Candidates, Choice, check_budget
+from .protocol import Candidates, Choice, Tick, check_budget
 
 
 class RandomPolicy:
     """Uniform without replacement."""
 
     looks: ClassVar[bool] = False
+    effort: ClassVar[int] = 0
 
-    def choose(self, candidates: Candidates, budget: int, seed: int) -> Choice:
+    def choose(self, candidates: Candidates, budget: int, seed: int, tick: Tick | None = None) -> Choice:
         check_budget(budget, len(candidates))
         order = np.random.default_rng([seed, 0x52]).permutation(len(candidates))
         return Choice([int(i) for i in order[:budget]], [0.0] * budget, ["drawn at random"] * budget)
@@ -29,8 +30,9 @@ class FarthestPolicy:
     """
 
     looks: ClassVar[bool] = False
+    effort: ClassVar[int] = 0
 
-    def choose(self, candidates: Candidates, budget: int, seed: int) -> Choice:
+    def choose(self, candidates: Candidates, budget: int, seed: int, tick: Tick | None = None) -> Choice:
         count = len(candidates)
         check_budget(budget, count)
         features = camera_features(candidates)

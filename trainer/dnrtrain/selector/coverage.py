@@ -11,7 +11,7 @@ from .demand import BINS, directions
 from .explain import explained
 from .greedy import lazy_greedy
 from .pool import choose_useful
-from .protocol import Candidates, Choice
+from .protocol import Candidates, Choice, Tick
 from .sightings import Sightings
 
 SHARPNESS = 8.0
@@ -28,12 +28,13 @@ class CoveragePolicy:
     """
 
     looks: ClassVar[bool] = True
+    effort: ClassVar[int] = 6
 
-    def choose(self, candidates: Candidates, budget: int, seed: int) -> Choice:
-        return choose_useful(candidates, budget, _choose)
+    def choose(self, candidates: Candidates, budget: int, seed: int, tick: Tick | None = None) -> Choice:
+        return choose_useful(candidates, budget, lambda some, count: _choose(some, count, tick))
 
 
-def _choose(candidates: Candidates, budget: int) -> Choice:
+def _choose(candidates: Candidates, budget: int, tick: Tick | None) -> Choice:
     sightings = candidates.sightings
     if sightings is None:
         raise ContractError("policy 'coverage' needs the candidates' sightings (selector.sightings.read_sightings)")
@@ -53,7 +54,7 @@ def _choose(candidates: Candidates, budget: int) -> Choice:
         part = sightings.of(view)
         np.add.at(chosen, keys[part].ravel(), amounts[part].ravel())
 
-    views, gains = lazy_greedy(len(candidates), budget, gain, take)
+    views, gains = lazy_greedy(len(candidates), budget, gain, take, tick)
     why, facts = explained(sightings, views, [f"adds {gain:.2%} coverage" for gain in gains])
     measure = "share of coverage: surface × direction of view × pixels, square root of repeated sightings"
     return Choice(views, gains, why, {"measure": measure, "coverage": float(sum(gains)), **facts})

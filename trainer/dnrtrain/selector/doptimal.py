@@ -10,7 +10,7 @@ from ..contract import ContractError
 from .explain import explained
 from .greedy import lazy_greedy
 from .pool import choose_useful
-from .protocol import Candidates, Choice
+from .protocol import Candidates, Choice, Tick
 
 PRIOR = 0.05
 """Ridge λ, in median sightings: below it, a cell counts as unknown."""
@@ -28,9 +28,10 @@ class DOptimalPolicy:
     """
 
     looks: ClassVar[bool] = True
+    effort: ClassVar[int] = 6
 
-    def choose(self, candidates: Candidates, budget: int, seed: int) -> Choice:
-        return choose_useful(candidates, budget, _choose)
+    def choose(self, candidates: Candidates, budget: int, seed: int, tick: Tick | None = None) -> Choice:
+        return choose_useful(candidates, budget, lambda some, count: _choose(some, count, tick))
 
 
 def harmonics(toward: np.ndarray) -> np.ndarray:
@@ -47,7 +48,7 @@ def harmonics(toward: np.ndarray) -> np.ndarray:
     return np.stack(bands, axis=1).astype(np.float32)
 
 
-def _choose(candidates: Candidates, budget: int) -> Choice:
+def _choose(candidates: Candidates, budget: int, tick: Tick | None) -> Choice:
     sightings = candidates.sightings
     if sightings is None:
         raise ContractError("policy 'd-optimal' needs the candidates' sightings (selector.sightings.read_sightings)")
@@ -74,7 +75,7 @@ def _choose(candidates: Candidates, budget: int) -> Choice:
         scale = information[sightings.of(view)] / (1.0 + np.maximum(amount, 0.0))
         inverse[where] -= scale[:, None, None] * solved[:, :, None] * solved[:, None, :]
 
-    views, gains = lazy_greedy(len(candidates), budget, gain, take)
+    views, gains = lazy_greedy(len(candidates), budget, gain, take, tick)
     why, facts = explained(sightings, views, [f"adds {gain:.3f} nats per cell" for gain in gains])
     measure = "nats of information on a texel's 9 harmonics, mean over cells by the candidates' pixels"
     return Choice(views, gains, why, {"measure": measure, **facts})

@@ -5,9 +5,15 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable
 
+from .protocol import Tick
+
 
 def lazy_greedy(
-    count: int, budget: int, gain: Callable[[int], float], take: Callable[[int], object]
+    count: int,
+    budget: int,
+    gain: Callable[[int], float],
+    take: Callable[[int], object],
+    tick: Tick | None = None,
 ) -> tuple[list[int], list[float]]:
     """Elements 0 .. count − 1 in greedy order, ``budget`` of them, and what each added.
 
@@ -19,7 +25,13 @@ def lazy_greedy(
         gain: what an element would add now.
         take: called once per element chosen.
     """
-    heap = [(-gain(i), i, 0) for i in range(count)]
+
+    def weigh(element: int) -> float:
+        if tick is not None:
+            tick(1)
+        return -gain(element)
+
+    heap = [(weigh(i), i, 0) for i in range(count)]
     heapq.heapify(heap)
     order: list[int] = []
     gains: list[float] = []
@@ -30,5 +42,5 @@ def lazy_greedy(
             gains.append(-bound)
             take(element)
         else:
-            heapq.heappush(heap, (-gain(element), element, len(order)))
+            heapq.heappush(heap, (weigh(element), element, len(order)))
     return order, gains

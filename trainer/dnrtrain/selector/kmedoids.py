@@ -10,7 +10,7 @@ from .explain import explained
 from .geometry import camera_features, distances
 from .medoids import Facilities, build, swap
 from .pool import choose_useful
-from .protocol import Candidates, Choice
+from .protocol import Candidates, Choice, Tick
 
 
 class KMedoidsPolicy:
@@ -20,9 +20,10 @@ class KMedoidsPolicy:
     """
 
     looks: ClassVar[bool] = True
+    effort: ClassVar[int] = 8
 
-    def choose(self, candidates: Candidates, budget: int, seed: int) -> Choice:
-        return choose_useful(candidates, budget, _choose)
+    def choose(self, candidates: Candidates, budget: int, seed: int, tick: Tick | None = None) -> Choice:
+        return choose_useful(candidates, budget, lambda some, count: _choose(some, count, tick))
 
 
 def camera_problem(candidates: Candidates) -> Facilities:
@@ -37,14 +38,14 @@ def camera_problem(candidates: Candidates) -> Facilities:
     )
 
 
-def medoids(problem: Facilities, budget: int) -> list[int]:
+def medoids(problem: Facilities, budget: int, tick: Tick | None = None) -> list[int]:
     """BUILD, then swaps."""
-    return swap(problem, build(problem, budget)[0])
+    return swap(problem, build(problem, budget, tick=tick)[0], tick)
 
 
-def _choose(candidates: Candidates, budget: int) -> Choice:
+def _choose(candidates: Candidates, budget: int, tick: Tick | None) -> Choice:
     problem = camera_problem(candidates)
-    views, gains = build(problem, budget, medoids(problem, budget))
+    views, gains = build(problem, budget, medoids(problem, budget, tick))
     owner = problem.rows(np.array(views)).argmin(axis=0)
     near = np.bincount(owner, minlength=len(views))
     why = [f"stands for {n} candidates around it" if n > 1 else "stands for itself" for n in near]

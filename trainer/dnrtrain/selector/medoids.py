@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .greedy import lazy_greedy
+from .protocol import Tick
 
 BLOCK_ELEMENTS = 4_000_000
 SWEEPS = 20
@@ -41,7 +42,9 @@ class Facilities:
         return float(near @ self.weights)
 
 
-def build(problem: Facilities, budget: int, among: Sequence[int] | None = None) -> tuple[list[int], list[float]]:
+def build(
+    problem: Facilities, budget: int, among: Sequence[int] | None = None, tick: Tick | None = None
+) -> tuple[list[int], list[float]]:
     """Greedy selection in order, and by how much each view lowered the cost (BUILD of PAM, Kaufman & Rousseeuw 1990).
 
     among: the views to choose from (default all).
@@ -57,11 +60,12 @@ def build(problem: Facilities, budget: int, among: Sequence[int] | None = None) 
         budget,
         lambda element: float(np.maximum(near - row(element), 0.0) @ problem.weights),
         lambda element: np.minimum(near, row(element), out=near),
+        tick,
     )
     return [int(views[element]) for element in order], gains
 
 
-def swap(problem: Facilities, chosen: Sequence[int]) -> list[int]:
+def swap(problem: Facilities, chosen: Sequence[int], tick: Tick | None = None) -> list[int]:
     """Exchange chosen views for others while that lowers the cost (FasterPAM, Schubert & Rousseeuw 2021).
 
     Eager: a block's best exchange is made at once. Of N candidates and M views one sweep takes N rows, not N · M.
@@ -75,6 +79,8 @@ def swap(problem: Facilities, chosen: Sequence[int]) -> list[int]:
         for first in range(0, problem.count, block):
             views = np.arange(first, min(first + block, problem.count))
             state.improve(views, problem.rows(views))
+            if tick is not None:
+                tick(len(views))
         if state.cost >= before:
             break
     return state.chosen

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
@@ -11,6 +12,10 @@ from ..contract import ContractError
 
 if TYPE_CHECKING:
     from .sightings import Sightings
+
+
+Tick = Callable[[int], object]
+"""Told how many candidates were weighed since the last call."""
 
 
 @dataclass(frozen=True)
@@ -61,13 +66,18 @@ class Choice:
 class Policy(Protocol):
     """A policy that needs no training.
 
-    looks: whether it uses :attr:`Candidates.sightings`; without them it does what camera poses allow, and says so.
+    looks: whether it uses :attr:`Candidates.sightings`.
+    effort: how often it weighs each candidate, roughly; for progress bars. 0: it is done at once.
     """
 
     looks: ClassVar[bool]
+    effort: ClassVar[int]
 
-    def choose(self, candidates: Candidates, budget: int, seed: int) -> Choice:
-        """Choose ``budget`` distinct candidates. Raises ContractError unless 1 <= budget <= N."""
+    def choose(self, candidates: Candidates, budget: int, seed: int, tick: Tick | None = None) -> Choice:
+        """Choose ``budget`` distinct candidates.
+
+        Raises ContractError: not 1 <= budget <= N, or it cannot do without sightings and there are none.
+        """
         ...
 
 
