@@ -1,13 +1,15 @@
-"""The default: k-medoids, then exchanges that also count what is seen of the surface."""
+"""k-medoids on poses, then exchanges that also count what is seen of the surface; places count, not candidates."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 
 from .demand import demand_of, demand_problem
 from .explain import explained
+from .geometry import camera_features, even_shares
 from .kmedoids import camera_problem, medoids
 from .medoids import Facilities, build, swap
 from .pool import choose_useful
@@ -24,12 +26,13 @@ class AutoPolicy:
     surface   mean, over the pixels of all candidates, of 1 − how well the best chosen view serves them
               (:mod:`.demand`): the same surface seen from near that direction at that resolution
 
-    On a dome around one object both agree and little changes; along paths, indoors and among occluders they do not.
+    Both means are over places, not over candidates: where a camera stood still, its many candidates count about as one
+    (:func:`.geometry.even_shares` at the scale of k-medoids' mean distance, that is, of the selection itself).
     Where no sightings are given, or no candidate sees anything, it is k-medoids, and ``details`` says so.
     """
 
     looks: ClassVar[bool] = True
-    effort: ClassVar[int] = 11
+    effort: ClassVar[int] = 13
 
     def choose(self, candidates: Candidates, budget: int, seed: int, tick: Tick | None = None) -> Choice:
         return choose_useful(candidates, budget, lambda some, count: _choose(some, count, tick))
@@ -38,13 +41,15 @@ class AutoPolicy:
 def _choose(candidates: Candidates, budget: int, tick: Tick | None) -> Choice:
     cameras = camera_problem(candidates)
     start = medoids(cameras, budget, tick)
+    cameras = replace(cameras, weights=even_shares(camera_features(candidates), cameras.cost(start)))
+    start = swap(cameras, start, tick)
     sightings = candidates.sightings
     if sightings is None or not len(sightings.cells):
         views, gains = build(cameras, budget, start)
-        measure = "decrease of the mean distance of a candidate to its nearest chosen view (position and direction)"
-        note = "k-medoids on poses: nothing is known of what the candidates see"
+        measure = "decrease of the mean distance of a place to its nearest chosen view (position and direction)"
+        note = "k-medoids on poses, places alike: nothing is known of what the candidates see"
         return Choice(views, gains, [note] * len(views), {"measure": measure, "note": note})
-    surface = demand_problem(sightings, demand_of(sightings))
+    surface = demand_problem(sightings, demand_of(sightings, cameras.weights))
     costs = {"cameras": cameras.cost(start), "surface": surface.cost(start)}
     both = combined(cameras, surface, costs)
     views, gains = build(both, budget, swap(both, start, tick))

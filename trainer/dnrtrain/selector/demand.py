@@ -25,7 +25,7 @@ class Demand:
     cells    int64 [D]
     toward   float32 [D, 3] unit mean direction from the surface to the cameras
     pixels   float32 [D] mean pixels of a sighting in it, as a share of a view's pixels
-    weights  float32 [D] share of all sighted pixels; sums to 1
+    weights  float32 [D] share of all sighted pixels, as much as their views count; sums to 1
     """
 
     cells: np.ndarray
@@ -46,11 +46,14 @@ def directions(count: int = BINS) -> np.ndarray:
     return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1).astype(np.float32)
 
 
-def demand_of(sightings: Sightings) -> Demand:
-    """All sightings, those of one cell from one bin of directions taken together."""
+def demand_of(sightings: Sightings, shares: np.ndarray | None = None) -> Demand:
+    """All sightings, those of one cell from one bin of directions taken together.
+
+    shares: what each view counts, [N] (default: alike).
+    """
     axes = directions().T
     size = sightings.grid**2 * BINS
-    pixels, number = np.zeros(size), np.zeros(size)
+    pixels, number, weights = np.zeros(size), np.zeros(size), np.zeros(size)
     sums = np.zeros((size, 3))
     for view in range(len(sightings)):
         part = sightings.of(view)
@@ -59,6 +62,7 @@ def demand_of(sightings: Sightings) -> Demand:
         amount = sightings.pixels[part].astype(np.float64)
         pixels[key] += amount  # a view has each cell once, so no key comes twice
         number[key] += 1.0
+        weights[key] += amount if shares is None else amount * shares[view]
         sums[key] += toward * amount[:, None]
     there = np.flatnonzero(pixels)
     toward = sums[there]
@@ -67,7 +71,7 @@ def demand_of(sightings: Sightings) -> Demand:
         there // BINS,
         toward.astype(np.float32),
         (pixels[there] / number[there]).astype(np.float32),
-        (pixels[there] / pixels.sum()).astype(np.float32),
+        (weights[there] / weights.sum()).astype(np.float32),
     )
 
 

@@ -6,6 +6,8 @@ import numpy as np
 
 from .protocol import Candidates
 
+BLOCK = 1_000_000
+
 
 def camera_features(candidates: Candidates) -> np.ndarray:
     """Positions, centred and scaled to unit mean radius, beside unit directions: float64 [N, 6].
@@ -26,3 +28,20 @@ def distances(features: np.ndarray, some: np.ndarray) -> np.ndarray:
     for column in features.astype(np.float32).T:
         total += np.square(column[some, None] - column[None, :])
     return np.sqrt(total, out=total)
+
+
+def even_shares(features: np.ndarray, scale: float) -> np.ndarray:
+    """What each candidate should count where places count alike, however many candidates stand there: float32 [N].
+
+    1 over the kernel density of the candidates there (Gaussian of standard deviation ``scale``), summing to 1: of k
+    candidates within much less than ``scale`` each counts 1 / k.
+    """
+    count = len(features)
+    block = max(1, BLOCK // max(1, count))
+    density = np.empty(count)
+    for first in range(0, count, block):
+        some = np.arange(first, min(first + block, count))
+        away = distances(features, some) / np.float32(max(scale, 1e-6))
+        density[some] = np.exp(-0.5 * np.square(away)).sum(axis=1, dtype=np.float64)
+    shares = 1.0 / density  # at least 1: each candidate is at its own place
+    return (shares / shares.sum()).astype(np.float32)
