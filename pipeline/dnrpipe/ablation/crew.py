@@ -56,12 +56,14 @@ class Crew:
             )
 
 
-def make_crew(settings: Settings, jobs: int, log: Path, console: Console) -> Crew:
+def make_crew(settings: Settings, jobs: int, log: Path, console: Console, *, single: bool = False) -> Crew:
     """``jobs`` workers, or 0: one per core, one on a GPU.
 
-    Cells side by side on a thread each finish more per hour than one after the other on all cores.
+    Cells side by side on a thread each finish more per hour than one after the other on all cores. single: one thread
+    a worker also where there are fewer workers than cores, so that ``jobs`` does not enter what comes out.
     """
     device, cores = torch_device(settings), worker_count(0)
     on_gpu = device.startswith("cuda")
     workers = jobs or (1 if on_gpu else cores)
-    return Crew(device, 0 if on_gpu else max(1, cores // workers), workers, log, console)
+    threads = 0 if on_gpu else 1 if single else max(1, cores // workers)
+    return Crew(device, threads, workers, log, console)

@@ -26,6 +26,7 @@ SMOKE: dict[str, Any] = {
     "passes": {"raster": "cycles-direct", "coverage_samples": 16},
     "raytrace": {"spp": 16, "evaluation_spp": 32, "max_depth": 3},
     "model": {"base": "none", "chain": False, "filter": 0, "output": "display", "guides": False},
+    "select": {"step1": {"epochs": 2}},
     "finetune": {"step2": {"epochs": 4}},
 }
 SMOKE_SCENE = "emissive_only"
@@ -98,7 +99,7 @@ def run_bench(
         "budgets": request.budgets,
         "spp": {"training": base.raytrace.spp, "test": base.raytrace.evaluation_spp},
     }
-    bench = Bench(request, console, make_crew(base, jobs, out / "logs" / "cells.log", console))
+    bench = Bench(request, console, make_crew(base, jobs, out / "logs" / "cells.log", console, single=True))
     with locked(out, "bench-select"):
         try:
             bench.run()

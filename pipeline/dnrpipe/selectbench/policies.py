@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import functools
 import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -45,7 +46,7 @@ _CONTENDERS = (
     Contender("kmedoids", "k-medoids of camera poses", "kmedoids"),
     Contender("coverage", "greedy coverage: surface x view direction x resolution", "coverage"),
     Contender("d-optimal", "greedy D-optimal design of the neural texture", "d-optimal"),
-    Contender("auto", "the default", "auto"),
+    Contender("auto", "the default: k-medoids, then swaps that count what is seen, too", "auto"),
     _paper("rl-paper", "-loss (the paper's)", "neg-loss"),
     _paper("rl-hard", "+loss", "pos-loss"),
     _paper("rl-decrease", "decrease of the error on probe views", "improvement"),
@@ -81,6 +82,7 @@ def settings_of(contender: Contender, base: Settings, budget: int) -> Settings:
     return Settings.model_validate(merge(data, {"select": {"budget": budget}}))
 
 
+@functools.cache
 def rules_fingerprint() -> str:
     """Hash of the sources of all rules: selections of other code are not kept, for they cost seconds."""
     import dnrtrain.selector
