@@ -102,7 +102,8 @@ def run_bench(
     bench = Bench(request, console, make_crew(base, jobs, out / "logs" / "cells.log", console, single=True))
     with locked(out, "bench-select"):
         try:
-            bench.run()
+            for _ in bench.run():
+                _write(bench, facts)
         finally:
             results = _write(bench, facts)
     return results

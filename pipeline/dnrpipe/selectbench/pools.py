@@ -55,15 +55,30 @@ def choose_pools(text: str) -> list[str]:
     return [name for name in POOLS if name in names]
 
 
-def prepare_pool(source: Path, pool: str, out: Path, settings: Settings, console: Console) -> Pool:
-    """Make or find the pool's workspace ``<out>/scenes/<scene>-<pool>.dnr``, its cameras and all its passes.
+@dataclass(frozen=True)
+class Placed:
+    """A pool whose cameras stand and whose passes are still to come. ``settings``: with the pool's cameras."""
+
+    scene: str
+    name: str
+    workspace: Workspace
+    settings: Settings
+
+    def prepare(self, console: Console) -> Pool:
+        """Render the passes that are missing. Raises UserError: fewer candidates than the largest budget."""
+        data = prepared(f"{self.scene}-{self.name}", self.workspace, self.settings, console)
+        data.run_id = data.run_id.replace("ablate", "bench-select")
+        return Pool(self.scene, self.name, data)
+
+
+def place_pool(source: Path, pool: str, out: Path, settings: Settings, console: Console) -> Placed:
+    """Make or find the pool's workspace ``<out>/scenes/<scene>-<pool>.dnr`` and say where its cameras stand.
 
     What does not depend on the cameras (conversion, baked textures) is made once per scene and copied. Raises
-    UserError: the scene has no room for the pool, or fewer candidates than the largest budget.
+    UserError: the scene has no room for the pool.
     """
     first = _converted(source, out, settings, console)
-    stem = source.stem
-    root = out / "scenes" / f"{stem}-{pool}.dnr"
+    root = out / "scenes" / f"{source.stem}-{pool}.dnr"
     workspace = Workspace.create(root, _source(source))
     for folder in ("scene", "bakes"):
         _copy_tree(first.root / folder, root / folder)
@@ -76,12 +91,11 @@ def prepare_pool(source: Path, pool: str, out: Path, settings: Settings, console
         if pool == "path":
             views = walk(summary, settings.cameras)
         else:
-            views = inside(summary, settings.cameras, load_geometry(first.scene / "geometry.npz"), stem)
+            meshes = load_geometry(first.scene / "geometry.npz")
+            views = inside(summary, settings.cameras, meshes, source.stem)
         write_rig(file, views)
         settings.cameras.source, settings.cameras.source_sha256 = str(file.resolve()), file_sha256(file)
-    data = prepared(f"{stem}-{pool}", workspace, settings, console)
-    data.run_id = data.run_id.replace("ablate", "bench-select")
-    return Pool(stem, pool, data)
+    return Placed(source.stem, pool, workspace, settings)
 
 
 def write_rig(path: Path, views: dict[str, list[View]]) -> None:

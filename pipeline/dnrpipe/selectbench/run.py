@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from ..settings import Settings
 from ..training import perceptual_weights
 from ..workspace import digest
 from .policies import LEARNED, Contender, rules_fingerprint, settings_of
-from .pools import Pool, prepare_pool, share_light
+from .pools import Placed, Pool, place_pool, share_light
 
 CHOICE_VERSION = 1  # raise when what a selection's file holds changes
 SHARED_COARSE = "farthest"
@@ -76,21 +76,29 @@ class Bench:
     references: dict[str, list[str]] = field(default_factory=dict)
     cells: dict[Place, dict[str, Any]] = field(default_factory=dict)
     """Tasks of the cells; places whose policies chose the same views share one key."""
+    seconds: dict[Path, float] = field(default_factory=dict)
+    """What files say that they took."""
 
-    def run(self) -> None:
-        """Prepare all pools, then go seed by seed, so that a whole table of the first seed exists early."""
+    def run(self) -> Iterator[int]:
+        """Prepare all pools, then go seed by seed; yields each seed when its cells are done, a whole table."""
         request = self.request
         self.perceptual = perceptual_weights(self.console) is not None
-        with self.console.bar("pools", len(request.scenes) * len(request.pools)) as bar:
-            for source in request.scenes:
-                for name in request.pools:
-                    pool = prepare_pool(source, name, request.out, request.base, self.console)
-                    traced = trace_references(pool.data, self._settings(pool), self.console)
-                    self.references[pool.folder] = sorted(traced.values())
-                    self.pools.append(pool)
-                    bar.advance(note=pool.folder)
+        places = [(source, name) for source in request.scenes for name in request.pools]
+        placed: list[Placed] = []
+        with self.console.bar("scenes and cameras", len(places)) as bar:  # all, before anything takes long
+            for source, name in places:
+                placed.append(place_pool(source, name, request.out, request.base, self.console))
+                bar.advance(note=f"{source.stem}-{name}")
+        with self.console.bar("pools", len(placed)) as bar:
+            for one in placed:
+                pool = one.prepare(self.console)
+                traced = trace_references(pool.data, self._settings(pool), self.console)
+                self.references[pool.folder] = sorted(traced.values())
+                self.pools.append(pool)
+                bar.advance(note=pool.folder)
         for seed in range(request.seeds):
             self._seed(seed)
+            yield seed
 
     def _seed(self, seed: int) -> None:
         rules, trained, coarse = [], [], []
@@ -239,13 +247,15 @@ class Bench:
         files = [workspace.raytraced("train", name) for name in names]
         if kind not in ("none", "raster"):
             files += [base_file(workspace, kind, "train", name) for name in names]
-        total = 0.0
-        for file in files:
+        return sum(self._seconds(file, clock) for file in files)
+
+    def _seconds(self, file: Path, clock: str) -> float:
+        if file not in self.seconds:
             metadata = read_metadata(file)
             if metadata is None:
                 raise UserError(f"{file}: is missing or damaged; run the same command again")
-            total += metadata[clock]
-        return total
+            self.seconds[file] = metadata[clock]
+        return self.seconds[file]
 
 
 def read_choice(task: dict[str, Any]) -> dict[str, Any]:
