@@ -8,6 +8,7 @@ Notation
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -56,7 +57,24 @@ def make_cameras(summary: dict[str, Any], settings: CameraSettings) -> dict[str,
         if len(frames) < 2:
             raise UserError("--cameras animation: the active camera does not move; use --cameras scene or dome")
         return split_views([_scene_view(f, settings) for f in frames], settings)
-    return split_views(read_camera_file(Path(source), settings), settings)
+    path = Path(source)
+    views = read_camera_file(path, settings)
+    return own_splits(path, views) or split_views(views, settings)
+
+
+def own_splits(path: Path, views: Sequence[View]) -> dict[str, list[View]] | None:
+    """Views by the ``"split"`` that each frame of a camera file names; None where no frame names one.
+
+    Raises UserError: some frames name none, or one that is not train, val or test.
+    """
+    named = [frame.get("split") for frame in json.loads(path.read_text(encoding="utf-8"))["frames"]]
+    if not any(named):
+        return None
+    if unknown := [view.name for view, split in zip(views, named, strict=True) if split not in SPLITS]:
+        raise UserError(
+            f"{path}: view {unknown[0]} has no split of {', '.join(SPLITS)}, but others have; give all of them one"
+        )
+    return {split: [v for v, own in zip(views, named, strict=True) if own == split] for split in SPLITS}
 
 
 def view_lenses(summary: dict[str, Any], settings: CameraSettings) -> dict[str, dict[str, float]]:
@@ -110,7 +128,7 @@ def sphere_views(
     rng = np.random.default_rng([settings.seed, stream])
     center = np.asarray(summary["bounds"]["center"], dtype=np.float64)
     radius = float(summary["bounds"]["radius"])
-    focal, distance = _framing(summary, settings, radius)
+    focal, distance = framing(summary, settings, radius)
     low, high = (math.sin(LOWEST), math.sin(HIGHEST)) if hemisphere else (-math.sin(HIGHEST), math.sin(HIGHEST))
     turn = rng.uniform(0, 2 * math.pi)
     order = (np.arange(count) + rng.uniform(0, 1, count)) / max(count, 1)
@@ -122,7 +140,7 @@ def sphere_views(
     for index, (z, azimuth) in enumerate(zip(heights[order], azimuths[order], strict=True)):
         ring = math.sqrt(max(0.0, 1 - z * z))
         direction = np.array([ring * math.cos(azimuth), ring * math.sin(azimuth), z])
-        views.append(_look_at_view(f"{index:04d}", center + distance * direction, center, focal, settings))
+        views.append(look_at_view(f"{index:04d}", center + distance * direction, center, focal, settings))
     return views
 
 
@@ -131,7 +149,7 @@ def orbit_views(
 ) -> list[View]:
     """A turntable: ``count`` views at one elevation, evenly spaced over a full turn."""
     center = np.asarray(summary["bounds"]["center"], dtype=np.float64)
-    focal, distance = _framing(summary, settings, float(summary["bounds"]["radius"]))
+    focal, distance = framing(summary, settings, float(summary["bounds"]["radius"]))
     elevation = math.radians(elevation_degrees)
     views = []
     for index in range(count):
@@ -143,7 +161,7 @@ def orbit_views(
                 math.sin(elevation),
             ]
         )
-        views.append(_look_at_view(f"{index:04d}", center + distance * direction, center, focal, settings))
+        views.append(look_at_view(f"{index:04d}", center + distance * direction, center, focal, settings))
     return views
 
 
@@ -176,8 +194,11 @@ def depth_range(views: Sequence[View], summary: dict[str, Any]) -> tuple[float, 
     return near, max(max(planar) + radius, near * 1.001)
 
 
-def _framing(summary: dict[str, Any], settings: CameraSettings, radius: float) -> tuple[float, float]:
-    """(focal length in pixels, camera distance): the bounding sphere fits the shorter side."""
+def framing(summary: dict[str, Any], settings: CameraSettings, radius: float) -> tuple[float, float]:
+    """(focal length in pixels, camera distance): the bounding sphere fits the shorter side.
+
+    The lens is the scene camera's, or Blender's default where it has none.
+    """
     active = next((c for c in summary["cameras"] if c.get("active") and c["type"] == "PERSP"), None)
     lens, sensor = (active["lens"], active["sensor_width"]) if active else (DEFAULT_LENS, DEFAULT_SENSOR)
     focal = lens / sensor * max(settings.width, settings.height)
@@ -186,7 +207,8 @@ def _framing(summary: dict[str, Any], settings: CameraSettings, radius: float) -
     return focal, settings.distance * radius / math.sin(half_angle)
 
 
-def _look_at_view(name: str, position: np.ndarray, target: np.ndarray, focal: float, settings: CameraSettings) -> View:
+def look_at_view(name: str, position: np.ndarray, target: np.ndarray, focal: float, settings: CameraSettings) -> View:
+    """The upright view from ``position`` [3] to ``target`` [3], which is not straight above or below it."""
     forward = target - position
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])

@@ -157,7 +157,7 @@ class Session:
     def _check(self, settings: Settings, workspace: Workspace | None) -> None:
         """Refuse bad camera files and a budget above the candidates before any work is done or folder made."""
         from .cameras import KEYWORDS, read_camera_file
-        from .training import check_budget
+        from .selection import check_budget
 
         record = workspace.manifest.stages.get("prepare") if workspace else None
         if settings.cameras.source not in KEYWORDS and (self.command == "prepare" or self.scene is not None):

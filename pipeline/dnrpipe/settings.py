@@ -13,8 +13,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator
 
+from dnrtrain.selector.names import TRAINED_NAMES, PolicyName, full_name
 from dnrtrain.settings import LossWeights, ModelSettings, Step1Settings, Step2Settings, Strict
 
 from .effects.plan import EffectName
@@ -98,9 +99,14 @@ class SelectSettings(Strict):
     """Which of the candidates are ray-traced."""
 
     budget: int = Field(default=25, ge=1, description="views to ray-trace")
-    policy: Literal["rl", "random", "farthest"] = "rl"
+    policy: PolicyName = Field(default="rl-paper", description="how they are chosen (docs/method.md)")
     seed: int = Field(default=0, ge=0)
     step1: Step1Settings = Step1Settings()
+
+    @field_validator("policy", mode="before")
+    @classmethod
+    def _in_full(cls, value: Any) -> Any:
+        return full_name(value) if isinstance(value, str) else value
 
 
 class FinetuneSettings(Strict):
@@ -124,6 +130,11 @@ class Settings(Strict):
     effects: EffectSettings = EffectSettings()
     finetune: FinetuneSettings = FinetuneSettings()
     device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="torch device")
+
+    @property
+    def trains_step1(self) -> bool:
+        """Whether the coarse model is wanted: by the policy, or as the start of step 2."""
+        return self.select.policy in TRAINED_NAMES or self.finetune.step2.start == "coarse"
 
 
 # The default model, "dnr": it corrects an image of baked light (docs/method.md; figures in docs/experiments.md).

@@ -65,6 +65,16 @@ def _base(settings: Settings) -> list[Any]:
     return [settings.model.base, settings.base.model_dump()]
 
 
+def _selection(settings: Settings) -> list[Any]:
+    """Settings that decide which views are chosen, and the coarse model where there is one."""
+    if not settings.trains_step1:
+        return [settings.select.model_dump(include={"budget", "policy", "seed"})]
+    select = settings.select.model_dump()
+    if select["policy"] == "rl-paper":
+        select["policy"] = "rl"  # its first name: what was trained under it stays done
+    return [settings.model.coarse().model_dump(), select, _neural(settings)]
+
+
 def _neural(settings: Settings) -> dict[str, list[str]]:
     """Effect settings that decide what the neural renderer is made of."""
     chosen = settings.effects
@@ -92,13 +102,13 @@ STAGES: dict[str, Stage] = {
         Stage(
             name="select",
             command="select",
-            does="step 1: coarse DNR and view selector on rasterised images",
+            does="choice of the views to ray-trace; step 1 (coarse DNR) where that or step 2 needs it",
             needs=("prepare",),
             reads=("passes", "cameras"),
             writes=("selection.json", "checkpoints/step1"),
-            settings=lambda s: [s.model.coarse().model_dump(), s.select.model_dump(), _neural(s)],
-            run="dnrpipe.training:run_select",
-            progress="dnrpipe.training:select_progress",
+            settings=_selection,
+            run="dnrpipe.selection:run",
+            progress="dnrpipe.selection:progress",
         ),
         Stage(
             name="raytrace",

@@ -1,4 +1,4 @@
-"""Stages `select` (step 1) and `finetune` (step 2): feed workspace files to the trainer, book its epochs."""
+"""Stage `finetune` (step 2), and what it shares with step 1: feed workspace files to the trainer, book its epochs."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from dnrtrain.atomic import write_json
 from dnrtrain.contract import View
-from dnrtrain.events import EpochEnd, Event, Note, Selected
+from dnrtrain.events import EpochEnd, Event, Note
 
 from .base import RENDERED, base_path
 from .console import Bar, Console
@@ -25,53 +24,6 @@ from .workspace import Workspace, digest, file_sha256
 
 if TYPE_CHECKING:
     from dnrtrain.dataset import Base, ViewSet
-
-
-def run_select(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
-    """Step 1: train the coarse DNR and choose ``budget`` views."""
-    import numpy as np
-
-    from dnrtrain.step1 import run_step1
-
-    views = split_views(workspace)
-    check_budget(settings.select.budget, len(views["train"]))
-    dataset = load(workspace, views["train"], "train")
-    val = load(workspace, views["val"], "val") if views["val"] else None
-    stamp = fingerprint(STAGES["select"], workspace, settings)
-    assert stamp is not None
-    folder = workspace.checkpoints("step1")
-    chosen: Selected | None = None
-    events = run_step1(
-        dataset,
-        val,
-        np.stack([view.position for view in views["train"]]),
-        plan_of(workspace, settings).model(settings.model).coarse(),
-        settings.select.step1,
-        policy=settings.select.policy,
-        budget=settings.select.budget,
-        seed=settings.select.seed,
-        device=torch_device(settings),
-        checkpoints=folder,
-        fingerprint=stamp,
-    )
-    for event in _follow(events, "select", settings.select.step1.epochs, workspace, console, run_id):
-        if isinstance(event, Selected):
-            chosen = event
-    assert chosen is not None  # run_step1 ends with Selected
-    write_json(
-        workspace.selection,
-        {
-            "policy": chosen.policy,
-            "budget": settings.select.budget,
-            "seed": settings.select.seed,
-            "views": chosen.views,
-            "details": chosen.details,
-        },
-    )
-    return Outcome(
-        digest([chosen.views, file_sha256(folder / "model.safetensors")]),
-        {"policy": chosen.policy, "views": chosen.views},
-    )
 
 
 def run_finetune(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
@@ -97,19 +49,14 @@ def run_finetune(workspace: Workspace, settings: Settings, console: Console, run
         fingerprint=digest([stamp, weights is not None]),
         weights=weights,
     )
-    for _ in _follow(events, "finetune", settings.finetune.step2.epochs, workspace, console, run_id):
+    for _ in follow(events, "finetune", settings.finetune.step2.epochs, workspace, console, run_id):
         pass
     return Outcome(file_sha256(folder / "model.safetensors"), {"perceptual": weights is not None, "views": len(names)})
 
 
-def select_progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
-    """(epochs trained, epochs wanted)."""
-    return _epochs(workspace.checkpoints("step1"), settings.select.step1.epochs, workspace.selection.exists())
-
-
 def finetune_progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
     """(epochs trained, epochs wanted)."""
-    return _epochs(workspace.checkpoints("step2"), settings.finetune.step2.epochs, True)
+    return epochs_done(workspace.checkpoints("step2"), settings.finetune.step2.epochs, True)
 
 
 def read_selection(workspace: Workspace) -> dict[str, Any]:
@@ -120,15 +67,6 @@ def read_selection(workspace: Workspace) -> dict[str, Any]:
         raise UserError(f"{workspace.root}: no views selected yet; run `dnrpipe select` first") from None
     except (json.JSONDecodeError, UnicodeDecodeError):
         raise UserError(f"{workspace.selection}: damaged; run `dnrpipe select --force`") from None
-
-
-def check_budget(budget: int, candidates: int) -> None:
-    """Raises UserError when more views are wanted than there are."""
-    if budget > candidates:
-        raise UserError(
-            f"--budget {budget}: only {candidates} candidate views exist; lower the budget or prepare more"
-            f" (`dnrpipe prepare --views {budget}`)"
-        )
 
 
 def load(
@@ -178,7 +116,7 @@ def perceptual_weights(console: Console) -> Any:
         return None
 
 
-def _epochs(folder: Path, wanted: int, finished: bool) -> tuple[int, int]:
+def epochs_done(folder: Path, wanted: int, finished: bool) -> tuple[int, int]:
     if finished and (folder / "model.safetensors").exists():
         return wanted, wanted
     for name in ("checkpoint.json", "model.json"):
@@ -188,7 +126,7 @@ def _epochs(folder: Path, wanted: int, finished: bool) -> tuple[int, int]:
     return 0, wanted
 
 
-def _follow(
+def follow(
     events: Iterator[Event],
     stage: Literal["select", "finetune"],
     epochs: int,

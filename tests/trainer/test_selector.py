@@ -16,41 +16,42 @@ from dnrtrain.selector.agent import (
     reward_of,
     td_target,
 )
-from dnrtrain.selector.baselines import BASELINES, FarthestPolicy
-from dnrtrain.selector.protocol import Cameras
+from dnrtrain.selector.baselines import FarthestPolicy
+from dnrtrain.selector.policies import UNTRAINED
+from dnrtrain.selector.protocol import Candidates
 from dnrtrain.selector.qnetwork import QNetwork
 
 
-def ring(count: int) -> Cameras:
+def ring(count: int) -> Candidates:
     angle = 2 * np.pi * np.arange(count) / count
     positions = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], 1)
-    return Cameras(positions, -positions)
+    return Candidates(positions, -positions)
 
 
 @pytest.mark.parametrize("name", ["random", "farthest"])
 def test_baselines_choose_distinct_views_by_seed(name: str) -> None:
-    policy = BASELINES[name]
+    policy = UNTRAINED[name]
     for budget in (1, 7, 20):
-        chosen = policy.choose(ring(20), budget, seed=3)
+        chosen = policy.choose(ring(20), budget, seed=3).views
         assert len(chosen) == len(set(chosen)) == budget and set(chosen) <= set(range(20))
-        assert chosen == policy.choose(ring(20), budget, seed=3)
-    assert len({tuple(policy.choose(ring(20), 5, seed)) for seed in range(8)}) > 1
+        assert chosen == policy.choose(ring(20), budget, seed=3).views
+    assert len({tuple(policy.choose(ring(20), 5, seed).views) for seed in range(8)}) > 1
     for budget in (0, 21):
         with pytest.raises(ContractError, match="budget"):
             policy.choose(ring(20), budget, seed=0)
 
 
 def test_farthest_spreads() -> None:
-    chosen = sorted(FarthestPolicy().choose(ring(16), 4, seed=5))
+    chosen = sorted(FarthestPolicy().choose(ring(16), 4, seed=5).views)
     assert np.diff(chosen).tolist() == [4, 4, 4]
 
 
 def test_farthest_tells_directions_apart_and_survives_coincident_cameras() -> None:
     place = np.zeros((6, 3))
     directions = np.eye(3)[[0, 0, 0, 1, 1, 2]]
-    chosen = FarthestPolicy().choose(Cameras(place, directions), 3, seed=0)
+    chosen = FarthestPolicy().choose(Candidates(place, directions), 3, seed=0).views
     assert len({tuple(directions[i]) for i in chosen}) == 3
-    assert sorted(FarthestPolicy().choose(Cameras(place, directions), 6, seed=0)) == list(range(6))
+    assert sorted(FarthestPolicy().choose(Candidates(place, directions), 6, seed=0).views) == list(range(6))
 
 
 def test_actions_are_masked_in_the_random_draw_and_in_the_maximum() -> None:

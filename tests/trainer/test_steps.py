@@ -62,7 +62,7 @@ def step2(
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("policy", ["rl", "random", "farthest"])
+@pytest.mark.parametrize("policy", ["rl", "random", "auto"])
 def test_selection_and_books(scene: Scene, tmp_path: Path, policy: str) -> None:
     events = step1(scene.raster, tmp_path, policy=policy, val=scene.raster.subset([0, 1]))
     epochs = [event for event in events if isinstance(event, EpochEnd)]
@@ -70,7 +70,7 @@ def test_selection_and_books(scene: Scene, tmp_path: Path, policy: str) -> None:
     assert epochs[1].losses["dnr"] < epochs[0].losses["dnr"] and epochs[0].val["psnr"] > 0
     assert ("rl" in epochs[0].losses) == (policy == "rl")
     last = events[-1]
-    assert isinstance(last, Selected) and last.policy == policy
+    assert isinstance(last, Selected) and last.policy == {"rl": "rl-paper"}.get(policy, policy)
     assert len(set(last.views)) == 4 and set(last.views) <= set(scene.raster.names)
     record = read_record(tmp_path / "step1")
     assert record is not None and record["selected"] == last.views

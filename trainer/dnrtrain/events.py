@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -27,11 +28,17 @@ class EpochEnd:
 
 @dataclass(frozen=True)
 class Selected:
-    """Step 1 is done: names of the chosen views, in order, and what the policy says of itself."""
+    """Step 1 is done: names of the chosen views, in order, and what the policy says of itself.
+
+    gains, why: per view, see :class:`dnrtrain.selector.protocol.Choice`; empty where a run from before they were kept
+    is found again.
+    """
 
     views: list[str]
     policy: str
-    details: dict[str, float | str | list[float]] = field(default_factory=dict)
+    details: dict[str, Any] = field(default_factory=dict)
+    gains: list[float] = field(default_factory=list)
+    why: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Step 1: the coarse DNR on rasterised images, and the view selector (paper equations 2 to 5).
 
-With ``rl`` an episode walks ``budget`` candidate views; every view taken is one training step of the DNR
-and gives the agent its reward. With the baselines the DNR trains on all candidates in random order for
-the same number of steps, without an agent.
+With ``rl-paper`` an episode walks ``budget`` candidate views; every view taken is one training step of the DNR
+and gives the agent its reward. With a policy that needs no training the DNR trains on all candidates in random
+order for the same number of steps, without an agent: that is worth its time where step 2 starts from its weights.
 
 The joint loss 0.1·L_RL + 1.0·L_DNRc (equation 5) is stepped by two Adam optimisers: the observation is
 detached, so the two gradients touch disjoint parameters and the sum splits exactly. L_RL = Σ_t (equation
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,9 +38,12 @@ from .schedule import (
     validate,
 )
 from .selector.agent import RewardScale, best_action, epsilon_at, epsilon_greedy, follow, reward_of, td_target
-from .selector.baselines import BASELINES, FarthestPolicy
-from .selector.protocol import POLICIES, Cameras, check_budget
+from .selector.baselines import FarthestPolicy
+from .selector.names import full_name
+from .selector.policies import untrained
+from .selector.protocol import Candidates, Choice, check_budget
 from .selector.qnetwork import QNetwork
+from .selector.sightings import Sightings
 from .settings import ModelSettings, Step1Settings
 
 PROBES = 4
@@ -59,6 +63,7 @@ def run_step1(
     device: str,
     checkpoints: Path,
     fingerprint: str,
+    sightings: Sightings | None = None,
 ) -> Iterator[Event]:
     """Train the coarse DNR (and the selector); the last event is :class:`Selected`.
 
@@ -66,16 +71,20 @@ def run_step1(
         views: all N candidates, targets = rasterised images.
         val: validation views with rasterised targets, or None.
         model: of the whole run; step 1 trains its :meth:`~dnrtrain.settings.ModelSettings.coarse` part.
-        camera_positions: centres of the candidates' cameras in world space, [N, 3] (policy ``farthest``).
-        policy: rl, random or farthest.
+        camera_positions: centres of the candidates' cameras in world space, [N, 3].
+        policy: a name of :mod:`.selector.policies`.
         budget: M, the number of views to select, 1 <= M <= N.
         checkpoints: this step's own folder; a run that was interrupted there with the same fingerprint
             and settings is continued after its last whole epoch, a finished one answers at once.
+        sightings: what the candidates see, for policies that look at it.
 
     Raises:
         ContractError: budget out of range, unknown policy, views without targets.
     """
-    run = _Step1(views, val, camera_positions, model, settings, policy, budget, seed, device, checkpoints, fingerprint)
+    if np.shape(camera_positions) != (len(views), 3):
+        raise ContractError(f"{len(views)} views but camera positions of shape {np.shape(camera_positions)}")
+    candidates = Candidates(np.asarray(camera_positions, np.float64), views.camera_directions, sightings)
+    run = _Step1(views, val, candidates, model, settings, policy, budget, seed, device, checkpoints, fingerprint)
     yield from run.events()
 
 
@@ -86,7 +95,7 @@ class _Step1:
         self,
         views: ViewSet,
         val: ViewSet | None,
-        camera_positions: np.ndarray,
+        candidates: Candidates,
         model: ModelSettings,
         settings: Step1Settings,
         policy: str,
@@ -97,31 +106,31 @@ class _Step1:
         fingerprint: str,
     ) -> None:
         check_budget(budget, len(views))
-        if policy not in POLICIES:
-            raise ContractError(f"unknown policy '{policy}'; choose one of {', '.join(POLICIES)}")
+        self.rule = untrained(policy)
+        policy = full_name(policy)
         require_target(views, "step 1")
-        if np.shape(camera_positions) != (len(views), 3):
-            raise ContractError(f"{len(views)} views but camera positions of shape {np.shape(camera_positions)}")
-        self.cameras = Cameras(np.asarray(camera_positions, np.float64), views.camera_directions)
+        self.candidates = candidates
         self.views, self.val = views.to(device), None if val is None else val.to(device)
         self.settings, self.policy, self.budget, self.seed = settings, policy, budget, seed
         self.device, self.folder, self.fingerprint = device, Path(folder), fingerprint
         model = model.coarse()
-        parts = [model.model_dump(), settings.model_dump(), policy, budget, seed, device]
+        # Under its first name, so that runs from before it had two are found again.
+        known = "rl" if policy == "rl-paper" else policy
+        parts = [model.model_dump(), settings.model_dump(), known, budget, seed, device]
         self.key = run_key(fingerprint, views, parts)
         self.episodes = -(-len(views) // budget)
         self.total_steps = settings.epochs * self.episodes * budget
         self.dnr = DNR(model, seed).to(device)
         self.agent: QNetwork | None = None
         self.slow: QNetwork | None = None
-        if policy == "rl":
+        if self.rule is None:
             shape = (len(views), model.texture_channels, settings.embedding, seed + 1)
             self.agent, self.slow = QNetwork(*shape).to(device), QNetwork(*shape).to(device)
         self.adam_dnr = adam([self.dnr], settings.learning_rate, device, settings.texture_rate_scale)
         self.adam_agent = adam([self.agent], settings.learning_rate, device) if self.agent else None
         self.probes: list[int] = []
         if self.agent and settings.reward == "improvement":
-            self.probes = FarthestPolicy().choose(self.cameras, min(PROBES, len(views)), seed)
+            self.probes = FarthestPolicy().choose(candidates, min(PROBES, len(views)), seed).views
         self.scale = RewardScale(raw=settings.reward_scale == "raw")
         self.history: list[dict] = []
         self.book = EpochBook()
@@ -132,15 +141,17 @@ class _Step1:
     def events(self) -> Iterator[Event]:
         record = checkpoint.read_record(self.folder)
         if record is not None and record.get("run") == self.key:
-            yield Selected(record["selected"], self.policy, record["details"])
+            yield Selected(
+                record["selected"], self.policy, record["details"], record.get("gains", []), record.get("why", [])
+            )
             return
         first = self._restore()
         if first:
             yield Note(f"step 1 continues after epoch {first} of {self.settings.epochs}")
         for epoch in range(first, self.settings.epochs):
             yield self._epoch(epoch)
-        order, details = self._select()
-        names = [self.views.names[i] for i in order]
+        choice = self._select()
+        names = [self.views.names[i] for i in choice.views]
         info = {
             "fingerprint": self.fingerprint,
             "run": self.key,
@@ -150,12 +161,14 @@ class _Step1:
             "budget": self.budget,
             "seed": self.seed,
             "selected": names,
-            "details": details,
+            "details": choice.details,
+            "gains": choice.gains,
+            "why": choice.why,
             "bfloat16": self.dnr.use_bfloat16,
             "history": self.history,
         }
         checkpoint.save_model(self.folder, self.dnr, info)
-        yield Selected(names, self.policy, details)
+        yield Selected(names, self.policy, choice.details, choice.gains, choice.why)
 
     def _epoch(self, epoch: int) -> EpochEnd:
         self.book = EpochBook()
@@ -254,10 +267,11 @@ class _Step1:
     # -- the selection ---------------------------------------------------------------------------------
 
     @torch.no_grad()
-    def _select(self) -> tuple[list[int], dict[str, float | str | list[float]]]:
-        """Indices of the chosen views, in order, and what the policy says of itself."""
-        if self.agent is None:
-            return BASELINES[self.policy].choose(self.cameras, self.budget, self.seed), {}
+    def _select(self) -> Choice:
+        """The policy's choice: by the trained agent's greedy roll-out where there is one."""
+        if self.rule is not None:
+            return self.rule.choose(self.candidates, self.budget, self.seed)
+        assert self.agent is not None
         random = step_random(self.seed, STEP1, -1, -1)
         order = [int(random.integers(len(self.views)))]
         selected = torch.zeros(len(self.views), dtype=torch.bool, device=self.device)
@@ -269,10 +283,12 @@ class _Step1:
             order.append(best_action(q, selected))
             selected[order[-1]] = True
             values.append(float(q[order[-1]]))
-        details: dict[str, float | str | list[float]] = {"reward": self.settings.reward}
+        details: dict[str, Any] = {"reward": self.settings.reward, "measure": "action value when it was taken"}
         if values and np.isfinite(values).all():
             details["action_values"] = values
-        return order, details
+        finite = [value if np.isfinite(value) else 0.0 for value in values]
+        why = ["drawn at random, as in every episode", *(f"highest action value: {value:.4f}" for value in values)]
+        return Choice(order, [0.0, *finite], why, details)
 
     # -- checkpoints -----------------------------------------------------------------------------------
 

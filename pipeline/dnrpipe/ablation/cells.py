@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from filelock import FileLock
+
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import ContractError
 from dnrtrain.events import Event, Selected
@@ -160,13 +162,15 @@ class Worker:
 
     def _pace(self, file: Path, folder: Path, train: Callable[[Path], Iterator[Event]]) -> float:
         """Seconds of one epoch: the second of two (the first warms up), kept in ``file`` for the row's other seeds."""
-        if not file.exists():
-            scratch = folder.with_name(f"{folder.name}.pace")
-            for _ in train(scratch):
-                pass
-            last = _history(scratch)[-1]
-            shutil.rmtree(scratch)
-            write_json(file, self._clock(last))
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(f"{file}.lock"):  # cells side by side train by one figure, not by one each
+            if not file.exists():
+                scratch = folder.with_name(f"{folder.name}.pace")
+                for _ in train(scratch):
+                    pass
+                last = _history(scratch)[-1]
+                shutil.rmtree(scratch)
+                write_json(file, self._clock(last))
         return float(json.loads(file.read_text()))
 
     def _clock(self, cost: dict[str, Any]) -> float:

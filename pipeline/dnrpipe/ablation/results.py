@@ -45,7 +45,7 @@ def gather(cells: Mapping[tuple[str, str, int], Path], rows: Sequence[Row], fact
                 "row": row,
                 "seed": seed,
                 "key": cell["key"],
-                **{name: _mean(cell["tests"], name) for name in METRICS},
+                **{name: mean_of(cell["tests"], name) for name in METRICS},
                 "views": len(cell["views"]),
                 "epochs": training and training["epochs"],
                 "steps": training and training["step2"]["steps"],
@@ -119,7 +119,8 @@ def known_rows(results: Mapping[str, Any]) -> list[str]:
     return [name for name in ROWS if name in present]
 
 
-def _mean(tests: list[dict[str, Any]], name: str) -> float | None:
+def mean_of(tests: list[dict[str, Any]], name: str) -> float | None:
+    """Mean of a metric over the test views that have it."""
     values = [test[name] for test in tests if test[name] is not None]
     return round(float(np.mean(values)), 5) if values else None
 

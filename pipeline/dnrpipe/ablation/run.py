@@ -22,12 +22,11 @@ from .. import __version__
 from ..console import Console
 from ..effects.store import plan_of
 from ..errors import UserError
-from ..executors import Retry, run_tasks
 from ..settings import Settings
-from ..tasks import TasksFailed, worker_count
-from ..training import perceptual_weights, torch_device
+from ..training import perceptual_weights
 from ..workspace import digest
 from .cells import STEP1_SHARE
+from .crew import Crew, make_crew
 from .results import code_state
 from .rows import Row, needs_base, needs_coarse, settings_of, step1_policy
 from .scenes import Scene, make_bases, prepare_scene, trace_references, trace_train
@@ -57,7 +56,7 @@ class Ablation:
     console: Console
     device: str = ""
     threads: int = 0
-    workers: int = 1
+    crew: Crew = field(init=False)
     perceptual: bool = False
     scenes: list[Scene] = field(default_factory=list)
     references: dict[str, dict[str, str]] = field(default_factory=dict)
@@ -72,12 +71,8 @@ class Ablation:
     def run(self) -> None:
         """Prepare all scenes, then go seed by seed, so that a whole table of the first seed exists early."""
         request = self.request
-        self.device = torch_device(request.base)
-        cores = worker_count(0)
-        on_gpu = self.device.startswith("cuda")
-        self.workers = request.jobs or (1 if on_gpu else cores)
-        # Cells side by side on a thread each finish more per hour than one after the other on all cores.
-        self.threads = 0 if on_gpu else max(1, cores // self.workers)
+        self.crew = make_crew(request.base, request.jobs, request.out / "logs" / "cells.log", self.console)
+        self.device, self.threads = self.crew.device, self.crew.threads
         self.perceptual = perceptual_weights(self.console) is not None
         with self.console.bar("scenes", len(request.scenes)) as bar:
             for source in request.scenes:
@@ -215,37 +210,8 @@ class Ablation:
         model = plan_of(scene.workspace, settings).model(settings.model)
         return settings.model_copy(update={"model": model})
 
-    # -- workers ---------------------------------------------------------------------------------------
-
     def _work(self, label: str, tasks: Sequence[dict[str, Any]]) -> None:
-        """Run the tasks whose output is missing; raises TasksFailed after all others are done."""
-        due = [task for task in tasks if not Path(task["output"]).exists()]
-        if not due:
-            return
-        threads = {name: str(self.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")} if self.threads else {}
-        common = {"threads": self.threads, "device": self.device}
-        log = self.request.out / "logs" / "cells.log"
-        failed: list[str] = []
-        with self.console.bar(label, len(tasks), len(tasks) - len(due)) as bar:
-            module = "dnrpipe.ablation.cells"
-            outcomes = run_tasks(module, common, due, workers=self.workers, log=log, environment=threads)
-            try:
-                for outcome in outcomes:
-                    if isinstance(outcome, Retry):
-                        self.console.warn(f"{outcome.task['label']}: {outcome.reason}; trying once more")
-                    elif outcome.result is None:
-                        self.console.warn(f"{outcome.task['label']} failed: {outcome.error}")
-                        failed.append(outcome.task["label"])
-                        bar.advance()
-                    else:
-                        bar.advance(note=outcome.task["label"])
-            finally:
-                outcomes.close()  # type: ignore[attr-defined]
-        if failed:
-            raise TasksFailed(
-                f"{label}: {len(failed)} of {len(due)} failed ({', '.join(failed[:5])}); the others are done."
-                f" See {log}; run the same command to try again"
-            )
+        self.crew.work(label, "dnrpipe.ablation.cells", tasks)
 
 
 def _read(task: dict[str, Any]) -> dict[str, Any]:

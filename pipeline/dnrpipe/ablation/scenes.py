@@ -51,13 +51,15 @@ class Scene:
     def _baseline(self, policy: str, budget: int, seed: int) -> list[str]:
         import numpy as np
 
-        from dnrtrain.selector.baselines import BASELINES
-        from dnrtrain.selector.protocol import Cameras
+        from dnrtrain.selector.policies import untrained
+        from dnrtrain.selector.protocol import Candidates
 
         names = list(self.train)
         positions = np.stack([self.train[name].position for name in names])
         directions = np.stack([-self.train[name].matrix[:3, 2] for name in names])
-        return [names[i] for i in BASELINES[policy].choose(Cameras(positions, directions), budget, seed)]
+        rule = untrained(policy)
+        assert rule is not None  # both names above are rules
+        return [names[i] for i in rule.choose(Candidates(positions, directions), budget, seed).views]
 
 
 def find_scenes(text: str | None) -> list[Path]:
@@ -84,15 +86,20 @@ def prepare_scene(source: Path, out: Path, settings: Settings, console: Console)
     """Make or find the scene's workspace ``<out>/scenes/<name>.dnr`` and its passes."""
     root = out / "scenes" / f"{source.stem}.dnr"
     workspace = Workspace.create(root, Source(path=str(source), sha256=file_sha256(source)))
+    return prepared(source.stem, workspace, settings, console)
+
+
+def prepared(name: str, workspace: Workspace, settings: Settings, console: Console) -> Scene:
+    """The workspace's passes, made where they are missing. Raises UserError: no test views, too few candidates."""
     run_stage("prepare", workspace, settings, Console(json_mode=console.json_mode, quiet=True))
     views = split_views(workspace)
     if not views.get("test"):
-        raise UserError(f"{source.stem}: has no test views to measure on; set cameras.test > 0")
+        raise UserError(f"{name}: has no test views to measure on; set cameras.test > 0")
     train = {view.name: view for view in views["train"]}
     if settings.select.budget > len(train):
-        raise UserError(f"--budget {settings.select.budget}: {source.stem} has {len(train)} candidate views")
+        raise UserError(f"a budget of {settings.select.budget} views: {name} has {len(train)} candidate views")
     return Scene(
-        source.stem,
+        name,
         workspace,
         train,
         {view.name: view for view in views["test"]},

@@ -113,7 +113,8 @@ def spread(values: Sequence[float], digits: int, *, signed: bool = False) -> str
     return f"{text} ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else text
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table; all columns but the first are right-aligned."""
     lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
@@ -138,7 +139,7 @@ def _means(figures: Figures, scenes: Sequence[str], title: str) -> str:
     for row in figures.rows:
         cells = [spread(figures.mean(row, metric, scenes), digits) for metric, _, digits in COLUMNS]
         rows.append([f"`{row}`", ROWS[row].what, *cells])
-    body = _table(["row", "what", *[title for _, title, _ in COLUMNS]], rows)
+    body = table(["row", "what", *[title for _, title, _ in COLUMNS]], rows)
     ceiling = [
         max(found)
         for scene in scenes
@@ -155,7 +156,7 @@ def _per_scene(figures: Figures, metric: str, title: str, digits: int) -> str:
     for scene in figures.scenes:
         line = [scene, *[spread(figures.scene(row, metric, scene), digits) for row in figures.rows]]
         rows.append([*line, spread(figures.scene(figures.rows[0], "ceiling", scene)[:1], 1)] if psnr else line)
-    return f"### {title}, per scene\n\n{_table([*head, 'ceiling'] if psnr else head, rows)}"
+    return f"### {title}, per scene\n\n{table([*head, 'ceiling'] if psnr else head, rows)}"
 
 
 def _gains(figures: Figures) -> str:
@@ -170,7 +171,7 @@ def _gains(figures: Figures) -> str:
             line.append(spread(figures.difference("dnr", rival, "psnr", scenes), 2, signed=True))
             line.append(spread(figures.ratio("dnr", rival, "lpips_vgg", scenes), 2))
         rows.append(line)
-    return f"### `dnr` against its rivals\n\n{_table(head, rows)}"
+    return f"### `dnr` against its rivals\n\n{table(head, rows)}"
 
 
 def _paper(figures: Figures) -> str:
@@ -194,7 +195,7 @@ def _paper(figures: Figures) -> str:
     if not rows:
         return ""
     head = ["taken away", "ΔPSNR, paper", "ΔPSNR, ours", "ΔSSIM, ours", "ΔLPIPS VGG, ours", "paper's order"]
-    return f"### The paper's table: what each mechanism is worth\n\n{_table(head, rows)}"
+    return f"### The paper's table: what each mechanism is worth\n\n{table(head, rows)}"
 
 
 def _verdict(theirs: float, ours: Sequence[float]) -> str:
@@ -217,7 +218,7 @@ def _figure7(figures: Figures) -> str:
             [ROWS[name].what, *[spread(figures.mean(name, m, figures.scenes), d) for m, _, d in COLUMNS[:6]]]
             for name in names
         ]
-        parts.append(f"### {title}\n\n{_table(['', *[head for _, head, _ in COLUMNS[:6]]], rows)}")
+        parts.append(f"### {title}\n\n{table(['', *[head for _, head, _ in COLUMNS[:6]]], rows)}")
     return "\n\n".join(parts)
 
 
@@ -237,7 +238,7 @@ def _ingredients(figures: Figures) -> str:
         milliseconds = [spread(figures.mean(name, part, figures.scenes), 1) for part in ("frame_ms", "base_ms")]
         rows.append([*line, *milliseconds])
     head = ["row", "what differs from `dnr`", "ΔPSNR", "ΔSSIM", "ΔLPIPS VGG", "network, ms", "base, ms"]
-    return f"### Ingredients of `dnr`, one changed at a time\n\n{_table(head, rows)}"
+    return f"### Ingredients of `dnr`, one changed at a time\n\n{table(head, rows)}"
 
 
 def main(arguments: Sequence[str]) -> int:

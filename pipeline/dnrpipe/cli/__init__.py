@@ -14,6 +14,7 @@ import click
 from .. import __version__
 from . import information, pictures, scene, stages
 from .ablate import ablate
+from .bench_select import bench_select
 
 
 class _Group(click.Group):
@@ -54,6 +55,7 @@ for _command in (
     pictures.report,
     stages.run,
     ablate,
+    bench_select,
     information.status,
     information.costs,
     information.doctor,

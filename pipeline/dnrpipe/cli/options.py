@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from dnrtrain.selector.names import ALIASES, NAMES
+
 from ..errors import UserError
 
 if TYPE_CHECKING:
@@ -49,7 +51,11 @@ CAMERA_OPTIONS = [
 ]
 SELECT_OPTIONS = [
     click.option("--budget", type=int, metavar="M", help="Views to ray-trace (default 25)."),
-    click.option("--policy", type=click.Choice(["rl", "random", "farthest"]), help="How to choose them."),
+    click.option(
+        "--policy",
+        type=click.Choice([*NAMES, *ALIASES]),
+        help="How to choose them; rl-paper (alias rl) trains step 1 for it, the others take seconds.",
+    ),
 ]
 
 

@@ -48,12 +48,16 @@ def prepare(scene: Path | None, strict: bool, **options: Any) -> None:
 @options(SELECT_OPTIONS)
 @common
 def select(**options: Any) -> None:
-    """Step 1: train the coarse neural renderer and choose the views to ray-trace.
+    """Choose the views to ray-trace.
+
+    Trains the coarse neural renderer (step 1) only where the policy learns from it or step 2 starts from it
+    (finetune.step2.start = coarse). selection.json says what each view adds, and why it was chosen.
 
     \b
     Examples:
       dnrpipe select --budget 25
-      dnrpipe select --budget 10 --policy farthest
+      dnrpipe select --budget 10 --policy auto
+      dnrpipe select --budget 10 --policy kmedoids
     """
     with open_session("select", options, overrides=select_overrides(options)) as session:
         session.stages("select")

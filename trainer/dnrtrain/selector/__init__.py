@@ -1,1 +1,1 @@
-"""View selection: the paper's Q-learning selector and the baselines, behind one protocol."""
+"""View selection: geometric and coverage policies and the paper's Q-learning selector, behind one protocol."""

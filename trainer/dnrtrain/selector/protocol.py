@@ -1,32 +1,84 @@
-"""What every selection policy has in common."""
+"""What every selection policy has in common: what it may know, and what it answers."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
 from ..contract import ContractError
 
-POLICIES = ("rl", "random", "farthest")
+if TYPE_CHECKING:
+    from .sightings import Sightings
+
+
+Tick = Callable[[int], object]
+"""Told how many candidates were weighed since the last call."""
 
 
 @dataclass(frozen=True)
-class Cameras:
-    """What a geometric policy may know of the candidates: centres and unit viewing directions, [N, 3] each."""
+class Candidates:
+    """N views to choose from.
+
+    positions, directions: camera centres and unit viewing directions in world space, float64 [N, 3] each.
+    sightings: what each of them sees of the surface, or None where nobody looked.
+    """
 
     positions: np.ndarray
     directions: np.ndarray
+    sightings: Sightings | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.positions)
+        if np.shape(self.positions) != (count, 3) or np.shape(self.directions) != (count, 3):
+            raise ContractError(
+                f"camera positions of shape {np.shape(self.positions)} and directions of shape"
+                f" {np.shape(self.directions)}: must be [N, 3] both"
+            )
+        if self.sightings is not None and len(self.sightings) != count:
+            raise ContractError(f"{count} cameras but sightings of {len(self.sightings)} views: must agree")
 
     def __len__(self) -> int:
         return len(self.positions)
 
+    def take(self, order: np.ndarray) -> Candidates:
+        """The candidates at ``order``, in that order."""
+        sightings = None if self.sightings is None else self.sightings.take(order)
+        return Candidates(self.positions[order], self.directions[order], sightings)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """An ordered selection of distinct views.
+
+    views: indices of candidates. gains: what each added when it was taken, in the policy's own measure (which
+    ``details["measure"]`` names). why: one plain sentence per view. details: anything JSON-able.
+    """
+
+    views: list[int]
+    gains: list[float]
+    why: list[str]
+    details: dict[str, Any] = field(default_factory=dict)
+
 
 class Policy(Protocol):
-    """A policy that needs no training: indices of ``budget`` distinct views, in order."""
+    """A policy that needs no training.
 
-    def choose(self, views: Cameras, budget: int, seed: int) -> list[int]: ...
+    looks: whether it uses :attr:`Candidates.sightings`.
+    effort: how often it weighs each candidate, roughly; for progress bars. 0: it is done at once.
+    """
+
+    looks: ClassVar[bool]
+    effort: ClassVar[int]
+
+    def choose(self, candidates: Candidates, budget: int, seed: int, tick: Tick | None = None) -> Choice:
+        """Choose ``budget`` distinct candidates.
+
+        Raises ContractError: not 1 <= budget <= N, or it cannot do without sightings and there are none.
+        """
+        ...
 
 
 def check_budget(budget: int, candidates: int) -> None:

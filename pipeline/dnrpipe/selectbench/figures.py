@@ -1,0 +1,71 @@
+"""Numbers from ``results.json``: means over scenes, spreads over seeds, paired differences."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from .intervals import Difference, summarise
+from .policies import CONTENDERS, SIMPLE
+from .pools import POOLS
+
+SPHERICAL = ("dome", "sphere")
+
+
+class Figures:
+    """Cells by pool, budget, policy; then by (scene, seed)."""
+
+    def __init__(self, results: Mapping[str, Any]) -> None:
+        self.cells: dict[tuple[str, int, str], dict[tuple[str, int], dict[str, Any]]] = {}
+        for cell in results["cells"]:
+            place = (cell["pool"], cell["budget"], cell["policy"])
+            self.cells.setdefault(place, {})[cell["scene"], cell["seed"]] = cell
+        present = {(cell["scene"]) for cell in results["cells"]}
+        self.scenes = [name for name in results["scenes"] if name in present]
+        self.pools = [name for name in POOLS if any(place[0] == name for place in self.cells)]
+        self.budgets = sorted({place[1] for place in self.cells})
+        self.policies = [name for name in CONTENDERS if any(place[2] == name for place in self.cells)]
+        self.seeds = sorted({cell["seed"] for cell in results["cells"]})
+
+    def values(self, pool: str, budget: int, policy: str, metric: str) -> dict[tuple[str, int], float]:
+        """A metric by (scene, seed), where it was measured."""
+        found = self.cells.get((pool, budget, policy), {})
+        return {place: cell[metric] for place, cell in found.items() if cell[metric] is not None}
+
+    def means(self, pool: str, budget: int, policy: str, metric: str) -> list[float]:
+        """Means over all scenes, one per seed; seeds that lack a scene are left out."""
+        values = self.values(pool, budget, policy, metric)
+        whole = [seed for seed in self.seeds if all((scene, seed) in values for scene in self.scenes)]
+        return [statistics.fmean(values[scene, seed] for scene in self.scenes) for seed in whole]
+
+    def best_simple(self, pool: str, budget: int) -> str | None:
+        """The simple rule of highest mean PSNR over the (scene, seed) that all simple rules here have."""
+        found = {name: self.values(pool, budget, name, "psnr") for name in SIMPLE}
+        found = {name: values for name, values in found.items() if values}
+        shared = set.intersection(*(set(values) for values in found.values())) if found else set()
+        if not shared:
+            return None
+        return max(found, key=lambda name: statistics.fmean(found[name][place] for place in shared))
+
+    def rival(self, kind: str, pool: str, budget: int) -> str | None:
+        """``random``, or the name of the best simple rule here for ``simple``."""
+        return self.best_simple(pool, budget) if kind == "simple" else kind
+
+    def against(self, policy: str, kind: str, pools: Sequence[str], budget: int, metric: str) -> Difference | None:
+        """policy - rival, each pool with its own rival; over several pools the mean of each (scene, seed) over them.
+
+        None where they share nothing, or where the policy is the rival everywhere; where it is the rival in some
+        pools, these count as 0.
+        """
+        rivals = {pool: self.rival(kind, pool, budget) for pool in pools}
+        rivals = {pool: rival for pool, rival in rivals.items() if rival is not None}
+        if all(rival == policy for rival in rivals.values()):
+            return None
+        found: dict[tuple[str, int], list[float]] = {}
+        for pool, rival in rivals.items():
+            ours, theirs = (self.values(pool, budget, name, metric) for name in (policy, rival))
+            for place in ours.keys() & theirs.keys():
+                found.setdefault(place, []).append(ours[place] - theirs[place])
+        whole = {place: statistics.fmean(pairs) for place, pairs in found.items() if len(pairs) == len(rivals)}
+        return summarise({place: whole[place] for place in sorted(whole)})

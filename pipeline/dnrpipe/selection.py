@@ -1,0 +1,154 @@
+"""Stage `select`: which candidates are ray-traced; with the coarse model (step 1) where anything needs it."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from typing import TYPE_CHECKING
+
+from dnrtrain.atomic import write_json
+from dnrtrain.contract import View
+from dnrtrain.events import Selected
+from dnrtrain.selector.names import TRAINED_NAMES
+
+from .console import Console
+from .costs import CostRecord
+from .effects.store import plan_of
+from .errors import UserError
+from .prepare import split_views
+from .settings import Settings
+from .stages import STAGES, Outcome, fingerprint
+from .training import epochs_done, follow, load, torch_device
+from .workspace import Workspace, digest, file_sha256
+
+if TYPE_CHECKING:
+    from dnrtrain.selector.sightings import Sightings
+
+
+def run(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
+    """Choose ``budget`` views and write ``selection.json``; train the coarse DNR on the way where it is wanted."""
+    views = split_views(workspace)["train"]
+    check_budget(settings.select.budget, len(views))
+    if settings.trains_step1:
+        chosen = _train_and_choose(workspace, settings, console, run_id, views)
+        made: list[object] = [chosen.views, file_sha256(workspace.checkpoints("step1") / "model.safetensors")]
+    else:
+        chosen = _choose(workspace, settings, console, run_id, views)
+        made = [chosen.views]
+    write_json(
+        workspace.selection,
+        {
+            "policy": chosen.policy,
+            "budget": settings.select.budget,
+            "seed": settings.select.seed,
+            "views": chosen.views,
+            "gains": chosen.gains,
+            "why": chosen.why,
+            "details": chosen.details,
+        },
+    )
+    return Outcome(digest(made), {"policy": chosen.policy, "views": chosen.views})
+
+
+def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
+    """(epochs trained, epochs wanted); without training (1 or 0, 1)."""
+    there = workspace.selection.exists()
+    if not settings.trains_step1:
+        return int(there), 1
+    return epochs_done(workspace.checkpoints("step1"), settings.select.step1.epochs, there)
+
+
+def check_budget(budget: int, candidates: int) -> None:
+    """Raises UserError when more views are wanted than there are."""
+    if budget > candidates:
+        raise UserError(
+            f"--budget {budget}: only {candidates} candidate views exist; lower the budget or prepare more"
+            f" (`dnrpipe prepare --views {budget}`)"
+        )
+
+
+def _choose(workspace: Workspace, settings: Settings, console: Console, run_id: str, views: list[View]) -> Selected:
+    import numpy as np
+
+    from dnrtrain.selector.policies import untrained
+    from dnrtrain.selector.protocol import Candidates
+
+    policy = settings.select.policy
+    console.say(f"select: no training; policy {policy} needs none, and step 2 starts fresh")
+    rule = untrained(policy)
+    assert rule is not None  # settings.trains_step1 is False
+    clock, cpu = time.monotonic(), time.process_time()
+    positions = np.stack([view.position for view in views])
+    directions = np.stack([-view.matrix[:3, 2] for view in views])
+    sightings = _look(workspace, console, views) if rule.looks else None
+    candidates = Candidates(positions, directions, sightings)
+    with console.bar(f"choosing by {policy}", len(views) * rule.effort) as bar:
+
+        def tick(weighed: int) -> None:
+            bar.advance(min(weighed, bar.total - bar.done))  # the effort is an estimate
+
+        choice = rule.choose(candidates, settings.select.budget, settings.select.seed, tick)
+        tick(bar.total)
+    workspace.ledger.append(
+        CostRecord(
+            time=time.time(),
+            run=run_id,
+            stage="select",
+            purpose="training",
+            unit="scene",
+            name="selection",
+            seconds=time.monotonic() - clock,
+            cpu_seconds=time.process_time() - cpu,
+            device="cpu",
+        )
+    )
+    # A model of another policy's run would pass for this one's in the report.
+    if workspace.checkpoints("step1").exists():
+        shutil.rmtree(workspace.checkpoints("step1"))
+    return Selected([views[i].name for i in choice.views], policy, choice.details, choice.gains, choice.why)
+
+
+def _train_and_choose(
+    workspace: Workspace, settings: Settings, console: Console, run_id: str, views: list[View]
+) -> Selected:
+    import numpy as np
+
+    from dnrtrain.selector.policies import untrained
+    from dnrtrain.step1 import run_step1
+
+    select = settings.select
+    if select.policy not in TRAINED_NAMES:
+        console.say(f"select: policy {select.policy} needs no training, but step 2 starts from the coarse model")
+    rule = untrained(select.policy)
+    sightings = _look(workspace, console, views) if rule is not None and rule.looks else None
+    validation = split_views(workspace)["val"]
+    stamp = fingerprint(STAGES["select"], workspace, settings)
+    assert stamp is not None  # its inputs were required
+    chosen: Selected | None = None
+    events = run_step1(
+        load(workspace, views, "train"),
+        load(workspace, validation, "val") if validation else None,
+        np.stack([view.position for view in views]),
+        plan_of(workspace, settings).model(settings.model).coarse(),
+        select.step1,
+        policy=select.policy,
+        budget=select.budget,
+        seed=select.seed,
+        device=torch_device(settings),
+        checkpoints=workspace.checkpoints("step1"),
+        fingerprint=stamp,
+        sightings=sightings,
+    )
+    for event in follow(events, "select", select.step1.epochs, workspace, console, run_id):
+        if isinstance(event, Selected):
+            chosen = event
+    assert chosen is not None  # run_step1 ends with Selected
+    return chosen
+
+
+def _look(workspace: Workspace, console: Console, views: list[View]) -> Sightings:
+    """What the candidates see, from their pass files."""
+    from dnrtrain.selector.sightings import read_sightings
+
+    with console.bar("what candidates see", len(views)) as bar:
+        return read_sightings([workspace.passes("train", view.name) for view in views], views, tick=bar.advance)

@@ -1,0 +1,131 @@
+"""Stage `select`: when it trains, what it writes, and what makes it stale."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dnrpipe.console import Console
+from dnrpipe.settings import Settings, resolve
+from dnrpipe.stages import STAGES, fingerprint, run_stage
+from dnrpipe.training import read_selection
+from dnrpipe.workspace import Source, Workspace
+from dnrtrain.contract import write_cameras
+
+sys.path.insert(0, str(Path(__file__).parent / "trainer"))
+
+import synthetic
+
+BUDGET = 3
+
+
+def told(policy: str = "kmedoids", budget: int = BUDGET, **changes: Any) -> Settings:
+    return resolve(None, {"select": {"budget": budget, "policy": policy}, **changes}, environment={})
+
+
+COARSE = {"finetune": {"step2": {"start": "coarse"}}}
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Workspace:
+    """Eight candidates with passes; of `prepare` only what a choice without training reads."""
+    made = Workspace.create(tmp_path / "scene.dnr", Source(path=str(tmp_path / "scene.blend"), sha256="0"))
+    views = synthetic.dome(8, 24)
+    files, _ = synthetic.write_scene(tmp_path / "made", views)
+    for view, file in zip(views, files, strict=True):
+        target = made.passes("train", view.name)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        file.rename(target)
+    write_cameras(made.cameras("train"), views, "train")
+    made.finish_stage("prepare", fingerprint="f", output="o", seconds=1.0, detail={"views": {"train": 8}})
+    return made
+
+
+def choose(workspace: Workspace, settings: Settings, capsys: pytest.CaptureFixture[str]) -> tuple[dict[str, Any], str]:
+    """The stage's own work (its inputs' state is another test's) -> selection.json and what was said."""
+    from dnrpipe.selection import run
+
+    outcome = run(workspace, settings, Console(), "select-0")
+    stamp = fingerprint(STAGES["select"], workspace, settings)
+    assert stamp is not None
+    workspace.finish_stage("select", fingerprint=stamp, output=outcome.output, seconds=0.0, detail=outcome.detail)
+    return read_selection(workspace), capsys.readouterr().out
+
+
+@pytest.mark.parametrize("policy", ["auto", "kmedoids", "coverage", "d-optimal", "farthest", "random"])
+def test_a_choice_without_training(workspace: Workspace, capsys: pytest.CaptureFixture[str], policy: str) -> None:
+    left = workspace.checkpoints("step1") / "model.json"
+    left.parent.mkdir(parents=True)
+    left.write_text("{}")
+    found, said = choose(workspace, told(policy), capsys)
+    assert f"no training; policy {policy} needs none" in said
+    assert not left.parent.exists()  # another policy's model would pass for this one's
+    assert found["policy"] == policy and found["budget"] == BUDGET
+    assert len(set(found["views"])) == len(found["gains"]) == len(found["why"]) == BUDGET
+    if policy not in ("farthest", "random"):
+        assert 0 <= found["details"]["uncovered"] < 0.5
+    booked = workspace.ledger.read()
+    assert [(r.stage, r.name, r.unit) for r in booked] == [("select", "selection", "scene")]
+
+
+def test_what_makes_a_choice_stale(workspace: Workspace, capsys: pytest.CaptureFixture[str]) -> None:
+    """Without training the model does not matter; a start from the coarse model does."""
+    choose(workspace, told(), capsys)
+
+    def stamp(**changes: Any) -> str | None:
+        return fingerprint(STAGES["select"], workspace, told(**changes))
+
+    assert stamp() == stamp(model={"width": 8}) == workspace.manifest.stages["select"].fingerprint
+    assert stamp() != stamp(**COARSE) != stamp(model={"width": 8}, **COARSE)
+    assert stamp() != stamp(policy="coverage")
+    assert stamp(policy="rl-paper") != stamp(policy="rl-paper", model={"width": 8})
+
+
+def test_rl_is_the_alias_of_rl_paper_and_stays_what_it_was() -> None:
+    settings = told("rl")
+    assert settings.select.policy == "rl-paper" and settings.trains_step1
+    recorded = STAGES["select"].settings(settings)
+    assert recorded == STAGES["select"].settings(told("rl-paper"))
+    assert recorded[1]["policy"] == "rl"  # what older workspaces recorded: their step 1 stays done
+    assert set(recorded[1]) == {"budget", "policy", "seed", "step1"}
+
+
+def test_when_step_1_trains() -> None:
+    assert [told(p).trains_step1 for p in ("auto", "kmedoids", "random", "rl")] == [False, False, False, True]
+    assert all(told(p, **COARSE).trains_step1 for p in ("auto", "rl"))
+
+
+def test_an_older_selection_is_read(workspace: Workspace) -> None:
+    old = {"policy": "rl", "budget": 2, "seed": 0, "views": ["0001", "0004"], "details": {"reward": "neg-loss"}}
+    workspace.selection.write_text(json.dumps(old))
+    assert read_selection(workspace)["views"] == ["0001", "0004"]
+    from dnrpipe.report.collect import collect
+
+    found = collect(workspace.root).selection
+    assert found is not None and [view.name for view in found.views] == old["views"]
+
+
+def test_too_large_a_budget_is_refused(workspace: Workspace) -> None:
+    from dnrpipe.errors import UserError
+    from dnrpipe.selection import run
+
+    with pytest.raises(UserError, match="--budget 9: only 8 candidate views exist"):
+        run(workspace, told("auto", 9), Console(), "select-0")
+
+
+def test_an_unknown_policy_is_refused() -> None:
+    from dnrpipe.errors import UserError
+
+    with pytest.raises(UserError, match=r"select\.policy.*'auto', 'kmedoids'"):
+        told("best")
+
+
+def test_the_stage_asks_for_its_inputs(workspace: Workspace) -> None:
+    from dnrpipe.errors import UserError
+
+    with pytest.raises(UserError, match="run `dnrpipe prepare` first"):
+        run_stage("select", workspace, told(), Console())

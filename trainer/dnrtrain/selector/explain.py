@@ -1,0 +1,75 @@
+"""What a selection leaves uncovered, and what each of its views brought, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .sightings import Sightings
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """After each view of an ordered selection, over all pixels of all candidates.
+
+    uncovered: share whose piece of surface no chosen view sees. angles: mean angle, in degrees, between the
+    directions from which candidate and nearest chosen view see a covered piece.
+    """
+
+    uncovered: list[float]
+    angles: list[float]
+
+
+def coverage_of(sightings: Sightings, views: Sequence[int]) -> Coverage:
+    """Follow a selection view by view. Everything counts as covered where no candidate sees anything."""
+    cells, toward = sightings.cells, sightings.toward
+    weights = sightings.pixels.astype(np.float64)
+    total = weights.sum()
+    nearest = np.full(len(cells), -2.0, np.float32)  # cosine to the nearest chosen sighting; −2: not seen
+    uncovered, angles = [], []
+    for view in views:
+        part = sightings.of(view)
+        known = np.zeros(sightings.grid**2, bool)
+        direction = np.zeros((sightings.grid**2, 3), np.float32)
+        known[cells[part]] = True
+        direction[cells[part]] = toward[part]
+        cosine = np.einsum("ek,ek->e", direction[cells], toward)
+        np.maximum(nearest, np.where(known[cells], cosine, -2.0), out=nearest)
+        covered = nearest > -2.0
+        share = weights[covered]
+        angle = np.degrees(np.arccos(np.clip(nearest[covered], -1.0, 1.0)))
+        uncovered.append(float(1.0 - share.sum() / total) if total else 0.0)
+        angles.append(float(angle @ share / share.sum()) if share.sum() else 0.0)
+    return Coverage([max(0.0, value) for value in uncovered], angles)
+
+
+def sentences(coverage: Coverage) -> list[str]:
+    """One per view, e.g. "first to see 12.0 % of what the candidates see; mean angle to it now 31°"."""
+    found = []
+    before, angle_before = 1.0, None
+    for uncovered, angle in zip(coverage.uncovered, coverage.angles, strict=True):
+        new = max(0.0, before - uncovered)
+        text = f"first to see {new:.1%} of what the candidates see" if new >= 0.0005 else "sees nothing new"
+        if angle_before is None:
+            text += f"; mean angle to the nearest sighting {angle:.0f}°"
+        else:
+            text += f"; mean angle to the nearest sighting {angle_before:.1f}° → {angle:.1f}°"
+        found.append(text)
+        before, angle_before = uncovered, angle
+    return found
+
+
+def explained(sightings: Sightings | None, views: Sequence[int], why: Sequence[str]) -> tuple[list[str], dict]:
+    """``why`` with what each view brought, and for the details what remains; as they are without sightings."""
+    if sightings is None:
+        return list(why), {}
+    coverage = coverage_of(sightings, views)
+    texts = [f"{reason}; {text}" if reason else text for reason, text in zip(why, sentences(coverage), strict=True)]
+    facts = {
+        "uncovered": coverage.uncovered[-1],
+        "uncovered_after_each": coverage.uncovered,
+        "mean_angle_degrees": coverage.angles[-1],
+    }
+    return texts, facts

@@ -1,0 +1,32 @@
+"""The policies that need no training, by name."""
+
+from __future__ import annotations
+
+from ..contract import ContractError
+from .auto import AutoPolicy
+from .baselines import FarthestPolicy, RandomPolicy
+from .coverage import CoveragePolicy
+from .doptimal import DOptimalPolicy
+from .kmedoids import KMedoidsPolicy
+from .names import NAMES, full_name
+from .protocol import Policy
+
+UNTRAINED: dict[str, Policy] = {
+    "auto": AutoPolicy(),
+    "kmedoids": KMedoidsPolicy(),
+    "coverage": CoveragePolicy(),
+    "d-optimal": DOptimalPolicy(),
+    "farthest": FarthestPolicy(),
+    "random": RandomPolicy(),
+}
+
+
+def untrained(name: str) -> Policy | None:
+    """The policy of that name or alias; None for one that step 1 must train.
+
+    Raises ContractError for an unknown one.
+    """
+    name = full_name(name)
+    if name not in NAMES:
+        raise ContractError(f"unknown policy '{name}'; choose one of {', '.join(NAMES)}")
+    return UNTRAINED.get(name)

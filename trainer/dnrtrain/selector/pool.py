@@ -1,0 +1,71 @@
+"""What all deterministic policies do with their pool: a fixed order, no duplicates, nothing that sees nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from .geometry import camera_features
+from .protocol import Candidates, Choice, check_budget
+
+
+def choose_useful(candidates: Candidates, budget: int, choose: Callable[[Candidates, int], Choice]) -> Choice:
+    """Run ``choose`` on the candidates that are worth a choice; fill up with the others if the budget asks for more.
+
+    ``choose`` gets the candidates in an order that depends on poses and pictures only, never on theirs in the file:
+    so a permutation of the candidates does not change the chosen set. Duplicates (the same picture; without
+    sightings the same pose) come once. Views that see nothing come last.
+    """
+    check_budget(budget, len(candidates))
+    order = canonical_order(candidates)
+    ranked = candidates.take(order)
+    sees = np.ones(len(order), bool) if ranked.sightings is None else ranked.sightings.seen > 0
+    first = _first_of_its_kind(ranked)
+    useful = np.flatnonzero(sees & first)
+    chosen = Choice([], [], [])
+    if len(useful):
+        chosen = choose(ranked.take(useful), min(budget, len(useful)))
+    views = [int(useful[i]) for i in chosen.views]
+    gains, why = list(chosen.gains), list(chosen.why)
+    for group, reason in ((sees & ~first, "a duplicate: all else was chosen"), (~sees, "sees nothing: all else was")):
+        extra = _spread(ranked, np.flatnonzero(group), budget - len(views))
+        views += extra
+        gains += [0.0] * len(extra)
+        why += [reason] * len(extra)
+    facts = {"duplicates": int((sees & ~first).sum()), "see_nothing": int((~sees).sum())}
+    details = {**chosen.details, **{name: value for name, value in facts.items() if value}}
+    return Choice([int(order[i]) for i in views], gains, why, details)
+
+
+def canonical_order(candidates: Candidates) -> np.ndarray:
+    """Indices sorted by position, direction and picture; by index only where all of these are equal."""
+    keys = [*candidates.positions.T, *candidates.directions.T]
+    if candidates.sightings is not None:
+        keys.append(candidates.sightings.pictures)
+    return np.lexsort(keys[::-1])
+
+
+def _first_of_its_kind(candidates: Candidates) -> np.ndarray:
+    """Whether each view is the first of its duplicates, bool [N]."""
+    first = np.zeros(len(candidates), bool)
+    if candidates.sightings is not None:
+        kinds = candidates.sightings.pictures[:, None]
+    else:
+        kinds = np.concatenate([candidates.positions, candidates.directions], axis=1)
+    first[np.unique(kinds, axis=0, return_index=True)[1]] = True
+    return first
+
+
+def _spread(candidates: Candidates, group: np.ndarray, wanted: int) -> list[int]:
+    """Up to ``wanted`` views of ``group``, farthest-point sampling from the first."""
+    if wanted <= 0 or not len(group):
+        return []
+    features = camera_features(candidates)[group]
+    nearest = np.full(len(group), np.inf)
+    taken: list[int] = [0]
+    while len(taken) < min(wanted, len(group)):
+        nearest = np.minimum(nearest, np.linalg.norm(features - features[taken[-1]], axis=1))
+        nearest[taken] = -1.0
+        taken.append(int(nearest.argmax()))
+    return [int(group[i]) for i in taken]

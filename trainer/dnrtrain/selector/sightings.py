@@ -1,0 +1,163 @@
+"""What each candidate sees of the surface, from its G-buffer: sparse, made view by view.
+
+The surface is the scene's atlas, cut into a grid of cells. A view's *sighting* of a cell is how many of its pixels
+fall there and from which mean direction they look. A cell covers a fixed piece of surface, so pixels per cell are
+the resolution at which the view samples it: near, facing, unoccluded views have many.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..contract import RASTER_CHANNELS, ContractError, View, require_channels
+
+GRID = 64
+"""Cells per side of the atlas."""
+LOOK_SIDE = 256
+"""Of larger images every k-th pixel is looked at, so that about this many a side remain (256 to 511)."""
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+CHANNELS = ("uv.U", "uv.V", "mask")
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """Sightings of N views, those of view i at ``start[i]:start[i + 1]``; cells ascend within a view.
+
+    grid      cells per side of the atlas; cell = row · grid + column, column by U and row by V
+    start     int64 [N + 1]
+    cells     int32 [E]
+    pixels    float32 [E] pixels that fall on the cell, as a share of the view's pixels
+    toward    float32 [E, 3] unit world-space direction from the surface to the camera, mean over those pixels
+    seen      float32 [N] share of the view's pixels that hit a surface
+    detail    float32 [N] mean absolute difference of neighbouring pixels' display luminance in the raster image,
+              over the surface; 0 where the view has no raster colour
+    pictures  uint64 [N] hash of what is seen in which pixel: equal for duplicates
+    """
+
+    grid: int
+    start: np.ndarray
+    cells: np.ndarray
+    pixels: np.ndarray
+    toward: np.ndarray
+    seen: np.ndarray
+    detail: np.ndarray
+    pictures: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.seen)
+
+    def of(self, view: int) -> slice:
+        """Where the view's sightings lie."""
+        return slice(int(self.start[view]), int(self.start[view + 1]))
+
+    def take(self, order: np.ndarray) -> Sightings:
+        """The views at ``order``, in that order."""
+        counts = np.diff(self.start)[order]
+        start = np.concatenate([[0], np.cumsum(counts)])
+        where = np.arange(start[-1]) + np.repeat(self.start[:-1][order] - start[:-1], counts)
+        return Sightings(
+            self.grid,
+            start,
+            self.cells[where],
+            self.pixels[where],
+            self.toward[where],
+            self.seen[order],
+            self.detail[order],
+            self.pictures[order],
+        )
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """One view's part of :class:`Sightings`."""
+
+    cells: np.ndarray
+    pixels: np.ndarray
+    toward: np.ndarray
+    seen: float
+    detail: float
+    picture: int
+
+
+def read_sightings(
+    files: Sequence[Path], views: Sequence[View], *, grid: int = GRID, tick: Callable[[], None] | None = None
+) -> Sightings:
+    """Look at the pass files of ``views``, one file in memory at a time. ``tick`` is called after each.
+
+    Raises ContractError: counts differ, or a file is missing, damaged, of another size, or lacks channels.
+    """
+    from ..exr import read_exr
+
+    def look() -> Iterable[Sighting]:
+        for file, view in zip(files, views, strict=True):
+            channels, _ = read_exr(file)
+            require_channels(file, channels, CHANNELS)
+            if channels["mask"].shape != (view.height, view.width):
+                height, width = channels["mask"].shape
+                raise ContractError(
+                    f"{file}: is {width}x{height}, its camera {view.width}x{view.height}; delete it and run the stage"
+                    " again"
+                )
+            yield look_at(channels, view, grid)
+            if tick is not None:
+                tick()
+
+    if len(files) != len(views):
+        raise ContractError(f"{len(views)} cameras, {len(files)} pass files: must agree")
+    return collect(look(), grid)
+
+
+def collect(looks: Iterable[Sighting], grid: int = GRID) -> Sightings:
+    """Sightings of views one after the other as one table."""
+    every = list(looks)
+    counts = [len(one.cells) for one in every]
+    return Sightings(
+        grid,
+        np.concatenate([[0], np.cumsum(counts, dtype=np.int64)]).astype(np.int64),
+        np.concatenate([np.zeros(0, np.int32), *(one.cells for one in every)]),
+        np.concatenate([np.zeros(0, np.float32), *(one.pixels for one in every)]),
+        np.concatenate([np.zeros((0, 3), np.float32), *(one.toward for one in every)]),
+        np.array([one.seen for one in every], np.float32),
+        np.array([one.detail for one in every], np.float32),
+        np.array([one.picture for one in every], np.uint64),
+    )
+
+
+def look_at(channels: dict[str, np.ndarray], view: View, grid: int = GRID) -> Sighting:
+    """One view's sightings. channels: those of its pass file, [H, W] each."""
+    height, width = channels["mask"].shape
+    step = max(1, min(height, width) // LOOK_SIDE)
+    part = (slice(step // 2, None, step), slice(step // 2, None, step))
+    mask = channels["mask"][part] > 0.5
+    u, v = (channels[name][part][mask] for name in ("uv.U", "uv.V"))
+    column, row = (np.clip((value * grid).astype(np.int32), 0, grid - 1) for value in (u, v))
+    cells, place = np.unique(row * grid + column, return_inverse=True)
+    toward = -view.ray_directions()[part][mask]
+    sums = np.stack([np.bincount(place, toward[:, k], len(cells)) for k in range(3)], axis=1)
+    length = np.linalg.norm(sums, axis=1, keepdims=True)
+    digest = hashlib.blake2b(np.packbits(mask).tobytes(), digest_size=8)
+    digest.update(np.stack([u, v]).tobytes())
+    return Sighting(
+        cells.astype(np.int32),
+        (np.bincount(place, minlength=len(cells)) / mask.size).astype(np.float32),
+        (sums / np.maximum(length, 1e-12)).astype(np.float32),
+        float(mask.mean()),
+        _detail(channels, part, mask),
+        int.from_bytes(digest.digest(), "little"),
+    )
+
+
+def _detail(channels: dict[str, np.ndarray], part: tuple[slice, slice], mask: np.ndarray) -> float:
+    if not set(RASTER_CHANNELS) <= set(channels) or not mask.any():
+        return 0.0
+    linear = sum(weight * channels[name][part] for name, weight in zip("RGB", LUMINANCE, strict=True))
+    shown = np.clip(linear, 0.0, 1.0) ** (1 / 2.2)
+    across = np.abs(np.diff(shown, axis=1))[mask[:, 1:] & mask[:, :-1]]
+    down = np.abs(np.diff(shown, axis=0))[mask[1:] & mask[:-1]]
+    pairs = across.size + down.size
+    return float((across.sum() + down.sum()) / pairs) if pairs else 0.0
