@@ -172,6 +172,9 @@ def test_tracing_all_uses_the_last_computed_record_of_each_view() -> None:
     assert (found.views, found.candidates, found.seconds_per_view) == (2, 10, 3.0)
     assert (found.actual_seconds, found.all_seconds, found.saved_seconds) == (6.0, 30.0, 24.0)
     assert (found.selection_seconds, found.net_saved_seconds) == (20.0, 4.0)
+    untrained = [*records, record(stage="select", unit="scene", name="selection", seconds=0.5)]
+    found = tracing_all_would_cost(untrained, 10)  # chosen anew, by a policy without training
+    assert found is not None and found.selection_seconds == 0.5
     one = tracing_all_would_cost(records, 10, only={"train/2"})  # train/1 is no longer selected
     assert one is not None and (one.views, one.actual_seconds, one.all_seconds) == (1, 4.0, 40.0)
 

@@ -209,6 +209,14 @@ def latest_epochs(records: Sequence[CostRecord], stage: str) -> list[CostRecord]
     return list({r.name: r for r in records if r.stage == stage and r.unit == "epoch"}.values())
 
 
+def selection_cost(records: Sequence[CostRecord]) -> CostSum:
+    """What the present selection cost: step 1's epochs, or the last choice that needed no training."""
+    chosen = [r for r in records if r.stage == "select" and not r.cache_hit]
+    if chosen and chosen[-1].unit != "epoch":
+        return total(chosen[-1:])
+    return total(latest_epochs(records, "select"))
+
+
 def upfront_seconds(records: Sequence[CostRecord], only: Collection[str] | None = None) -> float:
     """Wall seconds until the renderer exists: all training work once, at its latest cost.
 
@@ -262,7 +270,7 @@ def tracing_all_would_cost(
     actual = math.fsum(r.wall_seconds for r in views)
     mean = actual / len(views)
     everything = mean * max(n_candidates, len(views))
-    selection = total(latest_epochs(records, "select")).wall_seconds
+    selection = selection_cost(records).wall_seconds
     return TracingComparison(
         views=len(views),
         candidates=max(n_candidates, len(views)),
