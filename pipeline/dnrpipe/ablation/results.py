@@ -72,14 +72,20 @@ def gather(cells: Mapping[tuple[str, str, int], Path], rows: Sequence[Row], fact
 
 def read_results(path: Path) -> dict[str, Any]:
     """Results that :func:`gather` made. Raises UserError: missing, damaged or of another schema."""
+    return read_made(path, "ablate", SCHEMA, "cells")
+
+
+def read_made(path: Path, command: str, schema: int, part: str) -> dict[str, Any]:
+    """A results file of ``dnrpipe command``, known by its schema and by having ``part``. Raises UserError: is it not,
+    or missing or damaged."""
     try:
         results = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise UserError(f"{path}: no such file; make it with `dnrpipe ablate`") from None
+        raise UserError(f"{path}: no such file; make it with `dnrpipe {command}`") from None
     except (json.JSONDecodeError, UnicodeDecodeError):
-        raise UserError(f"{path}: damaged; run `dnrpipe ablate` again") from None
-    if not isinstance(results, dict) or results.get("schema") != SCHEMA:
-        raise UserError(f"{path}: not results of this dnrpipe's ablation; run `dnrpipe ablate` again")
+        raise UserError(f"{path}: damaged; run `dnrpipe {command}` again") from None
+    if not isinstance(results, dict) or results.get("schema") != schema or part not in results:
+        raise UserError(f"{path}: not results of this version's `dnrpipe {command}`; run it again")
     return results
 
 

@@ -11,8 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ..ablation.results import METRICS, code_state, machine, mean_of, versions
-from ..errors import UserError
+from ..ablation.results import METRICS, code_state, machine, mean_of, read_made, versions
 from .run import Bench, Place, read_choice
 
 SCHEMA = 1
@@ -72,12 +71,4 @@ def _line(
 
 def read_results(path: Path) -> dict[str, Any]:
     """Results that :func:`gather` made. Raises UserError: missing, damaged or of another schema."""
-    try:
-        results = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file; make it with `dnrpipe bench-select`") from None
-    except (json.JSONDecodeError, UnicodeDecodeError):
-        raise UserError(f"{path}: damaged; run `dnrpipe bench-select` again") from None
-    if not isinstance(results, dict) or results.get("schema") != SCHEMA or "pools" not in results:
-        raise UserError(f"{path}: not results of this dnrpipe's bench-select; run it again")
-    return results
+    return read_made(path, "bench-select", SCHEMA, "pools")
