@@ -13,6 +13,7 @@ from ..console import Console
 from ..errors import UserError
 from ..settings import merge, parse_assignment, resolve
 from ..workspace import locked
+from .crew import check_amounts
 from .measure import pictured
 from .plot import contact_sheet, plot
 from .results import gather
@@ -59,10 +60,7 @@ def run_ablation(
     for text in assignments:
         overrides = merge(overrides, parse_assignment(text))
     base = resolve(preset, overrides, environment={})
-    if seconds is not None and not seconds > 0:
-        raise UserError(f"--seconds {seconds:g}: must be more than 0")
-    if seeds < 1 or jobs < 0:
-        raise UserError(f"--seeds {seeds} --jobs {jobs}: at least 1 seed; jobs from 0 (one per core)")
+    check_amounts(seconds, seeds, jobs)
     request = Request(
         scenes=find_scenes(scenes or (SMOKE_SCENE if smoke else None)),
         rows=choose_rows(rows or (SMOKE_ROWS if smoke else "core")),

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..console import Console
+from ..errors import UserError
 from ..executors import Retry, run_tasks
 from ..settings import Settings
 from ..tasks import TasksFailed, worker_count
@@ -54,6 +55,14 @@ class Crew:
                 f"{label}: {len(failed)} of {len(due)} failed ({', '.join(failed[:5])}); the others are done."
                 f" See {self.log}; run the same command to try again"
             )
+
+
+def check_amounts(seconds: float | None, seeds: int, jobs: int) -> None:
+    """Raises UserError: an amount of work that is none."""
+    if seconds is not None and not seconds > 0:
+        raise UserError(f"--seconds {seconds:g}: must be more than 0")
+    if seeds < 1 or jobs < 0:
+        raise UserError(f"--seeds {seeds} --jobs {jobs}: at least 1 seed; jobs from 0 (one per core)")
 
 
 def make_crew(settings: Settings, jobs: int, log: Path, console: Console, *, single: bool = False) -> Crew:

@@ -59,11 +59,7 @@ def gather(cells: Mapping[tuple[str, str, int], Path], rows: Sequence[Row], fact
         )
     return {
         "schema": SCHEMA,
-        "command": shlex.join(["dnrpipe", *sys.argv[1:]]),
-        **code_state(),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "machine": machine(),
-        "versions": versions(),
+        **made_by(),
         **facts,
         "rows": {row.name: row.what for row in rows},
         "cells": found,
@@ -87,6 +83,17 @@ def read_made(path: Path, command: str, schema: int, part: str) -> dict[str, Any
     if not isinstance(results, dict) or results.get("schema") != schema or part not in results:
         raise UserError(f"{path}: not results of this version's `dnrpipe {command}`; run it again")
     return results
+
+
+def made_by() -> dict[str, Any]:
+    """What results say of their making: command, commit, date, machine, versions."""
+    return {
+        "command": shlex.join(["dnrpipe", *sys.argv[1:]]),
+        **code_state(),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "machine": machine(),
+        "versions": versions(),
+    }
 
 
 @functools.cache

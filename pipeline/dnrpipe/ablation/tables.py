@@ -119,16 +119,22 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def _provenance(results: Mapping[str, Any], figures: Figures) -> str:
+def code_of(results: Mapping[str, Any]) -> str:
+    """The commit that made the results, and those of its cells where they differ."""
     commits = sorted({cell["commit"] for cell in results["cells"] if cell["commit"]})
     state = f"commit {(results['commit'] or 'unknown')[:12]}{' with changes' if results['dirty'] else ''}"
     if len(commits) > 1:
         state += f" (cells of {len(commits)} commits: {', '.join(commit[:12] for commit in commits)})"
+    return state
+
+
+def _provenance(results: Mapping[str, Any], figures: Figures) -> str:
     box = results["machine"]
     time = f"about {results['seconds']:g} s of training for every row" if results["seconds"] else "the preset's epochs"
     return (
-        f"`{results['command']}`, {results['date'][:10]}, {state}; {box['processor']}, {box['cores']} cores, torch"
-        f" {results['versions']['torch']}. Preset {results['preset']}, {results['resolution']}, {results['budget']}"
+        f"`{results['command']}`, {results['date'][:10]}, {code_of(results)}; {box['processor']},"
+        f" {box['cores']} cores, torch {results['versions']['torch']}. Preset"
+        f" {results['preset']}, {results['resolution']}, {results['budget']}"
         f" training views, {len(figures.seeds)} seed(s), {time}. PSNR and SSIM over white; ± is the standard deviation"
         " over seeds; training time includes step 1 where a row has it."
     )

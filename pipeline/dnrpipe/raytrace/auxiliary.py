@@ -13,6 +13,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from .frames_rays import lets_through
+from .lobes import bsdfs_of
 from .visibility import first_visible_of
 
 MAX_BOUNCES = 6
@@ -27,9 +29,8 @@ def shown_first(mi: Any, scene: Any) -> Any:
     import drjit as dr
 
     visible = first_visible_of(mi, scene)
-    bsdfs = [shape.bsdf() for shape in scene.shapes() if shape.bsdf() is not None]
-    mirrors = any(not mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) for bsdf in bsdfs)
-    holes = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs)
+    mirrors = any(not mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) for bsdf in bsdfs_of(scene))
+    holes = lets_through(mi, scene)
 
     def reflectance(hit: Any, active: Any) -> tuple[Any, Any]:
         """(albedo, normal) where a path ends."""

@@ -20,7 +20,9 @@ from typing import Any
 
 import numpy as np
 
+from .frames_rays import lets_through
 from .lobes import (
+    bsdfs_of,
     diffuse_context,
     ignores_context,
     is_among,
@@ -70,10 +72,10 @@ class BaseRenderer:
         self.apart = [shape for shape in shapes if shape.id().startswith((LAMP_PREFIX, UNSEEN_PREFIX))]
         self.lit = bool(scene.emitters())
         self.media = any(shape.is_medium_transition() for shape in shapes)
-        bsdfs = list({id(b): b for b in [shape.bsdf() for shape in shapes] if b is not None}.values())
+        bsdfs = bsdfs_of(scene)
         self.whole = [b for b in bsdfs if ignores_context(b)]
         self.cut = any(mi.has_flag(b.flags(), mi.BSDFFlags.Null) for b in self.whole)
-        self.holes = any(mi.has_flag(b.flags(), mi.BSDFFlags.Null) for b in bsdfs)
+        self.holes = lets_through(mi, scene)
         self.translucent = bool(self.whole) or any(
             mi.has_flag(b.flags(), mi.BSDFFlags.DiffuseTransmission) for b in bsdfs
         )

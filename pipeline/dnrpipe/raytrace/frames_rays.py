@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from .lobes import bsdfs_of
 from .visibility import first_visible_of
 
 
@@ -23,8 +24,7 @@ def pinhole(mi: Any, camera: list[Any], pixel: Any, offset: Any, width: int) -> 
 
 def lets_through(mi: Any, scene: Any) -> bool:
     """Whether a surface of the scene passes light straight on."""
-    bsdfs = [shape.bsdf() for shape in scene.shapes() if shape.bsdf() is not None]
-    return any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs)
+    return any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs_of(scene))
 
 
 def seen_first(mi: Any, scene: Any) -> Any:

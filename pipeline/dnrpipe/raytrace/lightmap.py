@@ -25,7 +25,7 @@ import numpy as np
 
 from .denoise import denoise, filled
 from .frames_rays import lets_through
-from .lobes import diffuse_context, ignores_context, is_among, is_rough, other_context, reflectance
+from .lobes import bsdfs_of, diffuse_context, ignores_context, is_among, is_rough, other_context, reflectance
 from .texels import AtlasSurface
 
 MAX_SAMPLES = 4_000_000
@@ -49,7 +49,7 @@ class LightBaker:
         self.surface = AtlasSurface(mi, scene, groups)
         self.lift = float(LIFT * scene.bbox().bounding_sphere().radius)
         self.passing = lets_through(mi, scene)
-        bsdfs = list({id(b): b for b in [shape.bsdf() for shape in scene.shapes()] if b is not None}.values())
+        bsdfs = bsdfs_of(scene)
         self.whole = [b for b in bsdfs if ignores_context(b)]
         self.glossy = any(mi.has_flag(b.flags(), mi.BSDFFlags.Glossy) for b in bsdfs)
         inner = [shape.interior_medium() for shape in scene.shapes() if shape.is_medium_transition()]
@@ -179,9 +179,7 @@ class LightBaker:
         onwards = si.spawn_ray(si.to_world(bounce.wo))
         light = mi.Spectrum(0.0)
         if self.integrator is not None:
-            behind = self.scene.ray_intersect_preliminary(onwards, found)
-            going = found & ~(behind.is_valid() & behind.shape.is_emitter())
-            light = dr.select(going, self._arriving(sampler, onwards, going), 0)
+            light = self._arriving(sampler, onwards, found)
         found &= dr.all(dr.isfinite(light))
         return [*dr.select(found, weight * light, 0), *dr.select(found, weight, 0)]
 
@@ -211,18 +209,16 @@ class LightBaker:
         """One sample of what comes by way of other surfaces."""
         import drjit as dr
 
-        mi, scene = self.mi, self.scene
+        mi = self.mi
         # Not bsdf.sample: Mitsuba's mask gives nothing when it is asked for the diffuse lobes alone.
         wo = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
-        across = (sampler.next_1d() < 0.5) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseTransmission)
-        density = wo.z * dr.inv_pi * dr.select(mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseTransmission), 0.5, 1)
+        transmits = mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseTransmission)
+        across = (sampler.next_1d() < 0.5) & transmits
+        density = wo.z * dr.inv_pi * dr.select(transmits, 0.5, 1)
         wo.z = dr.select((si.wi.z < 0) ^ across, -wo.z, wo.z)
         weight = bsdf.eval(context, si, wo, active) / density
         going = active & (density > 0) & (dr.max(weight) > 0)
         onwards = si.spawn_ray(si.to_world(wo))
-        # What glows is counted by the emitter sample; the integrator would look through it instead of stopping there.
-        behind = scene.ray_intersect_preliminary(onwards, going)
-        going &= ~(behind.is_valid() & behind.shape.is_emitter())
         return dr.select(going, weight * self._arriving(sampler, onwards, going), 0)
 
     def _arriving(self, sampler: Any, ray: Any, active: Any) -> Any:
@@ -230,6 +226,9 @@ class LightBaker:
         import drjit as dr
 
         mi, light = self.mi, self.mi.Spectrum(0.0)
+        # What glows is counted where emitters are; the integrator would look through it instead of stopping there.
+        behind = self.scene.ray_intersect_preliminary(ray, active)
+        active &= ~(behind.is_valid() & behind.shape.is_emitter())
         for medium, starts in self._around(ray, active):
             found, _, _ = self.integrator.sample(self.scene, sampler, mi.RayDifferential3f(ray), medium, starts)
             light = dr.select(starts, found, light)

@@ -13,6 +13,11 @@ WIDE = 1.0
 """Density, 1/sr, below which a lobe is wide."""
 
 
+def bsdfs_of(scene: Any) -> list[Any]:
+    """The scene's BSDFs, each once."""
+    return list({id(b): b for b in [shape.bsdf() for shape in scene.shapes()] if b is not None}.values())
+
+
 def ignores_context(bsdf: Any) -> bool:
     """Whether the BSDF, or one nested in it, evaluates all its lobes whatever it is asked for."""
     return IGNORE_CONTEXT in str(bsdf)

@@ -8,7 +8,7 @@ from typing import Any
 
 from dnrtrain.atomic import write_json, write_text
 
-from ..ablation.crew import make_crew
+from ..ablation.crew import check_amounts, make_crew
 from ..ablation.scenes import find_scenes
 from ..console import Console
 from ..errors import UserError
@@ -69,10 +69,7 @@ def run_bench(
     defaults = SMOKE_REQUEST if smoke else CORE
     wanted = choose_budgets(budgets or defaults["budgets"], count)
     base = resolve(preset, merge(overrides, {"select": {"budget": max(wanted)}}), environment={})
-    if seconds is not None and not seconds > 0:
-        raise UserError(f"--seconds {seconds:g}: must be more than 0")
-    if seeds < 1 or jobs < 0:
-        raise UserError(f"--seeds {seeds} --jobs {jobs}: at least 1 seed; jobs from 0 (one per core)")
+    check_amounts(seconds, seeds, jobs)
     if base.cameras.source != "auto":
         raise UserError(f"cameras.source={base.cameras.source}: the pools decide where cameras stand; use --pools")
     request = Request(

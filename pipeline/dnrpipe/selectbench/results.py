@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import json
-import shlex
-import sys
 from collections.abc import Mapping
 from dataclasses import asdict
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ..ablation.results import METRICS, code_state, machine, mean_of, read_made, versions
+from ..ablation.results import METRICS, made_by, mean_of, read_made
 from .run import Bench, Place, read_choice
 
 SCHEMA = 1
@@ -30,11 +27,7 @@ def gather(bench: Bench, facts: Mapping[str, Any]) -> dict[str, Any]:
             )
     return {
         "schema": SCHEMA,
-        "command": shlex.join(["dnrpipe", *sys.argv[1:]]),
-        **code_state(),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "machine": machine(),
-        "versions": versions(),
+        **made_by(),
         **facts,
         "policies": {contender.name: contender.what for contender in bench.request.policies},
         "cells": cells,

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..ablation.tables import NONE, spread, table
+from ..ablation.tables import NONE, code_of, spread, table
 from .figures import SPHERICAL, Figures
 from .intervals import LEVEL, Difference
 from .pools import POOLS
@@ -34,15 +34,12 @@ def markdown(results: Mapping[str, Any], *, pictures: bool = True) -> str:
 
 
 def _provenance(results: Mapping[str, Any], figures: Figures) -> str:
-    commits = sorted({cell["commit"] for cell in results["cells"] if cell["commit"]})
-    state = f"commit {(results['commit'] or 'unknown')[:12]}{' with changes' if results['dirty'] else ''}"
-    if len(commits) > 1:
-        state += f" (cells of {len(commits)} commits: {', '.join(commit[:12] for commit in commits)})"
     box = results["machine"]
     time = f"about {results['seconds']:g} s of training for every cell" if results["seconds"] else "the preset's epochs"
     return (
-        f"`{results['command']}`, {results['date'][:10]}, {state}; {box['processor']}, {box['cores']} cores, torch"
-        f" {results['versions']['torch']}. Preset {results['preset']}, {results['resolution']}, {results['candidates']}"
+        f"`{results['command']}`, {results['date'][:10]}, {code_of(results)}; {box['processor']},"
+        f" {box['cores']} cores, torch {results['versions']['torch']}. Preset"
+        f" {results['preset']}, {results['resolution']}, {results['candidates']}"
         f" candidates a pool, {len(figures.scenes)} scene(s) ({', '.join(figures.scenes)}), {len(figures.seeds)}"
         f" seed(s), {time}, {len(results['cells'])} cells."
     )

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from .geometry import camera_features
+from .geometry import camera_features, farthest_first
 from .protocol import Candidates, Choice, Tick, check_budget
 
 
@@ -35,15 +35,9 @@ class FarthestPolicy:
     def choose(self, candidates: Candidates, budget: int, seed: int, tick: Tick | None = None) -> Choice:
         count = len(candidates)
         check_budget(budget, count)
-        features = camera_features(candidates)
-        chosen = [int(np.random.default_rng([seed, 0x46]).integers(count))]
-        gains, why = [0.0], ["drawn at random, as the first"]
-        nearest = np.full(count, np.inf)
-        while len(chosen) < budget:
-            nearest = np.minimum(nearest, np.linalg.norm(features - features[chosen[-1]], axis=1))
-            nearest[chosen] = -1.0  # never again, even where cameras coincide
-            chosen.append(int(np.argmax(nearest)))
-            gains.append(float(nearest[chosen[-1]]))
-            why.append(f"farthest from all views before it: {gains[-1]:.2f}")
+        first = int(np.random.default_rng([seed, 0x46]).integers(count))
+        chosen, gains = farthest_first(camera_features(candidates), first, budget)
+        why = [f"farthest from all views before it: {gain:.2f}" for gain in gains]
+        why[0] = "drawn at random, as the first"
         measure = "distance to the nearest view chosen before, position (in mean radii) and direction together"
         return Choice(chosen, gains, why, {"measure": measure})

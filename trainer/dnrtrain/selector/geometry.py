@@ -19,6 +19,22 @@ def camera_features(candidates: Candidates) -> np.ndarray:
     return np.concatenate([positions / max(spread, 1e-12), candidates.directions], axis=1)
 
 
+def farthest_first(features: np.ndarray, first: int, count: int) -> tuple[list[int], list[float]]:
+    """Farthest-point sampling (Gonzalez 1985) of ``count`` of the points [N, K], 1 <= count <= N.
+
+    -> their indices, beginning with ``first``, and the distance of each to the nearest before it (0 for the first).
+    The lowest index wins ties.
+    """
+    chosen, away = [first], [0.0]
+    nearest = np.full(len(features), np.inf)
+    while len(chosen) < count:
+        nearest = np.minimum(nearest, np.linalg.norm(features - features[chosen[-1]], axis=1))
+        nearest[chosen] = -1.0  # never again, even where points coincide
+        chosen.append(int(nearest.argmax()))
+        away.append(float(nearest[chosen[-1]]))
+    return chosen, away
+
+
 def distances(features: np.ndarray, some: np.ndarray) -> np.ndarray:
     """Euclidean distances from the points at ``some`` [B] to all of ``features`` [N, K]: float32 [B, N].
 

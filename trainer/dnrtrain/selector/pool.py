@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .geometry import camera_features
+from .geometry import camera_features, farthest_first
 from .protocol import Candidates, Choice, check_budget
 
 
@@ -61,11 +61,5 @@ def _spread(candidates: Candidates, group: np.ndarray, wanted: int) -> list[int]
     """Up to ``wanted`` views of ``group``, farthest-point sampling from the first."""
     if wanted <= 0 or not len(group):
         return []
-    features = camera_features(candidates)[group]
-    nearest = np.full(len(group), np.inf)
-    taken: list[int] = [0]
-    while len(taken) < min(wanted, len(group)):
-        nearest = np.minimum(nearest, np.linalg.norm(features - features[taken[-1]], axis=1))
-        nearest[taken] = -1.0
-        taken.append(int(nearest.argmax()))
+    taken, _ = farthest_first(camera_features(candidates)[group], 0, min(wanted, len(group)))
     return [int(group[i]) for i in taken]
