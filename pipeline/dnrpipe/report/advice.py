@@ -68,10 +68,12 @@ def notes(
         )
     tracing = summary.get("tracing_all")
     if tracing and tracing["net_saved_seconds"] < 0:
+        trained = selection is None or selection.trained
         found.append(
-            f"Step 1 took {duration(tracing['selection_seconds'])}, more than the "
+            f"{'Step 1' if trained else 'Choosing'} took {duration(tracing['selection_seconds'])}, more than the "
             f"{duration(tracing['saved_seconds'])} of ray tracing that it saved: at this resolution and sample "
-            "count, tracing every candidate costs less than choosing. (Step 1 also pre-trains the renderer.)"
+            "count, tracing every candidate costs less than choosing."
+            + (" (Step 1 also pre-trains the renderer.)" if trained else "")
         )
     if quality and upfront and quality.traced_seconds and quality.frame_seconds and break_even is None:
         found.append("A neural frame is not cheaper than a ray-traced one here, so the renderer never pays for itself.")

@@ -17,6 +17,7 @@ from dnrtrain.contract import ContractError, SceneFrame, View, read_cameras
 from .. import costs
 from ..errors import UserError
 from .advice import missing, notes
+from .coverage import coverage_maps
 from .data import (
     ChosenView,
     FindingGroup,
@@ -54,6 +55,8 @@ class _Selection(BaseModel):
     budget: int
     seed: int | None = None
     views: list[str]
+    why: list[str] = Field(default_factory=list)
+    details: dict[str, Any] = Field(default_factory=dict)
 
 
 class _Epoch(BaseModel):
@@ -95,7 +98,7 @@ def collect(root: Path, *, made_at: datetime | None = None) -> ReportData:
     selected = {f"train/{name}" for name in chosen.views} if chosen else None
     summary = costs.summarise(records, n_candidates=len(cameras["train"]) or None, only=selected, torn_lines=torn)
     quality = build_quality(root, metrics, records) if metrics else None
-    selection = _selection(root, chosen, records, len(cameras["train"])) if chosen else None
+    selection = _selection(root, chosen, records, cameras["train"]) if chosen else None
     training = [t for t in (_training(root, step) for step in (1, 2)) if t]
     upfront = costs.upfront_seconds(records, selected) if records else None
     break_even = None
@@ -165,7 +168,9 @@ def _read_views(root: Path, split: str) -> list[View]:
         raise UserError(str(error)) from None
 
 
-def _selection(root: Path, chosen: _Selection, records: Sequence[costs.CostRecord], candidates: int) -> Selection:
+def _selection(
+    root: Path, chosen: _Selection, records: Sequence[costs.CostRecord], candidates: Sequence[View]
+) -> Selection:
     frame = _read_model(root / "scene" / "frame.json", SceneFrame, "prepare")
     try:
         exr = ExrPictures(root, frame) if frame else None
@@ -184,6 +189,7 @@ def _selection(root: Path, chosen: _Selection, records: Sequence[costs.CostRecor
                 noise=record.noise if record else None,
                 raster=exr.load(f"passes/train/{name}.exr") if exr else None,
                 traced=exr.load(f"raytraced/train/{name}.exr") if exr else None,
+                why=chosen.why[order - 1] if order <= len(chosen.why) else None,
             )
         )
     return Selection(
@@ -192,7 +198,10 @@ def _selection(root: Path, chosen: _Selection, records: Sequence[costs.CostRecor
         budget=chosen.budget,
         views=views,
         traced=sum((root / "raytraced" / "train" / f"{name}.exr").is_file() for name in chosen.views),
-        candidates=candidates,
+        candidates=len(candidates),
+        trained=(root / "checkpoints" / "step1" / "model.json").is_file(),
+        measure=str(chosen.details["measure"]) if "measure" in chosen.details else None,
+        coverage=coverage_maps(root, candidates, chosen.views),
     )
 
 

@@ -123,10 +123,32 @@ class ChosenView(_Frozen):
     noise: float | None
     raster: Picture | None
     traced: Picture | None
+    why: str | None
+
+
+class CoverageMaps(_Frozen):
+    """The atlas, V upwards, in cells; transparent where no view looks, red where candidates do and no chosen view.
+
+    seen: how many chosen views see a cell, yellow at ``most``. angle: mean angle between the directions from which
+    the views and the nearest chosen view see it, the scale ends at ``farthest`` degrees. uncovered: share of the views'
+    pixels whose surface no chosen view sees. views_read: of how many ``candidates`` that is.
+    """
+
+    seen: Picture
+    angle: Picture
+    most: int
+    farthest: float
+    uncovered: float
+    mean_angle: float | None
+    views_read: int
+    candidates: int
 
 
 class Selection(_Frozen):
-    """``selection.json`` and how far its tracing has come."""
+    """``selection.json`` and how far its tracing has come.
+
+    trained: whether step 1 was trained on the way. measure: what a policy's gains are counted in.
+    """
 
     policy: str
     seed: int | None
@@ -134,6 +156,9 @@ class Selection(_Frozen):
     views: list[ChosenView]
     traced: int
     candidates: int
+    trained: bool
+    measure: str | None
+    coverage: CoverageMaps | None
 
 
 class Training(_Frozen):

@@ -149,7 +149,7 @@ def _tracing_chart(data: ReportData) -> Markup:
         charts.Segment(
             "bar-choosing",
             tracing["selection_seconds"],
-            f"choosing (step 1): {words.duration(tracing['selection_seconds'])}",
+            f"choosing: {words.duration(tracing['selection_seconds'])}",
         ),
     ]
     everything = charts.Segment(

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from .sightings import Sightings
+
+NOT_SEEN = -2.0
+"""In place of a cosine."""
 
 
 @dataclass(frozen=True)
@@ -24,11 +27,25 @@ class Coverage:
 
 def coverage_of(sightings: Sightings, views: Sequence[int]) -> Coverage:
     """Follow a selection view by view. Everything counts as covered where no candidate sees anything."""
-    cells, toward = sightings.cells, sightings.toward
     weights = sightings.pixels.astype(np.float64)
     total = weights.sum()
-    nearest = np.full(len(cells), -2.0, np.float32)  # cosine to the nearest chosen sighting; −2: not seen
     uncovered, angles = [], []
+    for nearest in nearest_cosines(sightings, views):
+        covered = nearest > NOT_SEEN
+        share = weights[covered]
+        angle = np.degrees(np.arccos(np.clip(nearest[covered], -1.0, 1.0)))
+        uncovered.append(float(1.0 - share.sum() / total) if total else 0.0)
+        angles.append(float(angle @ share / share.sum()) if share.sum() else 0.0)
+    return Coverage([max(0.0, value) for value in uncovered], angles)
+
+
+def nearest_cosines(sightings: Sightings, views: Sequence[int]) -> Iterator[np.ndarray]:
+    """After each view: per sighting the cosine to the nearest chosen sighting of its cell, float32 [E].
+
+    NOT_SEEN where no chosen view sees the cell. The array is the same one each time, changed.
+    """
+    cells, toward = sightings.cells, sightings.toward
+    nearest = np.full(len(cells), NOT_SEEN, np.float32)
     for view in views:
         part = sightings.of(view)
         known = np.zeros(sightings.grid**2, bool)
@@ -36,13 +53,8 @@ def coverage_of(sightings: Sightings, views: Sequence[int]) -> Coverage:
         known[cells[part]] = True
         direction[cells[part]] = toward[part]
         cosine = np.einsum("ek,ek->e", direction[cells], toward)
-        np.maximum(nearest, np.where(known[cells], cosine, -2.0), out=nearest)
-        covered = nearest > -2.0
-        share = weights[covered]
-        angle = np.degrees(np.arccos(np.clip(nearest[covered], -1.0, 1.0)))
-        uncovered.append(float(1.0 - share.sum() / total) if total else 0.0)
-        angles.append(float(angle @ share / share.sum()) if share.sum() else 0.0)
-    return Coverage([max(0.0, value) for value in uncovered], angles)
+        np.maximum(nearest, np.where(known[cells], cosine, NOT_SEEN), out=nearest)
+        yield nearest
 
 
 def sentences(coverage: Coverage) -> list[str]:

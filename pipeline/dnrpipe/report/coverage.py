@@ -1,0 +1,92 @@
+"""Maps on the atlas: which surface the chosen views see, and from how far off the others look at it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from dnrtrain.contract import ContractError, View
+from dnrtrain.selector.explain import NOT_SEEN, nearest_cosines
+from dnrtrain.selector.sightings import Sightings, read_sightings
+
+from .data import CoverageMaps, Picture
+from .pictures import encode
+
+LOOKED_AT = 100
+"""Candidates that are read at most, beside the chosen ones, evenly over their list."""
+SIDE = 256
+FARTHEST = 45.0
+"""Degrees at which the scale of angles ends."""
+UNSEEN = (214, 69, 65)
+"""RGB of surface that candidates see and no chosen view does; not in the colour maps."""
+
+
+def coverage_maps(root: Path, candidates: Sequence[View], chosen: Sequence[str]) -> CoverageMaps | None:
+    """Read G-buffers of the chosen views and of up to LOOKED_AT other candidates -> two maps of the atlas.
+
+    None where passes are missing (the scene was cleared away, or is being prepared again) or nothing is seen.
+    """
+    by_name = {view.name: view for view in candidates}
+    if any(name not in by_name for name in chosen):
+        return None  # cameras were made again after the choice
+    others = [view for view in candidates if view.name not in set(chosen)]
+    step = max(1, -(-len(others) // LOOKED_AT))
+    views = [*(by_name[name] for name in chosen), *others[::step]]
+    try:
+        sightings = read_sightings([root / "passes" / "train" / f"{view.name}.exr" for view in views], views)
+    except ContractError:
+        return None
+    if not len(sightings.cells):
+        return None
+    seen, angle, uncovered = _cells(sightings, len(chosen))
+    there = seen >= 0
+    counted = angle[there & (seen > 0)]
+    return CoverageMaps(
+        seen=_picture(seen / max(1, seen.max()), there, seen == 0, "viridis", "how many chosen views see it"),
+        angle=_picture(1.0 - np.minimum(angle, FARTHEST) / FARTHEST, there, seen == 0, "viridis", "degrees off"),
+        most=int(seen.max()),
+        farthest=FARTHEST,
+        uncovered=uncovered,
+        mean_angle=float(counted.mean()) if len(counted) else None,
+        views_read=len(views),
+        candidates=len(candidates),
+    )
+
+
+def _cells(sightings: Sightings, chosen: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """The first ``chosen`` views are the chosen ones.
+
+    Returns (chosen views that see each cell, −1 where nobody does, [G, G]; mean angle in degrees, by pixels, from the
+    views' direction to the nearest chosen sighting [G, G]; share of all pixels whose cell no chosen view sees).
+    """
+    grid = sightings.grid
+    size = grid * grid
+    number = np.full(size, -1, np.int64)
+    number[sightings.cells] = 0
+    of_chosen = sightings.cells[: sightings.start[chosen]]
+    number += np.bincount(of_chosen, minlength=size)
+    nearest = np.full(len(sightings.cells), NOT_SEEN, np.float32)
+    for nearest in nearest_cosines(sightings, range(chosen)):  # noqa: B007 - the last one counts
+        pass
+    served = nearest > NOT_SEEN
+    pixels = sightings.pixels.astype(np.float64)
+    degrees = np.degrees(np.arccos(np.clip(nearest, -1.0, 1.0)))
+    sums = np.bincount(sightings.cells[served], (degrees * pixels)[served], size)
+    weights = np.bincount(sightings.cells[served], pixels[served], size)
+    angle = sums / np.maximum(weights, 1e-12)
+    return number.reshape(grid, grid), angle.reshape(grid, grid), float(1.0 - pixels[served].sum() / pixels.sum())
+
+
+def _picture(values: np.ndarray, there: np.ndarray, unseen: np.ndarray, colours: str, what: str) -> Picture:
+    """Values [G, G] in [0, 1], V up -> an opaque-where-``there`` picture with V upwards."""
+    from matplotlib import colormaps
+    from PIL import Image
+
+    rgba = np.zeros((*values.shape, 4), np.uint8)
+    rgba[..., :3] = np.rint(colormaps[colours](values)[..., :3] * 255)
+    rgba[unseen, :3] = UNSEEN
+    rgba[there, 3] = 255
+    image = Image.fromarray(rgba[::-1]).resize((SIDE, SIDE), Image.Resampling.NEAREST)
+    return encode(image, f"the atlas: {what}", SIDE)
