@@ -32,7 +32,7 @@ demo: setup  ## the demo scene from .blend to report; prints the report's path
 	@$(BIN)/dnrpipe report -w $(DEMO)/demo.dnr
 
 test: setup browser lint types imports docs-check  ## lint, types, import rules, documentation, all tests
-	$(BIN)/pytest -q
+	$(BIN)/pytest -q -n 2 --dist loadgroup --durations 15
 
 browser:
 	@sh tools/system-libraries.sh $(APT_DEV)

@@ -10,6 +10,16 @@ REPO = Path(__file__).resolve().parents[1]
 SHARED = REPO.parent / "shared" / "assets"
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Side by side go whole files, not single tests, so that what a file's tests share is made once.
+
+    The end-to-end tests share a workspace between files.
+    """
+    for item in items:
+        folder = item.path.parent.name
+        item.add_marker(pytest.mark.xdist_group("e2e" if folder == "e2e" else f"{folder}/{item.path.stem}"))
+
+
 @pytest.fixture(scope="session")
 def demo_blend() -> Path:
     """The committed demo scene."""
