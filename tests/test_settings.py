@@ -102,3 +102,18 @@ def test_merge_leaves_its_arguments_alone_and_the_later_wins(base: dict, extra: 
         if not isinstance(value, dict):
             assert merged[key] == value
     assert merge(merged, extra) == merged
+
+
+def test_paths_per_texel_of_the_baked_light() -> None:
+    from dnrpipe.base import light_size, light_spp
+
+    def of(side: int, **base: object) -> tuple[int, int]:
+        settings = resolve("draft", {"cameras": {"width": side, "height": side}, "base": base}, environment={})
+        return light_size(settings), light_spp(settings)
+
+    assert of(64) == (256, 128)  # never more than at 512
+    assert of(128) == (512, 128)
+    assert of(256) == (1024, 32)
+    assert of(800)[1] == 32
+    assert of(256, light_size=512) == (512, 128)
+    assert of(256, light_spp=7) == (1024, 7)

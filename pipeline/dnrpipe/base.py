@@ -34,6 +34,7 @@ RENDERED = ("baked", "direct", "path")
 AUTOMATIC_TEXELS = 4
 """Light map texels per pixel of an image's side: about one texel a pixel where the atlas shows a part of itself."""
 SIZES = (256, 4096)
+SPP = (32, 128)
 
 
 def base_path(workspace: Workspace, split: str, name: str) -> Path:
@@ -52,6 +53,16 @@ def light_size(settings: Settings) -> int:
         return settings.base.light_size
     wanted = AUTOMATIC_TEXELS * max(settings.cameras.width, settings.cameras.height)
     return int(min(max(2 ** round(np.log2(wanted)), SIZES[0]), SIZES[1]))
+
+
+def light_spp(settings: Settings) -> int:
+    """Paths per texel: the setting, else as many as keep their sum what it is at 512², within SPP.
+
+    A finer map has more texels on the same surface, and the denoiser averages over them.
+    """
+    if settings.base.light_spp != "auto":
+        return settings.base.light_spp
+    return int(min(max(SPP[1] * (512 / light_size(settings)) ** 2, SPP[0]), SPP[1]))
 
 
 def base_views(
@@ -132,7 +143,7 @@ def _prepared(
         task = {
             "output": common["light"],
             "size": light_size(settings),
-            "spp": chosen.light_spp,
+            "spp": light_spp(settings),
             "integrator": config["integrator"],
             "max_depth": config["max_depth"],
             "seed": settings.raytrace.seed,

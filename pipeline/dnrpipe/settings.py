@@ -74,7 +74,9 @@ class BaseSettings(Strict):
     light_size: Annotated[int, Field(ge=16, le=16384)] | Literal["auto"] = Field(
         default="auto", description="texels of the baked light's side; auto: about one a pixel"
     )
-    light_spp: int = Field(default=128, ge=1, le=1_000_000, description="paths per texel of the baked light")
+    light_spp: Annotated[int, Field(ge=1, le=1_000_000)] | Literal["auto"] = Field(
+        default="auto", description="paths per texel of the baked light; auto: 128 up to 512 texels a side, then fewer"
+    )
     samples: int = Field(default=8, ge=1, le=64, description="rays per pixel of a base image")
     denoise: bool = Field(
         default=False, description="take the grain off base images of kind baked; the network does it as well"
