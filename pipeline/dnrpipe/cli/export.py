@@ -1,0 +1,63 @@
+"""Exports for other tools: NeRF data sets, ONNX, glTF, a page for the browser."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ..errors import UserError
+
+if TYPE_CHECKING:
+    from ..console import Console
+    from ..workspace import Workspace
+
+
+def _common(function: Callable[..., Any]) -> Callable[..., Any]:
+    """What all exports take."""
+    for option in reversed(
+        [
+            click.argument("workspace", required=False, metavar="[WORKSPACE]"),
+            click.option("-w", "--workspace", "named", metavar="DIR", help="The same, as other commands take it."),
+            click.option("--json", "as_json", is_flag=True, help="Print one JSON value; messages to stderr."),
+            click.option("-q", "--quiet", is_flag=True, help="Warnings and errors only."),
+        ]
+    ):
+        function = option(function)
+    return function
+
+
+def _opened(workspace: str | None, named: str | None, as_json: bool, quiet: bool) -> tuple[Workspace, Console]:
+    from ..console import Console
+    from ..workspace import Workspace, find_workspace
+
+    if workspace and named and workspace != named:
+        raise UserError(f"two workspaces are named, {workspace} and {named}; name one")
+    return Workspace.open(find_workspace(workspace or named)), Console(json_mode=as_json, quiet=quiet)
+
+
+@click.command("export-nerf")
+@_common
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="New folder (default: SCENE-nerf).")
+@click.option("--normalise", is_flag=True, help="Move and scale the scene into the unit sphere.")
+def export_nerf(out: Path | None, normalise: bool, **options: Any) -> None:
+    """Write ray-traced views and cameras as nerfstudio, gsplat/3DGS and instant-ngp read them.
+
+    The selected views are the training set, the held-out views of `dnrpipe evaluate` the test set: 8-bit PNG with
+    alpha in display space, transforms_{train,val,test}.json, transforms.json and a point cloud to start splats from.
+
+    \b
+    Examples:
+      dnrpipe export-nerf scene.dnr --out scene-nerf
+      ns-train splatfacto --data scene-nerf
+      dnrpipe export-nerf scene.dnr --out unit --normalise && ns-train nerfacto blender-data --data unit
+      instant-ngp scene-nerf/transforms_train.json
+    """
+    from ..export.nerf import export_nerf as export
+
+    workspace, console = _opened(**options)
+    answer = export(workspace, out or Path(f"{workspace.root.stem}-nerf"), console, normalise=normalise)
+    console.say(f"{answer['folder']}: {answer['train']} training and {answer['test']} test views")
+    console.result(answer)
