@@ -15,7 +15,7 @@ from .. import __version__
 from . import information, pictures, scene, stages
 from .ablate import ablate
 from .bench_select import bench_select
-from .export import export_nerf
+from .export import export_gltf, export_nerf, export_onnx
 
 
 class _Group(click.Group):
@@ -55,6 +55,8 @@ for _command in (
     pictures.render,
     pictures.report,
     export_nerf,
+    export_onnx,
+    export_gltf,
     stages.run,
     ablate,
     bench_select,

@@ -61,3 +61,53 @@ def export_nerf(out: Path | None, normalise: bool, **options: Any) -> None:
     answer = export(workspace, out or Path(f"{workspace.root.stem}-nerf"), console, normalise=normalise)
     console.say(f"{answer['folder']}: {answer['train']} training and {answer['test']} test views")
     console.result(answer)
+
+
+@click.command("export-onnx")
+@_common
+@click.option("--out", type=click.Path(path_type=Path), metavar="FILE", help="New file (default: SCENE.onnx).")
+def export_onnx(out: Path | None, **options: Any) -> None:
+    """Write the trained renderer (network, neural textures, display transform) as one ONNX file.
+
+    Any height and width, float32. Inputs are the channels of the workspace's EXR files (docs/export.md). The file is
+    run by onnxruntime on some views and compared with torch: beyond a difference of 1e-3 nothing is written.
+
+    \b
+    Examples:
+      dnrpipe export-onnx
+      dnrpipe export-onnx scene.dnr --out scene.onnx --json
+    """
+    from ..export.onnx import export_onnx as export
+
+    workspace, console = _opened(**options)
+    answer = export(workspace, out or Path(f"{workspace.root.stem}.onnx"), console)
+    console.say(
+        f"{answer['file']}: {answer['bytes'] / 1e6:.1f} MB, opset {answer['opset']}, inputs"
+        f" {', '.join(answer['inputs'])}; largest difference from torch {answer['largest_difference']:.1e}"
+    )
+    console.result(answer)
+
+
+@click.command("export-gltf")
+@_common
+@click.option("--out", type=click.Path(path_type=Path), metavar="FILE", help="New file (default: SCENE.glb).")
+@click.option("--light/--no-light", default=True, show_default=True, help="Baked light as an unlit texture.")
+def export_gltf(out: Path | None, light: bool, **options: Any) -> None:
+    """Write the scene's meshes with their atlas coordinates as binary glTF (Y up).
+
+    TEXCOORD_0 is the scene atlas that the neural texture lives in; the texture is what the surfaces send back
+    diffusely, in display space. Mirrors, glass and highlights are not in it.
+
+    \b
+    Examples:
+      dnrpipe export-gltf
+      dnrpipe export-gltf scene.dnr --out scene.glb --no-light
+    """
+    from ..export.gltf import export_gltf as export
+
+    workspace, console = _opened(**options)
+    answer = export(workspace, out or Path(f"{workspace.root.stem}.glb"), console, light=light)
+    console.say(
+        f"{answer['file']}: {answer['meshes']} meshes, {answer['triangles']} triangles, {answer['bytes'] / 1e6:.1f} MB"
+    )
+    console.result(answer)
