@@ -68,11 +68,14 @@ def read_baked_light(workspace: Workspace) -> np.ndarray:
     path = workspace.root / "base" / "light.npz"
     try:
         with np.load(path, allow_pickle=False) as data:
-            return np.asarray(data["light"], np.float32)
+            light = np.asarray(data["light"], np.float32)
     except (OSError, ValueError, KeyError, EOFError):
         raise UserError(
             f"{path}: no baked light; it comes with `dnrpipe raytrace-selected` where model.base is baked"
         ) from None
+    if light.ndim != 5 or light.shape[:2] != (2, 2) or light.shape[2] != light.shape[3]:
+        raise UserError(f"{path}: was baked by an older dnrpipe; run `dnrpipe raytrace-selected` again")
+    return light
 
 
 def _enlarged(image: np.ndarray, size: int) -> np.ndarray:
