@@ -111,3 +111,46 @@ def export_gltf(out: Path | None, light: bool, **options: Any) -> None:
         f"{answer['file']}: {answer['meshes']} meshes, {answer['triangles']} triangles, {answer['bytes'] / 1e6:.1f} MB"
     )
     console.result(answer)
+
+
+@click.command("export-web")
+@_common
+@click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="New folder (default: SCENE-web).")
+@click.option(
+    "--epochs", type=click.IntRange(1, 100_000), metavar="N", help="Training of the page's network (default 40)."
+)
+@click.option(
+    "--check", is_flag=True, help="Open the page in a headless Chromium and compare its pictures with torch's."
+)
+def export_web(out: Path | None, epochs: int | None, check: bool, **options: Any) -> None:
+    """Write a folder whose page renders the neural view in a browser, without a server.
+
+    WebGL2 draws G-buffer and baked light, onnxruntime-web (fetched from npm once) runs a network that is trained for
+    them on the ray-traced views: a browser has no ray tracer for the base image of the workspace's own. Open index.html
+    from disk, or put the folder on any static server: WebGPU is used there where the browser has it.
+
+    \b
+    Examples:
+      dnrpipe export-web
+      dnrpipe export-web scene.dnr --out page --check
+      python -m http.server -d page
+    """
+    from ..export.web import export_web as export
+
+    workspace, console = _opened(**options)
+    out = out or Path(f"{workspace.root.stem}-web")
+    answer = export(workspace, out, console, epochs=epochs)
+    console.say(
+        f"{answer['folder']}/index.html: {answer['psnr']:.2f} dB over {answer['test_views']} held-out views"
+        f" (baked light alone {answer['psnr_base']:.2f} dB)"
+    )
+    if check:
+        from ..export.web_check import check_page
+
+        found = check_page(workspace, out, console)
+        console.say(
+            f"in Chromium ({found['provider']}, {found['gl']}): {found['psnr_torch']:.1f} dB against torch on the same"
+            f" inputs, {found['psnr_truth']:.2f} dB against ray tracing; {found['frame_ms']:.0f} ms a frame"
+        )
+        answer["check"] = found
+    console.result(answer)

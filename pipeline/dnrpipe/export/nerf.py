@@ -44,7 +44,7 @@ def export_nerf(workspace: Workspace, out: Path, console: Console, *, normalise:
 
     Raises UserError: nothing ray-traced yet, or a folder that is not ours to write.
     """
-    views = _views(workspace)
+    views = raytraced_views(workspace)
     frame = read_frame(workspace)
     claim(out, "nerf")
     scale, shift = (1.0 / frame.radius, -np.asarray(frame.center)) if normalise else (1.0, np.zeros(3))
@@ -112,8 +112,11 @@ def write_points(path: Path, points: np.ndarray, colours: np.ndarray) -> None:
         temporary.write_bytes("\n".join(lines).encode("ascii") + table.tobytes())
 
 
-def _views(workspace: Workspace) -> dict[str, list[View]]:
-    """The ray-traced views: the selected ones in the order chosen, and the held-out ones."""
+def raytraced_views(workspace: Workspace) -> dict[str, list[View]]:
+    """The ray-traced views, train: the selected ones in the order chosen; test: the held-out ones.
+
+    Raises UserError: some are not ray-traced yet.
+    """
     cameras = split_views(workspace)
     by_name = {view.name: view for view in cameras["train"]}
     chosen = [by_name[name] for name in read_selection(workspace)["views"] if name in by_name]
