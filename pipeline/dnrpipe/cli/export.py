@@ -138,19 +138,15 @@ def export_web(out: Path | None, epochs: int | None, check: bool, **options: Any
     from ..export.web import export_web as export
 
     workspace, console = _opened(**options)
-    out = out or Path(f"{workspace.root.stem}-web")
-    answer = export(workspace, out, console, epochs=epochs)
+    answer = export(workspace, out or Path(f"{workspace.root.stem}-web"), console, epochs=epochs, check=check)
     console.say(
         f"{answer['folder']}/index.html: {answer['psnr']:.2f} dB over {answer['test_views']} held-out views"
         f" (baked light alone {answer['psnr_base']:.2f} dB)"
     )
     if check:
-        from ..export.web_check import check_page
-
-        found = check_page(workspace, out, console)
+        found = answer["check"]
         console.say(
             f"in Chromium ({found['provider']}, {found['gl']}): {found['psnr_torch']:.1f} dB against torch on the same"
             f" inputs, {found['psnr_truth']:.2f} dB against ray tracing; {found['frame_ms']:.0f} ms a frame"
         )
-        answer["check"] = found
     console.result(answer)

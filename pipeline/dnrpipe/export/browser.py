@@ -28,9 +28,21 @@ LOADING = 60
 """Seconds."""
 
 
+class PageError(UserError):
+    """The page threw, or Chromium did not answer."""
+
+
 def find_chromium() -> str | None:
     """Path of an installed Chromium, or None."""
     return next((path for name in NAMES if (path := shutil.which(name))), None)
+
+
+def require_chromium() -> str:
+    """Its path. Raises UserError where none is installed."""
+    chromium = find_chromium()
+    if chromium is None:
+        raise UserError(f"no Chromium here (looked for {', '.join(NAMES)}); install one to check the page")
+    return chromium
 
 
 class Tab:
@@ -50,16 +62,16 @@ class Tab:
         until = time.monotonic() + LOADING
         while self.evaluate("document.readyState + location.protocol") != "complete" + address.split("//")[0]:
             if time.monotonic() > until:
-                raise RuntimeError(f"Chromium did not load {address} in {LOADING} s")
+                raise PageError(f"Chromium did not load {address} in {LOADING} s")
             time.sleep(0.05)
 
     def evaluate(self, expression: str, timeout: float = 120) -> Any:
-        """The value of a JavaScript expression. Raises RuntimeError where it throws or takes too long."""
+        """The value of a JavaScript expression. Raises PageError where it throws or takes too long."""
         options = {"expression": expression, "awaitPromise": True, "returnByValue": True}
         answer = self._call("Runtime.evaluate", options, timeout)
         if "exceptionDetails" in answer:
             found = answer["exceptionDetails"].get("exception", {}).get("description", "unknown")
-            raise RuntimeError(f"the page says: {found}; {' | '.join(self.messages[-3:])}")
+            raise PageError(f"the page says: {found}; {' | '.join(self.messages[-3:])}")
         return answer["result"].get("value")
 
     def picture(self) -> bytes:
@@ -91,7 +103,7 @@ class Tab:
             answer = self._next(until, method)
             if answer.get("id") == self._number:
                 if "error" in answer:
-                    raise RuntimeError(f"Chromium refuses {method}: {answer['error']['message']}")
+                    raise PageError(f"Chromium refuses {method}: {answer['error']['message']}")
                 return answer["result"]
             if answer.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded", "Runtime.consoleAPICalled"):
                 self.messages.append(json.dumps(answer["params"])[:400])
@@ -100,10 +112,10 @@ class Tab:
         while b"\0" not in self._rest:
             ready, _, _ = select.select([self._read], [], [], max(0.0, until - time.monotonic()))
             if not ready:
-                raise RuntimeError(f"Chromium did not answer {what} in time")
+                raise PageError(f"Chromium did not answer {what} in time")
             part = os.read(self._read, 1 << 20)
             if not part:
-                raise RuntimeError(f"Chromium ended during {what}")
+                raise PageError(f"Chromium ended during {what}")
             self._rest += part
         line, self._rest = self._rest.split(b"\0", 1)
         return json.loads(line)
@@ -112,9 +124,7 @@ class Tab:
 @contextmanager
 def browser() -> Iterator[Tab]:
     """A Chromium of its own, with a profile of its own, ended afterwards. Raises UserError where none is installed."""
-    chromium = find_chromium()
-    if chromium is None:
-        raise UserError(f"no Chromium here (looked for {', '.join(NAMES)}); install one to check the page")
+    chromium = require_chromium()
     to_child, write = os.pipe()
     read, from_child = os.pipe()
     with tempfile.TemporaryDirectory(prefix="dnrpipe-", ignore_cleanup_errors=True) as profile:

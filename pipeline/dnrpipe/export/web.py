@@ -29,12 +29,14 @@ from ..scene_files import read_frame, read_json
 from ..session import resolve_settings
 from ..training import read_selection
 from ..workspace import Workspace
+from .browser import require_chromium
 from .folder import claim, finish
 from .gltf import glb
 from .meshes import read_meshes
 from .nerf import raytraced_views
 from .surface import SurfaceMaps, read_baked_light, surface_maps
 from .vendor import FILES, runtime
+from .web_check import check_page
 from .web_model import train, web_views
 
 if TYPE_CHECKING:
@@ -45,10 +47,15 @@ TRAINING = ".training"
 EMBEDDED = ("scene.glb", "light-front.bin", "light-back.bin", "model.onnx")
 
 
-def export_web(workspace: Workspace, out: Path, console: Console, *, epochs: int | None = None) -> dict[str, Any]:
+def export_web(
+    workspace: Workspace, out: Path, console: Console, *, epochs: int | None = None, check: bool = False
+) -> dict[str, Any]:
     """Train the page's network, write the folder, and measure the network on the held-out views (by torch).
 
-    Raises UserError: no baked light, no ray-traced views, no npm, or a folder that is not ours to write.
+    check: also open the page in a browser (:mod:`.web_check`).
+
+    Raises UserError: no baked light, no ray-traced views, no npm, or a folder that is not ours to write; with ``check``
+    also no Chromium.
     """
     from dnrtrain import onnx_export
 
@@ -57,6 +64,8 @@ def export_web(workspace: Workspace, out: Path, console: Console, *, epochs: int
     read_baked_light(workspace)
     meshes = read_meshes(workspace.scene)
     vendored = runtime()
+    if check:
+        require_chromium()
     claim(out, "web")
     maps = surface_maps(workspace, console)
     model = train(workspace, settings, console, views["train"], maps, out / TRAINING, epochs)
@@ -81,7 +90,11 @@ def export_web(workspace: Workspace, out: Path, console: Console, *, epochs: int
         *(out / "ort" / name for name in (*FILES, "LICENSE")),
     ]
     finish(out, "web", written)
-    return {"folder": str(out), "bytes": sum(path.stat().st_size for path in written), **quality}
+    answer = {"folder": str(out), "bytes": sum(path.stat().st_size for path in written), **quality}
+    if check:
+        data = web_views(workspace, views["test"], "test", maps)
+        answer["check"] = check_page(out, views["test"], data, model, console)
+    return answer
 
 
 def held_out(workspace: Workspace, model: DNR, views: Sequence[View], maps: SurfaceMaps) -> dict[str, Any]:

@@ -4,43 +4,40 @@ from __future__ import annotations
 
 import base64
 import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dnrtrain.contract import View
 
 from ..console import Console
-from ..workspace import Workspace
 from .browser import browser
-from .nerf import raytraced_views
-from .surface import surface_maps
-from .web import TRAINING
-from .web_model import web_views
+
+if TYPE_CHECKING:
+    from dnrtrain.dataset import ViewSet
+    from dnrtrain.model import DNR
 
 CHANNELS = {"uv": 2, "mask": 1, "coverage": 1, "view_dir": 3, "normal": 3, "base": 4, "rgb": 3}
 
 
-def check_page(workspace: Workspace, out: Path, console: Console, *, screenshot: Path | None = None) -> dict[str, Any]:
-    """Open ``out/index.html`` from disk in a headless Chromium (software GL) and render the held-out views.
+def check_page(out: Path, views: Sequence[View], data: ViewSet, model: DNR, console: Console) -> dict[str, Any]:
+    """Open ``out/index.html`` from disk in a headless Chromium (software GL) and render the views.
+
+    data: the same views by their files (:func:`.web_model.web_views`), with ray-traced targets.
 
     Returns means over the views, dB: ``psnr_torch``, the page's picture against torch on the inputs that the page
     drew; ``psnr_files``, against torch on Blender's G-buffers; ``psnr_truth``, against the ray-traced view; also the
     share of pixels whose mask agrees with Blender's, and milliseconds by stage.
 
-    Raises UserError: no Chromium. RuntimeError: the page failed.
+    Raises UserError: no Chromium, or the page failed in it.
     """
     import torch
 
-    from dnrtrain.checkpoint import load_model
     from dnrtrain.metrics import psnr
     from dnrtrain.model import render_views
 
-    views = raytraced_views(workspace)["test"]
-    data = web_views(workspace, views, "test", surface_maps(workspace, console))
-    model = load_model(out / TRAINING)
-    model.use_bfloat16 = False
     assert data.target is not None
     expected = render_views(model, data)
     rows: list[dict[str, float]] = []
@@ -63,8 +60,6 @@ def check_page(workspace: Workspace, out: Path, console: Console, *, screenshot:
             )
             bar.advance(note=f"{rows[-1]['psnr_torch']:.1f} dB")
         figures = tab.evaluate("window.dnr.then(page => page.figures())")
-        if screenshot is not None:
-            screenshot.write_bytes(tab.picture())
     means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     return {**means, "views": len(rows), **{k: v for k, v in figures.items() if k not in ("fps", "frames")}}
 

@@ -42,7 +42,7 @@ class Worker:
         size, samples = int(task["size"]), int(task["samples"])
         maps = SurfaceMapper(self.engine.mi, scene, grouped_meshes(self.bundle)).maps(size, samples, int(task["seed"]))
         with atomic_path(task["output"]) as temporary, temporary.open("wb") as file:
-            np.savez(file, **maps)
+            np.savez(file, **maps)  # pyright: ignore[reportArgumentType]
         return {"texels": size * size}
 
 
