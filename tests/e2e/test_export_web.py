@@ -10,11 +10,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from e2e_harness import run
 
 from dnrpipe.errors import UserError
 from dnrpipe.export.browser import browser, find_chromium
+from dnrpipe.export.gltf import Y_UP
 from dnrpipe.export.vendor import runtime
 
 pytestmark = [pytest.mark.slow, pytest.mark.e2e]
@@ -82,6 +84,21 @@ def test_dragging_and_choosing_change_the_picture_from_disk(exported: tuple[Path
         assert "WebAssembly" in figures and "dB PSNR over 2 ray-traced" in figures
 
 
+def test_instances_stand_where_gltf_puts_them(exported: tuple[Path, dict[str, Any]]) -> None:
+    """The page's own matrices: back from glTF's axes, and normals by the inverse transpose."""
+    rng = np.random.default_rng(1)
+    placement = np.eye(4)
+    placement[:3] = rng.normal(size=(3, 4))
+    stored = (Y_UP @ placement @ np.linalg.inv(Y_UP)).T.ravel().tolist()
+    with browser() as tab:
+        tab.open((exported[0] / "index.html").as_uri())
+        world = tab.evaluate(f"worldMatrix({stored})")
+        turned = np.array(tab.evaluate(f"normalMatrix({world})")).reshape(3, 3).T
+    assert np.allclose(np.array(world).reshape(4, 4).T, placement)
+    linear = placement[:3, :3]
+    assert np.allclose(turned, abs(np.linalg.det(linear)) * np.linalg.inv(linear).T)
+
+
 def test_a_static_server_serves_it_too(exported: tuple[Path, dict[str, Any]], server: str) -> None:
     """Without offline.js, file by file."""
     (exported[0] / "offline.js").rename(exported[0] / "away.js")
@@ -93,6 +110,29 @@ def test_a_static_server_serves_it_too(exported: tuple[Path, dict[str, Any]], se
             assert tab.evaluate("document.getElementById('message').textContent") == ""
     finally:
         (exported[0] / "away.js").rename(exported[0] / "offline.js")
+
+
+def test_the_base_image_is_the_ray_traced_diffuse_light(tiny: Path) -> None:
+    """Textures looked up at the G-buffer against the diffuse part of Mitsuba's base images."""
+    from dnrpipe.base import base_path
+    from dnrpipe.console import Console
+    from dnrpipe.export.nerf import raytraced_views
+    from dnrpipe.export.surface import surface_maps
+    from dnrpipe.export.web_model import web_views
+    from dnrpipe.workspace import Workspace
+    from dnrtrain.exr import read_exr
+
+    workspace = Workspace.open(tiny)
+    views = raytraced_views(workspace)["test"]
+    data = web_views(workspace, views, "test", surface_maps(workspace, Console(quiet=True)))
+    assert data.tensors.base is not None
+    for view, image in zip(views, data.tensors.base.numpy(), strict=True):
+        channels, _ = read_exr(base_path(workspace, "test", view.name))
+        whole = channels["coverage"] > 0.999  # edges mix surfaces
+        ours = image[:, whole]
+        theirs = np.stack([channels[f"diffuse.{c}"][whole] for c in "RGB"])
+        assert abs(ours.mean() / theirs.mean() - 1) < 0.1
+        assert np.corrcoef(ours.ravel(), theirs.ravel())[0, 1] > 0.85  # 128 texels for the whole scene
 
 
 def test_what_lies_in_the_folder(exported: tuple[Path, dict[str, Any]]) -> None:

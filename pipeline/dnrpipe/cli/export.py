@@ -117,7 +117,10 @@ def export_gltf(out: Path | None, light: bool, **options: Any) -> None:
 @_common
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", help="New folder (default: SCENE-web).")
 @click.option(
-    "--epochs", type=click.IntRange(1, 100_000), metavar="N", help="Training of the page's network (default 40)."
+    "--epochs",
+    type=click.IntRange(1, 100_000),
+    metavar="N",
+    help="Training of the page's network (default 40, more for few views).",
 )
 @click.option(
     "--check", is_flag=True, help="Open the page in a headless Chromium and compare its pictures with torch's."

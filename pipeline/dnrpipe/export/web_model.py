@@ -30,13 +30,18 @@ if TYPE_CHECKING:
     from dnrtrain.model import DNR
 
 
-def web_settings(settings: Settings, epochs: int | None) -> tuple[ModelSettings, Step2Settings]:
+STEPS = 1500
+"""Of training at least, whatever the number of views."""
+
+
+def web_settings(settings: Settings, views: int, epochs: int | None) -> tuple[ModelSettings, Step2Settings]:
     """Draft's sizes (milliseconds count), the scene's texture size, and a base image without specular part."""
     draft = PRESETS["draft"]
     size = min(settings.model.texture_size, 256)
     model = ModelSettings.model_validate({**draft["model"], "base": "raster", "texture_size": size})
     step2 = Step2Settings.model_validate({**draft["finetune"]["step2"], "patch": 192})
-    return model, step2 if epochs is None else step2.model_copy(update={"epochs": epochs})
+    wanted = epochs or max(step2.epochs, -(-STEPS // views))
+    return model, step2.model_copy(update={"epochs": wanted})
 
 
 def web_views(
@@ -88,7 +93,7 @@ def train(
     from dnrtrain.checkpoint import load_model
     from dnrtrain.step2 import run_step2
 
-    model, step2 = web_settings(settings, epochs)
+    model, step2 = web_settings(settings, len(views), epochs)
     data = web_views(workspace, views, "train", maps)
     weights = perceptual_weights(console)
     stamp = digest([float(maps.radiance.sum(dtype=np.float64)), [view.model_dump(mode="json") for view in views]])

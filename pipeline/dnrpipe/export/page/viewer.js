@@ -370,25 +370,25 @@ class Network {
     const adapter = !offline && navigator.gpu ? await navigator.gpu.requestAdapter().catch(() => null) : null;
     if (adapter) {
       try {
-        await network.open(model, "ort.webgpu.bundle.min.mjs", "webgpu");
+        await network.open(model, "webgpu", "ort-wasm-simd-threaded.asyncify.wasm");
         return network;
       } catch (error) {
         console.warn("WebGPU failed, WebAssembly instead:", error);
       }
     }
-    await network.open(model, "ort.wasm.bundle.min.mjs", "wasm");
+    await network.open(model, "wasm", "ort-wasm-simd-threaded.wasm");
     return network;
   }
 
-  async open(model, bundle, provider) {
-    const base = new URL("ort/", location.href).href;
+  async open(model, provider, binary) {
+    const base = new URL("ort/", location.href).href, bundle = `ort.${provider}.bundle.min.mjs`;
     let address = base + bundle;
     if (offline) address = URL.createObjectURL(new Blob([await file(`ort/${bundle}`)], { type: "text/javascript" }));
     this.ort = await import(address);
     const wasm = this.ort.env.wasm;
     wasm.numThreads = 1; // more need a server that isolates origins
-    if (offline) wasm.wasmBinary = (await file("ort/ort-wasm-simd-threaded.wasm")).buffer;
-    else wasm.wasmPaths = base;
+    if (offline) wasm.wasmBinary = (await file(`ort/${binary}`)).buffer;
+    else wasm.wasmPaths = { wasm: base + binary };
     this.session = await this.ort.InferenceSession.create(model, { executionProviders: [provider] });
     this.provider = provider === "webgpu" ? "WebGPU" : "WebAssembly, one thread";
   }
