@@ -23,6 +23,11 @@ pytestmark = [pytest.mark.slow, pytest.mark.e2e]
 
 PIXELS = "Array.from(document.querySelector('canvas').getContext('2d').getImageData(0, 0, 64, 64).data)"
 
+SETTLED = (
+    "window.dnr.then(async page => { do await new Promise(done => setTimeout(done, 100));"
+    " while (page.dirty || page.busy) })"
+)
+
 
 @pytest.fixture(scope="module")
 def exported(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
@@ -66,19 +71,19 @@ def test_the_browser_computes_what_torch_computes(exported: tuple[Path, dict[str
 def test_dragging_and_choosing_change_the_picture_from_disk(exported: tuple[Path, dict[str, Any]]) -> None:
     with browser() as tab:
         tab.open((exported[0] / "index.html").as_uri())
-        tab.evaluate("window.dnr.then(page => new Promise(done => setTimeout(done, 3000)))")
+        tab.evaluate(SETTLED)
         before = tab.evaluate(PIXELS)
         assert len(set(before)) > 30
         x, y, width = tab.evaluate(
             "(r => [r.x, r.y, r.width])(document.querySelector('canvas').getBoundingClientRect())"
         )
         tab.drag((x + 0.3 * width, y + 0.5 * width), (x + 0.6 * width, y + 0.5 * width))
-        tab.evaluate("new Promise(done => setTimeout(done, 2500))")
+        tab.evaluate(SETTLED)
         after = tab.evaluate(PIXELS)
         changed = sum(a != b for a, b in zip(before, after, strict=True)) / len(before)
         assert changed > 0.05
         tab.evaluate("(s => { s.value = 'normal'; s.onchange() })(document.getElementById('show'))")
-        tab.evaluate("new Promise(done => setTimeout(done, 2500))")
+        tab.evaluate(SETTLED)
         assert tab.evaluate(PIXELS) != after
         figures = tab.evaluate("document.getElementById('figures').innerText")
         assert "WebAssembly" in figures and "dB PSNR over 2 ray-traced" in figures
@@ -105,7 +110,7 @@ def test_a_static_server_serves_it_too(exported: tuple[Path, dict[str, Any]], se
     try:
         with browser() as tab:
             tab.open(server)
-            assert tab.evaluate("window.dnr.then(page => page.scene.name)") == "demo"
+            assert tab.evaluate("window.dnr.then(page => page.scene.size)") == [64, 64]
             tab.evaluate("window.dnr.then(page => page.frame(page.view(), 'neural')).then(() => true)")
             assert tab.evaluate("document.getElementById('message').textContent") == ""
     finally:
