@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from e2e_harness import run
 
+from dnrpipe.cli import _main
+
 pytestmark = [pytest.mark.slow, pytest.mark.e2e]
 
 READER = """
@@ -72,7 +74,7 @@ def test_blender_reads_the_scene_back(tiny: Path, tmp_path: Path) -> None:
 def test_file_follows_the_format(tiny: Path, tmp_path: Path) -> None:
     """Lengths, alignment, Y up and finite unit normals, read without our writer."""
     out = tmp_path / "plain.glb"
-    run("export-gltf", str(tiny), "--out", str(out), "--no-light", folder=tmp_path)
+    assert _main(["export-gltf", str(tiny), "--out", str(out), "--no-light"]) == 0
     raw = out.read_bytes()
     assert raw[:4] == b"glTF" and int.from_bytes(raw[8:12], "little") == len(raw) and len(raw) % 4 == 0
     length = int.from_bytes(raw[12:16], "little")
@@ -96,7 +98,7 @@ def test_file_follows_the_format(tiny: Path, tmp_path: Path) -> None:
     assert max(tops) == pytest.approx(json.loads((tiny / "scene" / "summary.json").read_text())["bounds"]["max"][2])
 
 
-def test_refusals(tiny: Path, tmp_path: Path) -> None:
-    done = run("export-gltf", str(tiny), "--out", "x.obj", folder=tmp_path, check=False)
-    assert done.returncode == 2 and "ends in .glb" in done.stderr
+def test_refusals(tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert _main(["export-gltf", str(tiny), "--out", str(tmp_path / "x.obj")]) == 2
+    assert "ends in .glb" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from e2e_harness import image, run
 
+from dnrpipe.cli import _main
+
 pytestmark = [pytest.mark.slow, pytest.mark.e2e]
 pytest.importorskip("onnxruntime")
 
@@ -48,12 +50,13 @@ def test_a_file_that_differs_is_not_written(tiny: Path, tmp_path: Path, monkeypa
     assert list(tmp_path.iterdir()) == []
 
 
-def test_refusals_are_one_line(tiny: Path, tmp_path: Path) -> None:
+def test_refusals_are_one_line(tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(tiny, tmp_path / "x.dnr", ignore=shutil.ignore_patterns("step2", "evaluation"))
     for arguments, words in (
-        ((str(tmp_path / "x.dnr"), "--out", "a.onnx"), "no finished model"),
+        ((str(tmp_path / "x.dnr"), "--out", str(tmp_path / "a.onnx")), "no finished model"),
         ((str(tiny), "--out", "a.txt"), "ends in .onnx"),
         ((str(tmp_path / "nowhere.dnr"),), "not a dnrpipe workspace"),
     ):
-        done = run("export-onnx", *arguments, folder=tmp_path, check=False)
-        assert done.returncode == 2 and words in done.stderr and len(done.stderr.splitlines()) == 1
+        assert _main(["export-onnx", *arguments]) == 2
+        said = capsys.readouterr().err
+        assert words in said and len(said.splitlines()) == 1
