@@ -21,7 +21,7 @@ from dnrtrain.settings import ModelSettings, Step2Settings
 from ..console import Console
 from ..scene_files import read_frame
 from ..settings import PRESETS, Settings
-from ..training import load, perceptual_weights, torch_device
+from ..training import epochs_done, load, perceptual_weights, torch_device
 from ..workspace import Workspace, digest
 from .surface import SurfaceMaps
 
@@ -102,7 +102,8 @@ def train(
         seed=settings.finetune.seed, device=torch_device(settings), checkpoints=folder, fingerprint=stamp,
         weights=weights,
     )  # fmt: skip
-    with console.bar("training for the page", step2.epochs) as bar:
+    done, _ = epochs_done(folder, step2.epochs, False)
+    with console.bar("training for the page", step2.epochs, done) as bar:
         for event in events:
             if isinstance(event, Note):
                 console.say(event.text)
