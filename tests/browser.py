@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import tempfile
 from pathlib import Path
 
-_NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
+from dnrpipe.export.browser import find_chromium
+
+__all__ = ["dump_dom", "find_chromium", "screenshot"]
 _FLAGS = (
     "--headless",
     "--no-sandbox",
@@ -20,11 +21,6 @@ _FLAGS = (
     "--disable-dev-shm-usage",
     "--hide-scrollbars",
 )
-
-
-def find_chromium() -> str | None:
-    """Path of an installed Chromium, or None."""
-    return next((path for name in _NAMES if (path := shutil.which(name))), None)
 
 
 def screenshot(page: Path, picture: Path, *, width: int, height: int, dark: bool = False) -> None:

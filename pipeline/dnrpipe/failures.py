@@ -19,6 +19,8 @@ _EXTRAS = {
     "PIL": "render",
     "jinja2": "render",
     "matplotlib": "render",
+    "onnx": "export",
+    "onnxruntime": "export",
 }
 
 

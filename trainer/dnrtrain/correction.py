@@ -70,7 +70,7 @@ def filter_by(image: Tensor, weights: Tensor) -> Tensor:
     ``weights`` [N, k², H, W] row by row; their softmax, the middle ahead by IDENTITY, is the kernel. Beyond the border
     the last pixel continues.
     """
-    count = weights.shape[1]
+    count = int(weights.shape[1])  # a number also where torch traces shapes
     side = round(count**0.5)
     ahead = F.one_hot(torch.tensor(count // 2, device=weights.device), count).view(1, count, 1, 1) * IDENTITY
     kernel = (weights + ahead).softmax(dim=1)

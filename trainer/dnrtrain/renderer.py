@@ -155,6 +155,12 @@ def planes(layer: nn.Conv2d, x: Tensor) -> Tensor:
 
 def pad_to_multiple(x: Tensor, multiple: int) -> Tensor:
     """Replicate the right and bottom border until both sides are multiples."""
+    if torch.jit.is_tracing():  # an exported graph takes pictures of any size: how much is missing is part of it
+        for axis in (-2, -1):
+            side = x.shape[axis]
+            last = torch.arange(side + -side % multiple, device=x.device).clamp(max=side - 1)
+            x = x.index_select(axis, last)
+        return x
     right, bottom = -x.shape[-1] % multiple, -x.shape[-2] % multiple
     return F.pad(x, (0, right, 0, bottom), mode="replicate") if right or bottom else x
 

@@ -15,6 +15,7 @@ from .. import __version__
 from . import information, pictures, scene, stages
 from .ablate import ablate
 from .bench_select import bench_select
+from .export import export_gltf, export_nerf, export_onnx, export_web
 
 
 class _Group(click.Group):
@@ -53,6 +54,10 @@ for _command in (
     stages.evaluate,
     pictures.render,
     pictures.report,
+    export_nerf,
+    export_onnx,
+    export_gltf,
+    export_web,
     stages.run,
     ablate,
     bench_select,

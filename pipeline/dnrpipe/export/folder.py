@@ -1,0 +1,43 @@
+"""The folder that an export writes: taken only where nothing of the user's is lost."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+from dnrtrain.atomic import write_text
+
+from ..errors import UserError
+
+MARKER = ".dnrpipe-export"
+"""Lists the files of the last export, one a line. Not JSON: instant-ngp reads every ``*.json`` of a folder."""
+
+
+def claim(folder: Path, kind: str) -> None:
+    """Make ``folder``, or take it over from an earlier export of the same kind.
+
+    Raises UserError: it is a file, or holds anything that such an export did not write.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise UserError(f"{folder}: is a file; name a folder with --out")
+    marker = folder / MARKER
+    if marker.is_file():
+        made = marker.read_text(encoding="utf-8").splitlines()
+        if made[:1] != [kind]:
+            raise UserError(f"{folder}: holds an export of another kind ({made[0] if made else '?'}); name another")
+    elif folder.exists() and any(folder.iterdir()):
+        raise UserError(f"{folder}: is not empty and no earlier export; name a new folder with --out")
+    else:
+        write_text(marker, f"{kind}\n")
+
+
+def finish(folder: Path, kind: str, files: Collection[Path]) -> None:
+    """Note what was written, and remove what the export before had and this one has not."""
+    names = sorted(path.relative_to(folder).as_posix() for path in files)
+    marker = folder / MARKER
+    before = marker.read_text(encoding="utf-8").splitlines()[1:]
+    write_text(marker, "\n".join([kind, *names]) + "\n")
+    for name in set(before) - set(names):
+        path = (folder / name).resolve()
+        if path.is_relative_to(folder.resolve()):
+            path.unlink(missing_ok=True)

@@ -1,0 +1,158 @@
+"""`dnrpipe export-onnx`: the trained renderer as one ONNX file, checked against torch on the workspace's own views."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dnrtrain.atomic import atomic_path
+from dnrtrain.contract import View
+from dnrtrain.exr import read_exr
+
+from .. import __version__
+from ..base import RENDERED, base_path
+from ..console import Console
+from ..errors import UserError
+from ..prepare import split_views
+from ..scene_files import read_frame
+from ..workspace import Workspace
+
+if TYPE_CHECKING:
+    from dnrtrain.contract import SceneFrame
+    from dnrtrain.model import DNR
+
+TOLERANCE = 1e-3
+"""Largest difference from torch that is let pass: a quarter of an 8-bit step. Display space."""
+CHECKED = 3
+"""Views that are compared; the last is also compared at an odd size, since the file promises any."""
+ODD = (61, 45)
+
+
+def export_onnx(workspace: Workspace, out: Path, console: Console) -> dict[str, Any]:
+    """Write the fine-tuned model to ``out``, compare it with torch by onnxruntime, and return what was found.
+
+    Nothing is left at ``out`` where the two differ by more than TOLERANCE: that is a UserError, as are a missing model
+    and views without files.
+    """
+    from dnrtrain import onnx_export
+    from dnrtrain.checkpoint import load_model
+
+    if out.suffix != ".onnx" or out.is_dir():
+        raise UserError(f"--out {out}: name a file that ends in .onnx")
+    model = load_model(workspace.checkpoints("step2"))
+    model.use_bfloat16 = False
+    frame = read_frame(workspace)
+    split, views = _views(workspace, model.settings.base)
+    extra = {"dnrpipe": __version__, "view_transform": frame.view_transform, "near": frame.near, "far": frame.far}
+    with atomic_path(out) as temporary:
+        onnx_export.export_onnx(temporary, model, frame, workspace.scene, extra)
+        with console.bar("comparing with torch", len(views)) as bar:
+            found = [_compare(temporary, workspace, model, frame, view, split, bar) for view in views]
+        worst = max(row["difference"] for row in found)
+        if not worst <= TOLERANCE:
+            raise UserError(
+                f"{out}: not written: its pictures differ from torch's by {worst:.2g}, more than {TOLERANCE:g}"
+            )
+    return {
+        "file": str(out),
+        "bytes": out.stat().st_size,
+        "opset": onnx_export.OPSET,
+        "inputs": {name: onnx_export.CHANNELS[name] for name in onnx_export.input_names(model.settings)},
+        "outputs": onnx_export.output_names(model.settings),
+        "largest_difference": worst,
+        "views": found,
+    }
+
+
+def view_inputs(workspace: Workspace, view: View, split: str, base: str, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """A view's files as the graph's inputs."""
+    from dnrtrain.onnx_export import graph_inputs
+
+    channels, _ = read_exr(workspace.passes(split, view.name))
+    if base in RENDERED:
+        more, _ = read_exr(base_path(workspace, split, view.name))
+        channels |= {name: image for name, image in more.items() if name not in channels}
+    elif base == "raster":
+        channels |= {f"base.{c}": channels[c] for c in "RGBA"}
+    return graph_inputs(channels, -view.ray_directions(), list(names))
+
+
+def _views(workspace: Workspace, base: str) -> tuple[str, list[View]]:
+    """Some views that have all files, held-out ones first."""
+    cameras = split_views(workspace)
+    for split in ("test", "train"):
+        found = [
+            view
+            for view in cameras.get(split, [])
+            if workspace.passes(split, view.name).is_file()
+            and (base not in RENDERED or base_path(workspace, split, view.name).is_file())
+        ]
+        if found:
+            return split, found[:CHECKED]
+    raise UserError(f"{workspace.root}: no view has its files; run `dnrpipe evaluate` first")
+
+
+def _compare(
+    path: Path, workspace: Workspace, model: DNR, frame: SceneFrame, view: View, split: str, bar: Any
+) -> dict[str, Any]:
+    """Largest differences of one view's picture from torch's, whole and cut to an odd size; median milliseconds."""
+    import onnxruntime
+    import torch
+
+    from dnrtrain.onnx_export import input_names
+
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    batch = _batch(workspace, model, frame, view, split)
+    inputs = view_inputs(workspace, view, split, model.settings.base, input_names(model.settings))
+    height, width = (min(side, odd) for side, odd in zip((view.height, view.width), ODD, strict=True))
+    differences, seconds = {}, []
+    for name, rows, columns in (("whole", view.height, view.width), ("cut", height, width)):
+        part = batch._map(lambda tensor, r=rows, c=columns: tensor[..., :r, :c])
+        with torch.no_grad():
+            output = model(part)
+        given = {key: np.ascontiguousarray(value[..., :rows, :columns]) for key, value in inputs.items()}
+        started = time.perf_counter()
+        answers = session.run(None, given)
+        seconds.append(time.perf_counter() - started)
+        expected = [output.rgb.clamp(0.0, 1.0)] + ([] if output.radiance is None else [_compressed(output.radiance)])
+        answers = [torch.from_numpy(answers[0]), *(_compressed(torch.from_numpy(a)) for a in answers[1:])]
+        differences[name] = max(float((a - b).abs().max()) for a, b in zip(answers, expected, strict=True))
+    bar.advance(note=f"{max(differences.values()):.1e}")
+    return {
+        "name": view.name,
+        "split": split,
+        "difference": max(differences.values()),
+        **differences,
+        "milliseconds": 1000 * seconds[0],
+    }
+
+
+def _compressed(radiance: Any) -> Any:
+    """Highlights of 1,000 differ by rounding alone by more than 1e-3: compared where the network works."""
+    from dnrtrain.correction import to_log
+
+    return to_log(radiance)
+
+
+def _batch(workspace: Workspace, model: DNR, frame: SceneFrame, view: View, split: str) -> Any:
+    """The same view by the trainer's own loader, without the target."""
+    from dnrtrain.dataset import load_views
+
+    base = model.settings.base
+    views = load_views(
+        [workspace.passes(split, view.name)],
+        None,
+        frame,
+        cameras=[view],
+        folder=workspace.scene,
+        target=False,
+        base=base,
+        base_files=[base_path(workspace, split, view.name)] if base in RENDERED else None,
+    )
+    return views.batch([0])

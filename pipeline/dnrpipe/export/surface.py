@@ -1,0 +1,88 @@
+"""What a rasteriser shows of the scene: the light that the atlas sends back diffusely, as textures."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..console import Console
+from ..errors import UserError
+from ..executors import Retry, run_tasks
+from ..raytrace.variants import choose_variant
+from ..workspace import Workspace
+
+SAMPLES = 16
+"""Points per texel."""
+LARGEST = 2048
+FINER = 2
+"""Texels of the textures per texel of the light map, along a side: reflectance has finer detail than light."""
+
+
+@dataclass(frozen=True)
+class SurfaceMaps:
+    """radiance: float32 [2, n, n, 4] (front, back): linear Rec.709, what the texel sends back diffusely and emits;
+    opacity. normal: float32 [n, n, 3], the triangles', world space. Row 0 at V = 0. thin: backs can be seen."""
+
+    radiance: np.ndarray
+    normal: np.ndarray
+    thin: bool
+
+
+def surface_maps(workspace: Workspace, console: Console) -> SurfaceMaps:
+    """Evaluate the surfaces in a worker process and light them with ``base/light.npz``.
+
+    Raises UserError: no baked light, no jit variant of Mitsuba, or a scene that fails twice.
+    """
+    light = read_baked_light(workspace)
+    size = min(FINER * light.shape[2], LARGEST)
+    choice = choose_variant(workspace.manifest.settings.get("raytrace", {}).get("variant", "auto"))
+    if choice.variant.startswith("scalar"):
+        raise UserError("surface maps need a jit variant of Mitsuba (LLVM or CUDA; see `dnrpipe doctor`)")
+    with tempfile.TemporaryDirectory(prefix="dnrpipe-") as folder, console.bar("surface maps", 1) as bar:
+        task = {"output": str(Path(folder) / "maps.npz"), "size": size, "samples": SAMPLES, "seed": 0}
+        common = {"bundle": str((workspace.scene / "scene.xml").resolve()), "variant": choice.variant}
+        log = Path(folder) / "worker.log"
+        outcomes = run_tasks(
+            "dnrpipe.raytrace.surface_maps", common, [task], workers=1, log=log, environment=choice.environment
+        )
+        for outcome in outcomes:
+            if isinstance(outcome, Retry):
+                console.warn(f"surface maps: {outcome.reason}; trying once more")
+            elif outcome.result is None:
+                raise UserError(f"surface maps failed twice: {outcome.error}")
+        bar.advance(note=f"{size}² texels")
+        with np.load(task["output"], allow_pickle=False) as data:
+            maps = {name: data[name] for name in data.files}
+    lit = np.stack([_enlarged(side, size) for side in light[0]])
+    radiance = np.zeros((2, size, size, 4), np.float32)
+    radiance[..., :3] = maps["albedo"] * lit + maps["emission"]
+    radiance[..., 3] = maps["opacity"]
+    return SurfaceMaps(radiance, maps["normal"], bool(maps["thin"]))
+
+
+def read_baked_light(workspace: Workspace) -> np.ndarray:
+    """``base/light.npz``, float32 [2, 2, n, n, 3]. Raises UserError: this workspace has none."""
+    path = workspace.root / "base" / "light.npz"
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            light = np.asarray(data["light"], np.float32)
+    except (OSError, ValueError, KeyError, EOFError):
+        raise UserError(
+            f"{path}: no baked light; it comes with `dnrpipe raytrace-selected` where model.base is baked"
+        ) from None
+    if light.ndim != 5 or light.shape[:2] != (2, 2) or light.shape[2] != light.shape[3]:
+        raise UserError(f"{path}: was baked by an older dnrpipe; run `dnrpipe raytrace-selected` again")
+    return light
+
+
+def _enlarged(image: np.ndarray, size: int) -> np.ndarray:
+    """[n, n, 3] at size², bilinear, texel centres at half integers."""
+    import torch
+    import torch.nn.functional as F
+
+    tensor = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None]
+    grown = F.interpolate(tensor, (size, size), mode="bilinear", align_corners=False)
+    return grown[0].permute(1, 2, 0).numpy()

@@ -1,0 +1,149 @@
+"""`dnrpipe export-web`: a folder whose page renders the neural view in a browser, without a server.
+
+index.html, viewer.js   the page
+scene.json              cameras, sizes, display figures
+scene.glb               meshes with atlas coordinates (see :mod:`.gltf`)
+light-front.bin, -back  what surfaces send back diffusely: RGBA float16 [n, n, 4], row 0 at V = 0, A = opacity
+model.onnx              the network (see :mod:`.web_model`)
+ort/                    onnxruntime-web and its licence
+offline.js              all of the above once more as text: pages opened from disk may not read files
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dnrtrain.atomic import atomic_path, write_json, write_text
+from dnrtrain.contract import View
+
+from .. import __version__
+from ..console import Console
+from ..scene_files import read_frame, read_json
+from ..session import resolve_settings
+from ..training import read_selection
+from ..workspace import Workspace
+from .browser import require_chromium
+from .folder import claim, finish
+from .gltf import glb
+from .meshes import read_meshes
+from .nerf import raytraced_views
+from .surface import SurfaceMaps, read_baked_light, surface_maps
+from .vendor import FILES, runtime
+from .web_check import check_page
+from .web_model import train, web_views
+
+if TYPE_CHECKING:
+    from dnrtrain.model import DNR
+
+TRAINING = ".training"
+"""Of the export's folder: the checkpoint, so that an interrupted export goes on where it stopped."""
+EMBEDDED = ("scene.glb", "light-front.bin", "light-back.bin", "model.onnx")
+
+
+def export_web(
+    workspace: Workspace, out: Path, console: Console, *, epochs: int | None = None, check: bool = False
+) -> dict[str, Any]:
+    """Train the page's network, write the folder, and measure the network on the held-out views (by torch).
+
+    check: also open the page in a browser (:mod:`.web_check`).
+
+    Raises UserError: no baked light, no ray-traced views, no npm, or a folder that is not ours to write; with ``check``
+    also no Chromium.
+    """
+    from dnrtrain import onnx_export
+
+    settings = resolve_settings(workspace, {}, None)
+    views = raytraced_views(workspace)
+    read_baked_light(workspace)
+    meshes = read_meshes(workspace.scene)
+    vendored = runtime()
+    if check:
+        require_chromium()
+    claim(out, "web")
+    maps = surface_maps(workspace, console)
+    model = train(workspace, settings, console, views["train"], maps, out / TRAINING, epochs)
+    quality = held_out(workspace, model, views["test"], maps)
+    with atomic_path(out / "scene.glb") as temporary:
+        temporary.write_bytes(glb(meshes, None))
+    for name, side in zip(("front", "back"), maps.radiance, strict=True):
+        with atomic_path(out / f"light-{name}.bin") as temporary:
+            texels = np.clip(side, 0, 65504).astype("<f2")
+            temporary.write_bytes(texels.tobytes() if name == "front" or maps.thin else b"")
+    frame = read_frame(workspace)
+    onnx_export.export_onnx(out / "model.onnx", model, frame, workspace.scene, {"dnrpipe": __version__})
+    write_json(out / "scene.json", _scene(workspace, views, maps, quality))
+    for name in ("index.html", "viewer.js"):
+        write_text(out / name, (files("dnrpipe.export") / "page" / name).read_text(encoding="utf-8"))
+    for name in (*FILES, "LICENSE"):
+        with atomic_path(out / "ort" / name) as temporary:
+            temporary.write_bytes((vendored / name).read_bytes())
+    _embed(out)
+    written = [
+        *(out / name for name in (*EMBEDDED, "scene.json", "index.html", "viewer.js", "offline.js")),
+        *(out / "ort" / name for name in (*FILES, "LICENSE")),
+    ]
+    finish(out, "web", written)
+    answer = {"folder": str(out), "bytes": sum(path.stat().st_size for path in written), **quality}
+    if check:
+        data = web_views(workspace, views["test"], "test", maps)
+        answer["check"] = check_page(out, views["test"], data, model, console)
+    return answer
+
+
+def held_out(workspace: Workspace, model: DNR, views: Sequence[View], maps: SurfaceMaps) -> dict[str, Any]:
+    """Mean PSNR of the page's network and of its base image on the held-out views, over white, dB; by torch."""
+    import torch
+
+    from dnrtrain.metrics import psnr
+    from dnrtrain.model import compose, render_views
+
+    data = web_views(workspace, views, "test", maps)
+    tensors = data.tensors
+    assert tensors.target is not None and tensors.base is not None and tensors.display is not None
+    with torch.no_grad():
+        shown = render_views(model, data)
+        base = compose(tensors.display(tensors.base), tensors.coverage)
+    own = workspace.evaluation / "metrics.json"
+    return {
+        "test_views": len(views),
+        "psnr": float(psnr(shown, tensors.target).mean()),
+        "psnr_base": float(psnr(base, tensors.target).mean()),
+        "psnr_workspace": read_json(own)["mean"]["psnr"] if own.is_file() else None,
+    }
+
+
+def _scene(workspace: Workspace, views: dict[str, list[View]], maps: SurfaceMaps, quality: dict[str, Any]) -> Any:
+    frame = read_frame(workspace)
+    first = views["train"][0]
+    return {
+        "name": workspace.root.stem,
+        "dnrpipe": __version__,
+        "center": list(frame.center),
+        "radius": frame.radius,
+        "texels": maps.radiance.shape[1],
+        "thin": maps.thin,
+        "size": [first.width, first.height],
+        "quality": quality,
+        "start": first.model_dump(mode="json"),
+        "distance": float(np.median([np.linalg.norm(view.position - frame.center) for view in views["train"]])),
+        "trained_on": len(read_selection(workspace)["views"]),
+    }
+
+
+def _embed(out: Path) -> None:
+    """``offline.js``: base64 of what the page would otherwise fetch."""
+
+    def text(path: Path) -> str:
+        return base64.b64encode(path.read_bytes()).decode("ascii")
+
+    content = {name: text(out / name) for name in EMBEDDED}
+    content |= {f"ort/{name}": text(out / "ort" / name) for name in FILES[:2]}
+    scene = json.loads((out / "scene.json").read_text(encoding="utf-8"))
+    write_text(out / "offline.js", f"window.DNR_OFFLINE = {json.dumps({'scene': scene, 'files': content})};\n")

@@ -1,0 +1,92 @@
+"""The page in a browser against torch: the same cameras, the page's own inputs, its own pictures."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dnrtrain.contract import View
+
+from ..console import Console
+from .browser import browser
+
+if TYPE_CHECKING:
+    from dnrtrain.dataset import ViewSet
+    from dnrtrain.model import DNR
+
+CHANNELS = {"uv": 2, "mask": 1, "coverage": 1, "view_dir": 3, "normal": 3, "base": 4, "rgb": 3}
+
+
+def check_page(out: Path, views: Sequence[View], data: ViewSet, model: DNR, console: Console) -> dict[str, Any]:
+    """Open ``out/index.html`` from disk in a headless Chromium (software GL) and render the views.
+
+    data: the same views by their files (:func:`.web_model.web_views`), with ray-traced targets.
+
+    Returns means over the views, dB: ``psnr_torch``, the page's picture against torch on the inputs that the page
+    drew; ``psnr_files``, against torch on Blender's G-buffers; ``psnr_truth``, against the ray-traced view; also the
+    share of pixels whose mask agrees with Blender's, and milliseconds by stage.
+
+    Raises UserError: no Chromium, or the page failed in it.
+    """
+    import torch
+
+    from dnrtrain.metrics import psnr
+    from dnrtrain.model import render_views
+
+    assert data.target is not None
+    expected = render_views(model, data)
+    rows: list[dict[str, float]] = []
+    with browser() as tab, console.bar("views in Chromium", len(views)) as bar:
+        tab.open((out.resolve() / "index.html").as_uri())
+        tab.evaluate("window.dnr.then(() => true)")
+        for index, view in enumerate(views):
+            page = probe(tab, view)
+            batch = page_batch(data.batch([index]), page)
+            with torch.no_grad():
+                same = model(batch).rgb.clamp(0.0, 1.0)
+            shown = torch.from_numpy(page["rgb"])[None]
+            rows.append(
+                {
+                    "psnr_torch": float(psnr(shown, same)),
+                    "psnr_files": float(psnr(shown, expected[index : index + 1])),
+                    "psnr_truth": float(psnr(shown, data.target[index : index + 1])),
+                    "mask_agrees": float((batch.mask == data.mask[index : index + 1]).float().mean()),
+                }
+            )
+            bar.advance(note=f"{rows[-1]['psnr_torch']:.1f} dB")
+        figures = tab.evaluate("window.dnr.then(page => page.figures())")
+    means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+    return {**means, "views": len(rows), **{k: v for k, v in figures.items() if k not in ("fps", "frames")}}
+
+
+def probe(tab: Any, view: View) -> dict[str, np.ndarray]:
+    """What the page draws and renders of a view: its inputs and ``rgb``, float32 [C, H, W] each."""
+    answer = tab.evaluate(f"window.dnr.then(page => page.probe({json.dumps(view.model_dump(mode='json'))}))")
+    return {
+        name: np.frombuffer(base64.b64decode(answer[name]), "<f4").reshape(count, view.height, view.width).copy()
+        for name, count in CHANNELS.items()
+    }
+
+
+def page_batch(batch: Any, page: dict[str, np.ndarray]) -> Any:
+    """``batch`` (one view) with the page's inputs in place of those from files."""
+    from dataclasses import replace
+
+    import torch
+
+    maps = {name: torch.from_numpy(image)[None] for name, image in page.items()}
+    mask = (maps["mask"] > 0.5).float()
+    return replace(
+        batch,
+        uv=(2.0 * maps["uv"] - 1.0) * mask,
+        mask=mask,
+        coverage=maps["coverage"],
+        view_dir=maps["view_dir"],
+        normal=maps["normal"] * mask,
+        base=maps["base"][:, :3] * mask,
+    )

@@ -1,0 +1,114 @@
+"""The network of the page: the default one, over a base image that a browser can draw.
+
+A browser has no ray tracer, so its base image is the light that surfaces send back diffusely (:mod:`.surface`), looked
+up once a pixel; mirrors, glass and highlights are the network's to learn. The workspace's own network was trained over
+more than that and would be wrong over less: this one is trained anew, on the same ray-traced views.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dnrtrain.contract import View
+from dnrtrain.events import EpochEnd, Note
+from dnrtrain.settings import ModelSettings, Step2Settings
+
+from ..console import Console
+from ..scene_files import read_frame
+from ..settings import PRESETS, Settings
+from ..training import epochs_done, load, perceptual_weights, torch_device
+from ..workspace import Workspace, digest
+from .surface import SurfaceMaps
+
+if TYPE_CHECKING:
+    from dnrtrain.dataset import Batch, ViewSet
+    from dnrtrain.model import DNR
+
+
+STEPS = 1500
+"""Of training at least, whatever the number of views."""
+
+
+def web_settings(settings: Settings, views: int, epochs: int | None) -> tuple[ModelSettings, Step2Settings]:
+    """Draft's sizes (milliseconds count), the scene's texture size, and a base image without specular part."""
+    draft = PRESETS["draft"]
+    size = min(settings.model.texture_size, 256)
+    model = ModelSettings.model_validate({**draft["model"], "base": "raster", "texture_size": size})
+    step2 = Step2Settings.model_validate({**draft["finetune"]["step2"], "patch": 192})
+    wanted = epochs or max(step2.epochs, -(-STEPS // views))
+    return model, step2.model_copy(update={"epochs": wanted})
+
+
+def web_views(
+    workspace: Workspace, views: Sequence[View], split: str, maps: SurfaceMaps, *, raytraced: bool = True
+) -> ViewSet:
+    """The views with the base image that the page would draw, and ray-traced targets."""
+    from dnrtrain.display import DisplayTransform
+
+    loaded = load(workspace, list(views), split, raytraced=raytraced)
+    base = base_images(loaded.tensors, maps)
+    display = DisplayTransform(read_frame(workspace), workspace.scene)
+    return replace(loaded, tensors=replace(loaded.tensors, base=base, display=display))
+
+
+def base_images(views: Batch, maps: SurfaceMaps) -> Any:
+    """[N, 3, H, W] linear: bilinear look-ups of the side that is seen, as the page's shader makes them."""
+    import torch
+    import torch.nn.functional as F
+
+    def sampled(image: np.ndarray, mode: str) -> Any:
+        texels = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None]
+        grid = views.uv.permute(0, 2, 3, 1)
+        parts = [F.grid_sample(texels, g[None], mode, padding_mode="border", align_corners=False) for g in grid]
+        return torch.cat(parts)
+
+    front, back = (sampled(half(side[..., :3]), "bilinear") for side in maps.radiance)
+    if not maps.thin:
+        return front * views.mask
+    # The files do not say which side of a sheet is seen: the shading normal faces the camera, the triangle's need not.
+    away = (views.normal * sampled(maps.normal, "nearest")).sum(dim=1, keepdim=True) < 0
+    return torch.where(away, back, front) * views.mask
+
+
+def half(image: np.ndarray) -> np.ndarray:
+    """Rounded to the texture's format, 16-bit floats; brighter than they can say is as bright as they can."""
+    return np.clip(image, 0, 65504).astype(np.float16).astype(np.float32)
+
+
+def train(
+    workspace: Workspace,
+    settings: Settings,
+    console: Console,
+    views: Sequence[View],
+    maps: SurfaceMaps,
+    folder: Path,
+    epochs: int | None,
+) -> DNR:
+    """Train the page's network in ``folder``, or go on where an earlier call was stopped; float32 for inference."""
+    from dnrtrain.checkpoint import load_model
+    from dnrtrain.step2 import run_step2
+
+    model, step2 = web_settings(settings, len(views), epochs)
+    data = web_views(workspace, views, "train", maps)
+    weights = perceptual_weights(console)
+    stamp = digest([float(maps.radiance.sum(dtype=np.float64)), [view.model_dump(mode="json") for view in views]])
+    events = run_step2(
+        data, None, folder, model, step2,
+        seed=settings.finetune.seed, device=torch_device(settings), checkpoints=folder, fingerprint=stamp,
+        weights=weights,
+    )  # fmt: skip
+    done, _ = epochs_done(folder, step2.epochs, False)
+    with console.bar("training for the page", step2.epochs, done) as bar:
+        for event in events:
+            if isinstance(event, Note):
+                console.say(event.text)
+            elif isinstance(event, EpochEnd):
+                bar.advance(event.epoch - bar.done, note=f"loss {event.losses['total']:.4f}")
+    found = load_model(folder)
+    found.use_bfloat16 = False
+    return found

@@ -1,0 +1,109 @@
+"""What the scene's surfaces are, over the atlas: diffuse reflectance, emission, opacity, geometric normal.
+
+A worker (see :mod:`dnrpipe.executors`). Together with the light map this is all that a rasteriser needs to show the
+scene's diffuse light: radiance = albedo · light + emission (:mod:`.base` says the same of rays).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dnrpipe.errors import UserError
+from dnrtrain.atomic import atomic_path
+
+from .denoise import filled
+from .engine import Engine
+from .frames_rays import lets_through
+from .lightmap import LightBaker
+from .lobes import diffuse_context, reflectance
+from .texels import grouped_meshes
+
+
+class Worker:
+    """Evaluates surfaces.
+
+    common: {"bundle", "variant"}
+    task: {"output", "size", "samples", "seed"}; the file is an ``npz``, row 0 at V = 0, gaps between charts filled:
+    ``albedo`` and ``emission`` float32 [2, n, n, 3] (front, back), ``opacity`` [n, n], ``normal`` [n, n, 3] (the
+    triangles', world space), ``thin`` bool: whether any surface's back can be seen.
+    """
+
+    def __init__(self, common: dict[str, Any]) -> None:
+        self.bundle = Path(common["bundle"])
+        self.engine = Engine(common["variant"], 0, [self.bundle])
+        if not self.engine.compiled:
+            raise UserError("surface maps need a jit variant of Mitsuba (LLVM or CUDA; see `dnrpipe doctor`)")
+
+    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
+        scene = self.engine.scenes[str(self.bundle)]
+        size, samples = int(task["size"]), int(task["samples"])
+        maps = SurfaceMapper(self.engine.mi, scene, grouped_meshes(self.bundle)).maps(size, samples, int(task["seed"]))
+        with atomic_path(task["output"]) as temporary, temporary.open("wb") as file:
+            np.savez(file, **maps)  # pyright: ignore[reportArgumentType]
+        return {"texels": size * size}
+
+
+class SurfaceMapper(LightBaker):
+    """Maps of one scene's surfaces; finds its points as the light's baker does."""
+
+    def __init__(self, mi: Any, scene: Any, groups: Any = ()) -> None:
+        super().__init__(mi, scene, None, groups)
+        self.holes = lets_through(mi, scene)
+
+    def maps(self, size: int, samples: int, seed: int) -> dict[str, np.ndarray]:
+        """See :class:`Worker`. samples: points per texel."""
+        found = {
+            "albedo": np.zeros((2, size, size, 3), np.float32),
+            "emission": np.zeros((2, size, size, 3), np.float32),
+            "opacity": np.ones((size, size), np.float32),
+            "normal": np.zeros((size, size, 3), np.float32),
+            "thin": np.array(False),
+        }
+        if not self.surface.count:
+            return found
+        texels, _, normal, thin = self.occupied(size)
+        everywhere = np.zeros(size * size, bool)
+        everywhere[texels] = True
+        image = np.zeros((size * size, 3), np.float32)
+        image[texels] = normal
+        found["normal"] = filled(image.reshape(size, size, 3), everywhere.reshape(size, size))
+        found["thin"] = np.array(bool(thin.any()))
+        for number, side in enumerate((1, -1)):
+            chosen = texels if side > 0 else texels[thin]
+            if not len(chosen):
+                continue
+            sums = self._traced(self._properties, chosen, size, samples, seed * 4 + number, side)
+            count = sums[:, 7:8]
+            mean = np.divide(sums[:, :7], count, out=np.zeros_like(sums[:, :7]), where=count > 0)
+            met = count[:, 0] > 0
+            valid = np.zeros(size * size, bool)
+            valid[chosen[met]] = True
+            for name, columns in (("albedo", slice(0, 3)), ("emission", slice(3, 6)), ("opacity", slice(6, 7))):
+                values = np.zeros((size * size, 3), np.float32)
+                values[chosen[met]] = mean[met, columns]
+                whole = filled(values.reshape(size, size, 3), valid.reshape(size, size)) if met.any() else None
+                if name != "opacity" and whole is not None:
+                    found[name][number] = whole
+                elif side > 0 and whole is not None:
+                    found[name] = whole[..., 0]
+        return found
+
+    def _properties(self, sampler: Any, uv: Any, side: int) -> list[Any]:
+        """Reflectance, emission, opacity at each (U, V), and 1 where there is a surface."""
+        import drjit as dr
+
+        mi = self.mi
+        si, found = self._surface(sampler, uv, side)
+        bsdf = si.bsdf()
+        rho = reflectance(mi, bsdf, diffuse_context(mi), si, found)
+        emitter = si.emitter(self.scene)
+        emission = dr.select(found, emitter.eval(si, found), 0)
+        opacity = mi.Float(1.0)
+        if self.holes:
+            opacity = 1 - dr.mean(bsdf.eval_null_transmission(si, found))
+        found &= dr.all(dr.isfinite(rho)) & dr.all(dr.isfinite(emission)) & dr.isfinite(opacity)
+        one = mi.Float(1.0)
+        return [*(dr.select(found, value, 0) for value in (*rho, *emission, opacity, one))]

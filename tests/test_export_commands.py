@@ -1,0 +1,61 @@
+"""The export commands: cheap help with examples, and one line for bad input."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from dnrpipe.cli import cli
+from dnrpipe.errors import UserError
+from dnrpipe.export import vendor
+
+COMMANDS = ("export-nerf", "export-onnx", "export-gltf", "export-web")
+
+
+def test_help_is_cheap_and_has_examples() -> None:
+    code = (
+        "import sys; from dnrpipe.cli import _main; codes = [_main([name, '--help']) for name in sys.argv[1:]];"
+        "heavy = {'torch', 'bpy', 'mitsuba', 'numpy', 'OpenEXR', 'onnx', 'onnxruntime'} & set(sys.modules);"
+        "print(sorted(heavy)); sys.exit(any(codes))"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *COMMANDS], capture_output=True, text=True, check=True)
+    assert done.stdout.count("Examples:") == len(COMMANDS)
+    assert done.stdout.strip().endswith("[]"), done.stdout
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_two_workspaces_are_refused(name: str) -> None:
+    with pytest.raises(UserError, match="two workspaces"):
+        cli.main([name, "a.dnr", "-w", "b.dnr"], standalone_mode=False)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_no_workspace_is_said(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match="no workspace in"):
+        cli.main([name], standalone_mode=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_npm_the_runtime_is_refused_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DNRPIPE_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(vendor.shutil, "which", lambda name: None)
+    with pytest.raises(UserError, match="npm is not installed"):
+        vendor.runtime()
+    assert not (tmp_path / "cache").exists()
+
+
+@pytest.mark.parametrize(("script", "words"), [("exit 1", "did not deliver"), ("echo x > a.tgz", "other bytes")])
+def test_what_npm_delivers_is_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, words: str) -> None:
+    """No network, or a tampered archive: refused, and nothing is cached."""
+    npm = tmp_path / "npm"
+    npm.write_text(f"#!/bin/sh\n{script}\n")
+    npm.chmod(0o755)
+    monkeypatch.setenv("DNRPIPE_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(vendor.shutil, "which", lambda name: str(npm))
+    with pytest.raises(UserError, match=words):
+        vendor.runtime()
+    assert not (tmp_path / "cache").exists()
