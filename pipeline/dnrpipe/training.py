@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from dnrtrain.contract import View
-from dnrtrain.events import EpochEnd, Event, Note
+from dnrtrain.events import Diverged, EpochEnd, Event, Note
 
 from .base import RENDERED, base_path
 from .console import Bar, Console
@@ -141,6 +141,9 @@ def follow(
                 _book_epoch(event, stage, workspace, run_id, bar)
                 if event.skipped:
                     console.warn(f"epoch {event.epoch}: skipped {event.skipped} non-finite steps")
+            elif isinstance(event, Diverged):
+                workspace.ledger.append(_epoch_record(event, f"epoch {event.epoch} (diverged)", stage, run_id))
+                console.warn(event.text)
             elif isinstance(event, Note):
                 console.warn(event.text)
             yield event
@@ -149,20 +152,7 @@ def follow(
 def _book_epoch(
     event: EpochEnd, stage: Literal["select", "finetune"], workspace: Workspace, run_id: str, bar: Bar
 ) -> None:
-    workspace.ledger.append(
-        CostRecord(
-            time=time.time(),
-            run=run_id,
-            stage=stage,
-            purpose="training",
-            unit="epoch",
-            name=f"epoch {event.epoch}",
-            seconds=event.seconds,
-            cpu_seconds=event.cpu_seconds,
-            device=event.device,
-            steps=event.steps,
-        )
-    )
+    workspace.ledger.append(_epoch_record(event, f"epoch {event.epoch}", stage, run_id))
     behind = event.epoch - bar.done - 1  # epochs that an earlier run did
     if behind > 0:
         bar.advance(behind)
@@ -171,3 +161,20 @@ def _book_epoch(
     if "psnr" in event.val:
         note += f", val {event.val['psnr']:.2f} dB"
     bar.advance(note=note)
+
+
+def _epoch_record(
+    event: EpochEnd | Diverged, name: str, stage: Literal["select", "finetune"], run_id: str
+) -> CostRecord:
+    return CostRecord(
+        time=time.time(),
+        run=run_id,
+        stage=stage,
+        purpose="training",
+        unit="epoch",
+        name=name,
+        seconds=event.seconds,
+        cpu_seconds=event.cpu_seconds,
+        device=event.device,
+        steps=event.steps,
+    )

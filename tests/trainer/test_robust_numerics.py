@@ -183,6 +183,8 @@ def batch_of(height: int, width: int, foreground: str, base: str, display: Displ
     )  # fmt: skip
 
 
+foregrounds = st.sampled_from(("black", "one pixel", "white", "random"))
+bases = st.sampled_from(("black", "random", "hdr", "hdr pixel", "subnormal"))
 MODELS = {
     "vanilla": {"modalities": "uv"},
     "concat": {"aggregator": "concat"},
@@ -196,8 +198,7 @@ MODELS = {
 
 @pytest.mark.parametrize("name", MODELS)
 @settings(deadline=None, max_examples=16, derandomize=True)
-@given(height=sides, width=sides, foreground=st.sampled_from(("black", "one pixel", "white", "random")),
-       base=st.sampled_from(("black", "random", "hdr", "hdr pixel", "subnormal")), bfloat16=st.booleans(), shown=shown)  # fmt: skip
+@given(height=sides, width=sides, foreground=foregrounds, base=bases, bfloat16=st.booleans(), shown=shown)
 @example(height=8, width=8, foreground="black", base="hdr", bfloat16=False, shown="bright")
 @example(height=13, width=23, foreground="one pixel", base="hdr", bfloat16=True, shown="lut")
 @example(height=1, width=1, foreground="white", base="hdr pixel", bfloat16=True, shown="dark")
