@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from dnrtrain.contract import View
+from dnrtrain.display import NPZ_ERRORS
 
 from .console import Console
 from .costs import CostRecord
@@ -203,5 +204,5 @@ def _light_print(path: Path) -> str | None:
     try:
         with np.load(path, allow_pickle=False) as data:
             return str(data["fingerprint"])
-    except (OSError, ValueError, KeyError, EOFError):
+    except NPZ_ERRORS:
         return None

@@ -24,7 +24,7 @@ from .scene_files import read_frame, read_json, read_summary, scene_fingerprint
 from .settings import Settings
 from .stages import Outcome
 from .tasks import run_view_tasks, view_record, worker_count
-from .workspace import Workspace, digest
+from .workspace import Workspace, digest, file_sha256
 
 MAX_BAKE_ROUNDS = 4
 """Values whose need shows only after others are baked take further rounds; two are the rule."""
@@ -186,7 +186,13 @@ def _convert(workspace: Workspace, settings: Settings, console: Console, run_id:
             seconds=time.monotonic() - started,
         )
     )
-    write_json(marker, {"fingerprint": scene_fingerprint(workspace)})
+    # frame.json is not among them: near and far follow the cameras.
+    files = {
+        str(path.relative_to(workspace.scene)): file_sha256(path)
+        for path in sorted(workspace.scene.rglob("[!.]*"))
+        if path.is_file() and path.name != "frame.json"
+    }
+    write_json(marker, {"fingerprint": scene_fingerprint(workspace), "files": files})
     return summary
 
 

@@ -6,7 +6,7 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-from dnrtrain.contract import View
+from dnrtrain.contract import ContractError, View
 from dnrtrain.exr import read_metadata
 
 from .base import RENDERED, base_path, base_views
@@ -52,7 +52,10 @@ def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
     """(selected views on disk, selected views)."""
     if not workspace.selection.exists():
         return 0, settings.select.budget
-    names = read_selection(workspace)["views"]
+    try:
+        names = read_selection(workspace)["views"]
+    except ContractError:
+        return 0, settings.select.budget  # damaged: the stage mends it when it runs
     rendered = settings.model.base in RENDERED
     made = [
         workspace.raytraced("train", name).exists() and (not rendered or base_path(workspace, "train", name).exists())

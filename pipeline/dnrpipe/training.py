@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from dnrtrain.contract import View
+from dnrtrain.contract import DamagedFile, View
 from dnrtrain.events import Diverged, EpochEnd, Event, Note
 
 from .base import RENDERED, base_path
@@ -60,13 +61,21 @@ def finetune_progress(workspace: Workspace, settings: Settings) -> tuple[int, in
 
 
 def read_selection(workspace: Workspace) -> dict[str, Any]:
-    """``selection.json``. Raises UserError when there is none or it is damaged."""
+    """``selection.json``. Raises UserError: there is none. DamagedFile: it does not read, or names other views."""
+    path = workspace.selection
     try:
-        return json.loads(workspace.selection.read_text(encoding="utf-8"))
+        selection = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise UserError(f"{workspace.root}: no views selected yet; run `dnrpipe select` first") from None
-    except (json.JSONDecodeError, UnicodeDecodeError):
-        raise UserError(f"{workspace.selection}: damaged; run `dnrpipe select --force`") from None
+    except (ValueError, RecursionError) as error:
+        raise DamagedFile(path, str(error)) from None
+    names = selection.get("views") if isinstance(selection, dict) else None
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise DamagedFile(path, "has no list of views")
+    unknown = sorted(set(names) - {view.name for view in split_views(workspace).get("train", [])})
+    if unknown:
+        raise DamagedFile(path, f"views {', '.join(unknown)[:200]} are no candidates")
+    return selection
 
 
 def load(
@@ -121,9 +130,9 @@ def epochs_done(folder: Path, wanted: int, finished: bool) -> tuple[int, int]:
         return wanted, wanted
     for name in ("checkpoint.json", "model.json"):
         path = folder / name
-        if path.exists():
+        with contextlib.suppress(OSError, ValueError, TypeError, AttributeError, RecursionError):
             return min(int(json.loads(path.read_text()).get("epoch", 0)), wanted - 1), wanted
-    return 0, wanted
+    return 0, wanted  # no epoch, or a damaged book of them: the stage itself reads the weights
 
 
 def follow(

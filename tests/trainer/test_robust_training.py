@@ -7,7 +7,6 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -173,23 +172,20 @@ def test_identical_views(scene: Scene, tmp_path: Path) -> None:
     assert epochs[-1].losses["photometric"] < epochs[0].losses["photometric"]
 
 
+@pytest.mark.slow
 def test_bfloat16_ends_where_float32_does(scene: Scene, tmp_path: Path) -> None:
-    """Held-out PSNR within 0.1 dB, mean of two seeds, averaged weights (single runs differ by more than that)."""
+    """Held-out PSNR within 0.1 dB once the learning rate has fallen far enough for a run to come to rest."""
     target = scene.held_out.tensors.target
     assert target is not None
+    changes = {"epochs": 40, "ema": 0.97, "learning_rate_end": 1e-5, "augment": False}
     scores = {}
     for precision in ("float32", "bfloat16"):
-        values = []
-        for seed in range(2):
-            settings = FRESH.model_copy(
-                update={"precision": precision, "epochs": 25, "ema": 0.97, "learning_rate": 3e-3, "augment": False}
-            )
-            folder = tmp_path / f"{precision}{seed}"
-            list(events_of(scene.traced, folder, settings, MODEL.model_copy(update={"width": 8}), seed))
-            values.append(float(psnr(render_views(load_model(folder / "step2"), scene.held_out), target).mean()))
-        scores[precision] = float(np.mean(values))
+        settings = FRESH.model_copy(update={**changes, "precision": precision})
+        fine_tune(scene.traced, tmp_path / precision, settings, MODEL.model_copy(update={"width": 16}))
+        pictures = render_views(load_model(tmp_path / precision / "step2"), scene.held_out)
+        scores[precision] = float(psnr(pictures, target).mean())
     print(scores)
-    assert min(scores.values()) > 15
+    assert min(scores.values()) > 22
     assert abs(scores["float32"] - scores["bfloat16"]) < 0.1
 
 

@@ -91,8 +91,8 @@ class DamagedFile(ContractError):
     """
 
     def __init__(self, path: Path | str, reason: str) -> None:
-        super().__init__(f"{path}: damaged ({' '.join(reason.split())}); delete it and run its stage again")
-        self.path = Path(path)
+        self.path, self.reason = Path(path), " ".join(reason.split())
+        super().__init__(f"{path}: damaged ({self.reason}); delete it and run its stage again")
 
 
 class View(BaseModel):

@@ -15,6 +15,7 @@ from .. import __version__
 from . import information, pictures, scene, stages
 from .ablate import ablate
 from .bench_select import bench_select
+from .verify import verify
 
 
 class _Group(click.Group):
@@ -57,6 +58,7 @@ for _command in (
     ablate,
     bench_select,
     information.status,
+    verify,
     information.costs,
     information.doctor,
     information.weights,
