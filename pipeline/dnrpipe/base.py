@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from dnrtrain.contract import View
-from dnrtrain.display import NPZ_ERRORS
+from dnrtrain.contract import NPZ_ERRORS, View
 
 from .console import Console
 from .costs import CostRecord

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from dnrtrain.contract import DamagedFile, View
+from dnrtrain.contract import DamagedFile, View, read_cameras
 from dnrtrain.events import Diverged, EpochEnd, Event, Note
 
 from .base import RENDERED, base_path
@@ -72,7 +72,8 @@ def read_selection(workspace: Workspace) -> dict[str, Any]:
     names = selection.get("views") if isinstance(selection, dict) else None
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise DamagedFile(path, "has no list of views")
-    unknown = sorted(set(names) - {view.name for view in split_views(workspace).get("train", [])})
+    cameras = workspace.cameras("train")
+    unknown = sorted(set(names) - {view.name for view in read_cameras(cameras)}) if cameras.exists() else []
     if unknown:
         raise DamagedFile(path, f"views {', '.join(unknown)[:200]} are no candidates")
     return selection

@@ -37,15 +37,17 @@ def examine(workspace: Workspace, console: Console) -> tuple[int, list[Fault]]:
     with console.bar("checking files", len(work)) as bar:
         for path, check in work:
             try:
+                bar.advance(note=path.name)
                 check(path)
             except DamagedFile as damage:
+                if damage.path != path:  # a file that this one refers to; it has its own check
+                    continue
                 owner = owner_of(path, workspace)
                 faults.append(Fault(path, f"damaged ({damage.reason})", owner.command if owner else None))
             except (ContractError, UserError, OSError) as error:
                 text = str(error).removeprefix(f"{path}: ")
                 owner = owner_of(path, workspace)
                 faults.append(Fault(path, text, owner.command if owner else None))
-            bar.advance(note=path.name)
     faults += [Fault(path, "left behind by a run that was killed", None, True) for path in _litter(workspace.root)]
     return len(work), faults
 
@@ -166,7 +168,7 @@ def _picture(path: Path) -> None:
 def _archive(path: Path) -> None:
     import numpy as np
 
-    from dnrtrain.display import NPZ_ERRORS
+    from dnrtrain.contract import NPZ_ERRORS
 
     try:
         with np.load(path, allow_pickle=False) as data:

@@ -36,6 +36,8 @@ from __future__ import annotations
 import json
 import math
 import re
+import zipfile
+import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -78,6 +80,13 @@ BASE_CHANNELS = (
 )
 SPLITS = ("train", "val", "test")
 Split = Literal["train", "val", "test", "novel"]
+
+
+NPZ_ERRORS = (
+    *(OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, RuntimeError),
+    *(zipfile.BadZipFile, zlib.error),
+)
+"""What reading a damaged npz file may raise: numpy passes zip's and deflate's own errors through."""
 
 
 class ContractError(ValueError):

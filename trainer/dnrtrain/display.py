@@ -7,8 +7,6 @@ sRGB opto-electronic transfer function (IEC 61966-2-1), then Blender's extra gam
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +14,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .contract import DamagedFile, SceneFrame
+from .contract import NPZ_ERRORS, DamagedFile, SceneFrame
 from .precision import at_least_float32
 
-NPZ_ERRORS = (OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error)
-"""What reading a damaged npz file may raise (numpy passes zip's and deflate's own errors through)."""
 MAX_LUT_BYTES = 64 << 20
 ALPHA_FLOOR = 1e-6
 GAMMA_FLOOR = 1e-6

@@ -6,8 +6,10 @@ checksum of names and pixels in the header.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
+import io
 import json
 import os
 from collections.abc import Mapping
@@ -72,7 +74,11 @@ def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     try:
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
             _refuse_bomb(file.header(), Path(path).stat().st_size)
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        # The binding prints what is wrong with a file on standard output, where commands print their JSON.
+        with (
+            contextlib.redirect_stdout(io.StringIO()),
+            OpenEXR.File(str(path), separate_channels=True) as file,
+        ):
             channels = {k: np.asarray(c.pixels, dtype=np.float32) for k, c in file.channels().items()}
             header = file.header()
             metadata = _metadata(header)

@@ -11,7 +11,7 @@ import numpy as np
 
 from dnrpipe.errors import UserError
 from dnrtrain.atomic import atomic_path
-from dnrtrain.display import NPZ_ERRORS
+from dnrtrain.contract import NPZ_ERRORS
 
 from .engine import Engine
 from .lightmap import LightBaker
