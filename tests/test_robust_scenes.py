@@ -1,6 +1,6 @@
-"""Geometry, light and cameras that break renderers, end to end: converted, path-traced and rasterised.
+"""Geometry, light and cameras that break renderers, end to end: converted and path-traced.
 
-Metamorphic: what must not matter (scale, place, names, order, splitting, broken neighbours) leaves the picture as it is.
+Metamorphic: what must not matter (scale, place, names, splitting, broken neighbours) leaves the picture as it is.
 """
 
 from __future__ import annotations

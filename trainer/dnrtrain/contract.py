@@ -137,6 +137,8 @@ class View(BaseModel):
         if not np.isfinite(matrix).all():
             raise ValueError("transform contains NaN or infinity")
         rotation = matrix[:3, :3]
+        if np.abs(rotation).max() > 2:  # their products may overflow
+            raise ValueError("transform is not a rotation and a translation (scaled, sheared or mirrored)")
         if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
             raise ValueError("transform is not a rotation and a translation (scaled, sheared or mirrored)")
         return value
