@@ -42,10 +42,10 @@ class Worker:
 
 
 class Made:
-    """One scene after conversion, a traced view and its G-buffer; ``error`` where any of it failed."""
+    """One scene after conversion, a traced view and what was said; ``error`` where any of it failed."""
 
-    def __init__(self, error: str | None, image: Any = None, passes: Any = None, numbers: Any = None) -> None:
-        self.error, self.image, self.passes, self.numbers = error, image, passes, numbers or {}
+    def __init__(self, error: str | None, image: Any = None, numbers: Any = None, warnings: Any = ()) -> None:
+        self.error, self.image, self.numbers, self.warnings = error, image, numbers or {}, list(warnings)
 
 
 @pytest.fixture(scope="module")
@@ -62,11 +62,12 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Made]:
         source = robust_scenes.save(builder, folders[name] / "a.blend")
         tasks.append({"source": str(source), "scene_dir": str(folders[name] / "scene"), "name": name})
     found: dict[str, Made] = {}
-    views = {}
+    views, said = {}, {}
     for name, outcome in _outcomes("dnrpipe.blender.prepare", tasks, log).items():
         if outcome.result is None:
             found[name] = Made(f"conversion: {outcome.error}")
             continue
+        said[name] = outcome.result["warnings"]
         settings = CameraSettings(source="scene", train=1, val=0, test=0, width=SIDE, height=SIDE)
         (views[name],) = make_cameras(outcome.result, settings)["train"]
         near, far = depth_range([views[name]], outcome.result)
@@ -85,7 +86,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Made]:
             found[name] = Made(f"ray tracing: {outcome.error}")
             continue
         channels, _ = read_exr(folders[name] / "traced.exr")
-        found[name] = Made(None, np.stack([channels[c] for c in "RGBA"], -1), numbers=outcome.result)
+        found[name] = Made(None, np.stack([channels[c] for c in "RGBA"], -1), outcome.result, said[name])
     return found
 
 
@@ -102,7 +103,10 @@ def _outcomes(module: str, tasks: list[dict[str, Any]], log: Path, **options: An
 
 @pytest.mark.parametrize("name", list(robust_scenes.SAME)[1:])
 def test_what_must_not_matter_does_not(name: str, made: dict[str, Made]) -> None:
-    """The picture is the plain still life's: mean within 1.5 %, pixels within noise but for single edge pixels."""
+    """The picture is the plain still life's: mean within 1.5 %, pixels within noise but for single edge pixels.
+
+    1e5 units from the origin float32 leaves steps of 0.008 in a scene of 3 units: warned, and within 6 %.
+    """
     ours, plain = made[name], made["as it is"]
     assert ours.error is None, ours.error
     assert np.isfinite(ours.image).all()
@@ -111,7 +115,9 @@ def test_what_must_not_matter_does_not(name: str, made: dict[str, Made]) -> None
     difference = np.abs(ours.image - plain.image)[..., :3].max(-1)
     if name == "again":
         assert difference.max() == 0
-    assert ours.image[..., :3].mean() == pytest.approx(plain.image[..., :3].mean(), rel=0.015)
+    tolerance = 0.06 if name == "1e5 away" else 0.015
+    assert ours.image[..., :3].mean() == pytest.approx(plain.image[..., :3].mean(), rel=tolerance)
+    assert (name == "1e5 away") == any("move it to the origin" in line for line in ours.warnings)
     assert np.quantile(difference, 0.9) < 0.1, np.quantile(difference, 0.9)
 
 
