@@ -25,7 +25,7 @@ from .executors import Retry, run_tasks
 from .raytrace.variants import choose_variant
 from .scene_files import scene_fingerprint
 from .settings import Settings
-from .tasks import run_view_tasks, task_name, view_record
+from .tasks import run_view_tasks, task_name, view_record, warn_repairs
 from .workspace import Workspace, digest
 
 LIGHT_VERSION, BASE_VERSION = 5, 11
@@ -105,6 +105,7 @@ def base_views(
         book=book,
         environment=environment,
     )
+    warn_repairs(tasks, console)
     return tasks
 
 

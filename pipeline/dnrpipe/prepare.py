@@ -23,7 +23,7 @@ from .finding_lines import finding_lines
 from .scene_files import read_frame, read_json, read_summary, scene_fingerprint
 from .settings import Settings
 from .stages import Outcome
-from .tasks import run_view_tasks, view_record, worker_count
+from .tasks import run_view_tasks, view_record, warn_repairs, worker_count
 from .workspace import Workspace, digest, file_sha256
 
 MAX_BAKE_ROUNDS = 4
@@ -69,6 +69,7 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
         workers=worker_count(settings.passes.workers),
         book=book,
     )
+    warn_repairs(tasks, console)
     return Outcome(
         # Views, scene and engine are all in the tasks' fingerprints.
         digest([[Path(task["output"]).parent.name, task["fingerprint"]] for task in tasks]),

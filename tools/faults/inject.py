@@ -296,11 +296,9 @@ def _chosen(workspace: Path) -> set[str]:
 def campaign(kills: int, seed: int) -> dict[str, list[Callable[[Bench, Path], Result]]]:
     """All faults by kind; ``kills`` are spread evenly over the stages."""
     dice = random.Random(seed)
-    names = list(COMMANDS)
+    turns = itertools.cycle(COMMANDS)
     plan: dict[str, list[Callable[[Bench, Path], Result]]] = {
-        "kill": [
-            lambda b, f, s=stage: kill(b, f, s, dice) for stage in itertools.islice(itertools.cycle(names), kills)
-        ],
+        "kill": [lambda b, f, s=stage: kill(b, f, s, dice) for stage in itertools.islice(turns, kills)],
         "worker": [
             lambda b, f, s=stage, n=number: worker_dies(b, f, s, n)
             for stage in ("prepare", "raytrace")
