@@ -45,9 +45,9 @@ def verify(workspace: str | None, named: str | None, repair: bool, as_json: bool
     else:
         for fault in faults:
             click.echo(f"{fault.path}: {fault.reason}")
-        click.echo(
-            f"{checked} files checked, {len(faults)} with a fault" + (", thrown away" if repair and faults else "")
-        )
+        kept = sum(fault.path.exists() for fault in faults)
+        gone = f", {len(faults) - kept} thrown away, {kept} kept: no stage makes them" if repair and faults else ""
+        click.echo(f"{checked} files checked, {len(faults)} with a fault{gone}")
         if due:
             click.echo("next: " + ", ".join(f"dnrpipe {command}" for command in due))
         elif faults and not repair:
