@@ -82,3 +82,14 @@ def test_verify_finds_everything_and_repair_clears_the_way(copy: Path) -> None:
 
 def _source(workspace: Path) -> str:
     return json.loads((workspace / "manifest.json").read_text())["source"]["path"]
+
+
+def test_the_number_of_processes_changes_no_bit(copy: Path) -> None:
+    """Ray tracing by one worker and by three: the same pixels (the seed of a view is its own)."""
+    expected = {name: value for name, value in contents(copy).items() if name.startswith("raytraced/train")}
+    assert len(expected) == 3
+    for workers in (1, 3):
+        shutil.rmtree(copy / "raytraced" / "train")
+        run("raytrace-selected", "--set", f"raytrace.workers={workers}", folder=copy)
+        again = {name: value for name, value in contents(copy).items() if name.startswith("raytraced/train")}
+        assert again == expected
