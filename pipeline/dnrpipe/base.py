@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from dnrtrain.contract import View
+from dnrtrain.contract import NPZ_ERRORS, View
 
 from .console import Console
 from .costs import CostRecord
@@ -25,7 +25,7 @@ from .executors import Retry, run_tasks
 from .raytrace.variants import choose_variant
 from .scene_files import scene_fingerprint
 from .settings import Settings
-from .tasks import run_view_tasks, task_name, view_record
+from .tasks import run_view_tasks, task_name, view_record, warn_repairs
 from .workspace import Workspace, digest
 
 LIGHT_VERSION, BASE_VERSION = 5, 11
@@ -116,6 +116,7 @@ def base_views(
         book=book,
         environment=environment,
     )
+    warn_repairs(tasks, console)
     return tasks
 
 
@@ -214,5 +215,5 @@ def _light_print(path: Path) -> str | None:
     try:
         with np.load(path, allow_pickle=False) as data:
             return str(data["fingerprint"])
-    except (OSError, ValueError, KeyError, EOFError):
+    except NPZ_ERRORS:
         return None

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from dnrtrain.atomic import atomic_path, write_json
-from dnrtrain.contract import View
+from dnrtrain.contract import ContractError, View
 from dnrtrain.exr import read_metadata
 
 from .base import RENDERED, base_path, base_views
@@ -105,7 +105,10 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
 
 def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
     """(test views measured, test views)."""
-    views = split_views(workspace).get("test", [])
+    try:
+        views = split_views(workspace).get("test", [])
+    except ContractError:
+        views = []  # damaged: the stage mends it when it runs
     if not views:
         return 0, settings.cameras.test
     done = sum((workspace.evaluation / f"{view.name}.flip.png").exists() for view in views)

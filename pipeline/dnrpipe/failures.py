@@ -52,6 +52,10 @@ def _explain_os(error: OSError) -> tuple[str, int] | None:
     where = error.filename or "the workspace"
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return f"{where}: the disk is full; free some space and run the same command to go on", 2
+    if error.errno == errno.EFBIG:
+        return f"{where}: the system allows no file as large as this (`ulimit -f`); raise the limit and run again", 2
+    if error.errno == errno.EIO:
+        return f"{where}: cannot be read or written ({error.strerror or error}); check the disk", 2
     if error.errno in (errno.EACCES, errno.EROFS, errno.EPERM):
         return f"{where}: cannot be written (read-only or not yours); choose another folder with -w", 2
     if error.errno in (errno.ENOTDIR, errno.EISDIR):

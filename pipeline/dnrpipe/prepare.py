@@ -23,8 +23,8 @@ from .finding_lines import finding_lines
 from .scene_files import read_frame, read_json, read_summary, scene_fingerprint
 from .settings import Settings
 from .stages import Outcome
-from .tasks import run_view_tasks, view_record, worker_count
-from .workspace import Workspace, digest
+from .tasks import run_view_tasks, view_record, warn_repairs, worker_count
+from .workspace import Workspace, digest, file_sha256
 
 MAX_BAKE_ROUNDS = 4
 """Values whose need shows only after others are baked take further rounds; two are the rule."""
@@ -69,6 +69,7 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
         workers=worker_count(settings.passes.workers),
         book=book,
     )
+    warn_repairs(tasks, console)
     return Outcome(
         # Views, scene and engine are all in the tasks' fingerprints.
         digest([[Path(task["output"]).parent.name, task["fingerprint"]] for task in tasks]),
@@ -186,7 +187,13 @@ def _convert(workspace: Workspace, settings: Settings, console: Console, run_id:
             seconds=time.monotonic() - started,
         )
     )
-    write_json(marker, {"fingerprint": scene_fingerprint(workspace)})
+    # frame.json is not among them: near and far follow the cameras.
+    files = {
+        str(path.relative_to(workspace.scene)): file_sha256(path)
+        for path in sorted(workspace.scene.rglob("[!.]*"))
+        if path.is_file() and path.name != "frame.json"
+    }
+    write_json(marker, {"fingerprint": scene_fingerprint(workspace), "files": files})
     return summary
 
 

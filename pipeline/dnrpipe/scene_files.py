@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from dnrtrain.contract import SceneFrame
+from dnrtrain.contract import DamagedFile, SceneFrame
 
 from .errors import UserError
 from .workspace import Workspace, digest, file_sha256
@@ -18,13 +18,13 @@ SCENE_VERSION = 6  # raise when the conversion or the G-buffer scene changes wha
 
 
 def read_json(path: Path) -> Any:
-    """JSON that an earlier stage wrote. Raises UserError when it is missing or damaged."""
+    """JSON that an earlier stage wrote. Raises UserError when it is missing, DamagedFile when it does not read."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise UserError(f"{path}: is missing; run `dnrpipe prepare --force`") from None
-    except ValueError:
-        raise UserError(f"{path}: damaged; run `dnrpipe prepare --force`") from None
+    except (ValueError, RecursionError) as error:
+        raise DamagedFile(path, str(error)) from None
 
 
 def read_summary(workspace: Workspace) -> dict[str, Any]:
@@ -33,21 +33,24 @@ def read_summary(workspace: Workspace) -> dict[str, Any]:
 
 
 def read_frame(workspace: Workspace) -> SceneFrame:
-    """``scene/frame.json``. Raises UserError when it is missing or damaged."""
+    """``scene/frame.json``. Raises UserError when it is missing, DamagedFile when it does not read."""
     path = workspace.scene / "frame.json"
     try:
         return SceneFrame.model_validate(read_json(path))
-    except ValidationError:
-        raise UserError(f"{path}: damaged; run `dnrpipe prepare --force`") from None
+    except ValidationError as error:
+        raise DamagedFile(path, error.errors()[0]["msg"]) from None
 
 
 def scene_fingerprint(workspace: Workspace) -> str:
     """Hash of what the scene is converted from: the scene file and the files it refers to.
 
-    A file that is gone counts as it was: a workspace lives without its sources.
+    A file that is gone counts as it was: a workspace lives without its sources. A damaged summary counts as none.
     """
     summary = workspace.scene / "summary.json"
-    content = read_json(summary) if summary.exists() else {}
+    try:
+        content = read_json(summary) if summary.exists() else {}
+    except DamagedFile:
+        content = {}
     recorded: dict[str, str] = content.get("external", {})
     current = {name: _sha256_now(Path(name)) if Path(name).is_file() else sha for name, sha in recorded.items()}
     # Without their folders: moving a scene with its textures changes nothing.

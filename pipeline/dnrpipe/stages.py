@@ -215,13 +215,58 @@ def run_stage(
     workspace.manifest.versions = {"dnrpipe": __version__, "python": platform.python_version()}
     workspace.manifest.settings = settings.model_dump(mode="json")
     workspace.save()
-    outcome: Outcome = _call(stage.run, workspace, settings, console, run_id)
+    outcome = _run_mending(stage, workspace, settings, console, run_id)
     seconds = time.monotonic() - started
     done = fingerprint(stage, workspace, settings)
     assert done is not None  # its inputs were required above
     workspace.finish_stage(name, fingerprint=done, output=outcome.output, seconds=seconds, detail=outcome.detail)
     console.say(f"{stage.command}: done in {clock(seconds)}")
     return {"stage": name, "ran": True, "seconds": seconds, **outcome.detail}
+
+
+def _run_mending(stage: Stage, workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
+    """Run the stage; a damaged file that it meets is named, thrown away and made again by the stage it is from.
+
+    Raises DamagedFile: the file is of no stage, or was damaged again.
+    """
+    from dnrtrain.contract import DamagedFile
+
+    met: set[Path] = set()
+    while True:
+        try:
+            return _call(stage.run, workspace, settings, console, run_id)
+        except DamagedFile as damage:
+            owner = owner_of(damage.path, workspace)
+            if owner is None or damage.path in met:
+                raise
+            met.add(damage.path)
+            console.warn(f"{damage.path}: damaged ({damage.reason}); `dnrpipe {owner.command}` makes it again")
+            discard(damage.path, owner, workspace)
+            if owner.name != stage.name:
+                run_stage(owner.name, workspace, settings, console)
+
+
+def owner_of(path: Path, workspace: Workspace) -> Stage | None:
+    """The stage that writes ``path``, or None for files of no stage and files outside the workspace."""
+    try:
+        inside = path.resolve().relative_to(workspace.root.resolve())
+    except ValueError:
+        return None
+    for stage in STAGES.values():
+        if any(inside.is_relative_to(written) for written in stage.writes):
+            return stage
+    return None
+
+
+def discard(path: Path, owner: Stage, workspace: Workspace) -> None:
+    """Remove a damaged file such that its stage is due. Without its last file a converted scene is none."""
+    path.unlink(missing_ok=True)
+    if path.resolve().is_relative_to(workspace.scene.resolve()):
+        (workspace.scene / "prepared.json").unlink(missing_ok=True)
+    record = workspace.manifest.stages.get(owner.name)
+    if record is not None:
+        record.fingerprint = ""
+        workspace.save()
 
 
 def require_inputs(stage: Stage, workspace: Workspace, settings: Settings) -> None:

@@ -118,3 +118,13 @@ def view_record(
         noise=result.get("noise"),
         detail={k: v for k, v in result.items() if k not in known},
     )
+
+
+def warn_repairs(tasks: Sequence[dict[str, Any]], console: Console) -> None:
+    """Say which views hold pixels that were not finite: traced or read again, or set to zero."""
+    for task in tasks:
+        metadata = read_metadata(Path(task["output"])) or {}
+        repaired, masked = int(metadata.get("repaired") or 0), int(metadata.get("masked") or 0)
+        if repaired or masked:
+            rest = f", {masked} more set to zero" if masked else ""
+            console.warn(f"repaired: {repaired} pixels in view {task_name(task)} that were not finite{rest}")

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import zlib
-from pathlib import Path
 from typing import Any
 
-from dnrtrain.contract import View
-from dnrtrain.exr import read_metadata
+from dnrtrain.contract import ContractError, View
 
 from .base import RENDERED, base_path, base_views
 from .console import Console
@@ -17,7 +15,7 @@ from .prepare import split_views
 from .scene_files import scene_fingerprint
 from .settings import Settings
 from .stages import Outcome
-from .tasks import is_made, run_view_tasks, view_record, worker_count
+from .tasks import is_made, run_view_tasks, view_record, warn_repairs, worker_count
 from .training import read_selection
 from .workspace import Workspace, digest
 
@@ -52,7 +50,10 @@ def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
     """(selected views on disk, selected views)."""
     if not workspace.selection.exists():
         return 0, settings.select.budget
-    names = read_selection(workspace)["views"]
+    try:
+        names = read_selection(workspace)["views"]
+    except ContractError:
+        return 0, settings.select.budget  # damaged: the stage mends it when it runs
     rendered = settings.model.base in RENDERED
     made = [
         workspace.raytraced("train", name).exists() and (not rendered or base_path(workspace, "train", name).exists())
@@ -126,20 +127,10 @@ def trace_views(
         book=book,
         environment=choice.environment,
     )
-    _warn_repairs(tasks, console)
+    warn_repairs(tasks, console)
     return tasks
 
 
 def view_seed(seed: int, split: str, name: str) -> int:
     """A seed of its own for every view, stable across runs and machines; below 2^18 (passes add bits)."""
     return zlib.crc32(f"{seed}/{split}/{name}".encode()) & 0x3FFFF
-
-
-def _warn_repairs(tasks: list[dict[str, Any]], console: Console) -> None:
-    for task in tasks:
-        metadata = read_metadata(Path(task["output"])) or {}
-        if metadata.get("repaired") or metadata.get("masked"):
-            console.warn(
-                f"view {task['view']['name']}: repaired {metadata['repaired']} non-finite pixels by tracing"
-                f" them again, set {metadata['masked']} to zero"
-            )

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from dnrtrain.contract import View
-from dnrtrain.events import EpochEnd, Event, Note
+from dnrtrain.contract import DamagedFile, View, read_cameras
+from dnrtrain.events import Diverged, EpochEnd, Event, Note
 
 from .base import RENDERED, base_path
 from .console import Bar, Console
@@ -60,13 +61,22 @@ def finetune_progress(workspace: Workspace, settings: Settings) -> tuple[int, in
 
 
 def read_selection(workspace: Workspace) -> dict[str, Any]:
-    """``selection.json``. Raises UserError when there is none or it is damaged."""
+    """``selection.json``. Raises UserError: there is none. DamagedFile: it does not read, or names other views."""
+    path = workspace.selection
     try:
-        return json.loads(workspace.selection.read_text(encoding="utf-8"))
+        selection = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise UserError(f"{workspace.root}: no views selected yet; run `dnrpipe select` first") from None
-    except (json.JSONDecodeError, UnicodeDecodeError):
-        raise UserError(f"{workspace.selection}: damaged; run `dnrpipe select --force`") from None
+    except (ValueError, RecursionError) as error:
+        raise DamagedFile(path, str(error)) from None
+    names = selection.get("views") if isinstance(selection, dict) else None
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise DamagedFile(path, "has no list of views")
+    cameras = workspace.cameras("train")
+    unknown = sorted(set(names) - {view.name for view in read_cameras(cameras)}) if cameras.exists() else []
+    if unknown:
+        raise DamagedFile(path, f"views {', '.join(unknown)[:200]} are no candidates")
+    return selection
 
 
 def load(
@@ -121,9 +131,9 @@ def epochs_done(folder: Path, wanted: int, finished: bool) -> tuple[int, int]:
         return wanted, wanted
     for name in ("checkpoint.json", "model.json"):
         path = folder / name
-        if path.exists():
+        with contextlib.suppress(OSError, ValueError, TypeError, AttributeError, RecursionError):
             return min(int(json.loads(path.read_text()).get("epoch", 0)), wanted - 1), wanted
-    return 0, wanted
+    return 0, wanted  # no epoch, or a damaged book of them: the stage itself reads the weights
 
 
 def follow(
@@ -141,6 +151,9 @@ def follow(
                 _book_epoch(event, stage, workspace, run_id, bar)
                 if event.skipped:
                     console.warn(f"epoch {event.epoch}: skipped {event.skipped} non-finite steps")
+            elif isinstance(event, Diverged):
+                workspace.ledger.append(_epoch_record(event, f"epoch {event.epoch} (diverged)", stage, run_id))
+                console.warn(event.text)
             elif isinstance(event, Note):
                 console.warn(event.text)
             yield event
@@ -149,20 +162,7 @@ def follow(
 def _book_epoch(
     event: EpochEnd, stage: Literal["select", "finetune"], workspace: Workspace, run_id: str, bar: Bar
 ) -> None:
-    workspace.ledger.append(
-        CostRecord(
-            time=time.time(),
-            run=run_id,
-            stage=stage,
-            purpose="training",
-            unit="epoch",
-            name=f"epoch {event.epoch}",
-            seconds=event.seconds,
-            cpu_seconds=event.cpu_seconds,
-            device=event.device,
-            steps=event.steps,
-        )
-    )
+    workspace.ledger.append(_epoch_record(event, f"epoch {event.epoch}", stage, run_id))
     behind = event.epoch - bar.done - 1  # epochs that an earlier run did
     if behind > 0:
         bar.advance(behind)
@@ -171,3 +171,20 @@ def _book_epoch(
     if "psnr" in event.val:
         note += f", val {event.val['psnr']:.2f} dB"
     bar.advance(note=note)
+
+
+def _epoch_record(
+    event: EpochEnd | Diverged, name: str, stage: Literal["select", "finetune"], run_id: str
+) -> CostRecord:
+    return CostRecord(
+        time=time.time(),
+        run=run_id,
+        stage=stage,
+        purpose="training",
+        unit="epoch",
+        name=name,
+        seconds=event.seconds,
+        cpu_seconds=event.cpu_seconds,
+        device=event.device,
+        steps=event.steps,
+    )

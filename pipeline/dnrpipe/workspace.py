@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from dnrtrain.atomic import write_json
 
@@ -74,6 +74,19 @@ class Manifest(BaseModel):
     settings: dict[str, Any] = Field(default_factory=dict)
     stages: dict[str, StageRecord] = Field(default_factory=dict)
     versions: dict[str, str] = Field(default_factory=dict)
+
+    @field_validator("stages")
+    @classmethod
+    def _counted(cls, stages: dict[str, StageRecord]) -> dict[str, StageRecord]:
+        """What other commands read of a record is there."""
+        if "prepare" in stages:
+            views = stages["prepare"].detail.get("views")
+            counted = isinstance(views, dict) and "train" in views and all(type(n) is int for n in views.values())
+            if not counted:
+                raise ValueError("stage prepare does not say how many views it has")
+        if "raytrace" in stages and not isinstance(stages["raytrace"].detail.get("views"), list):
+            raise ValueError("stage raytrace does not say which views it has")
+        return stages
 
 
 class DamagedManifest(UserError):
@@ -140,7 +153,7 @@ class Workspace:
             data = json.loads(path.read_text(encoding="utf-8"))
         except FileNotFoundError:
             raise UserError(f"{root}: not a dnrpipe workspace; make one with `dnrpipe prepare SCENE`") from None
-        except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        except (ValueError, RecursionError) as error:
             raise DamagedManifest(f"{path}: damaged ({error}); run `dnrpipe prepare SCENE` again") from None
         schema = data.get("schema") if isinstance(data, dict) else None
         if isinstance(schema, int) and schema > SCHEMA:

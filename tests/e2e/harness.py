@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
+from tools.faults.workspaces import contents
+
+__all__ = ["STAGES", "TINY", "command", "contents", "environment", "image", "run"]
 
 # 64², 6 candidates, a few epochs: everything runs, nothing takes long.
 TINY = {
@@ -45,27 +47,6 @@ def run(*arguments: str, folder: Path, check: bool = True, **extra: str) -> subp
     if check and done.returncode != 0:
         raise AssertionError(f"dnrpipe {' '.join(arguments)} ended with {done.returncode}:\n{done.stderr}")
     return done
-
-
-def contents(workspace: Path) -> dict[str, object]:
-    """What a run made, without times: pixels of every EXR, the selection, metrics, bytes of the weights."""
-    from dnrtrain.exr import read_exr
-
-    found: dict[str, object] = {}
-    for path in sorted(workspace.rglob("[!.]*.exr")):
-        if path.is_relative_to(workspace / "scene"):
-            continue
-        channels, _ = read_exr(path)
-        found[str(path.relative_to(workspace))] = {k: v.tobytes() for k, v in channels.items()}
-    found["selection"] = json.loads((workspace / "selection.json").read_text())
-    for path in sorted(workspace.rglob("model.safetensors")):
-        found[str(path.relative_to(workspace))] = path.read_bytes()
-    metrics = json.loads((workspace / "evaluation" / "metrics.json").read_text())
-    found["metrics"] = [
-        [round(v, 6) for k, v in sorted(row.items()) if isinstance(v, float) and not k.startswith("seconds")]
-        for row in metrics["views"]
-    ]
-    return found
 
 
 def image(path: Path) -> np.ndarray:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from e2e_harness import STAGES, command, contents, environment, image, run
+from tools.faults.workspaces import forget, torn
 
 from dnrpipe.costs import Ledger
 from dnrtrain.exr import read_exr
@@ -180,7 +181,7 @@ def test_killed_anywhere_and_run_again_gives_the_same(stage: str, tiny: Path, tm
     if start > 0:
         shutil.copytree(tiny, copy)
         for later in STAGES[start:]:
-            _forget(copy, names[later])
+            forget(copy, names[later])
     rng = random.Random(stage)
     arguments = ("prepare", str(demo_blend)) if stage == "prepare" else (stage,)
     for _ in range(3):
@@ -190,43 +191,18 @@ def test_killed_anywhere_and_run_again_gives_the_same(stage: str, tiny: Path, tm
         time.sleep(rng.uniform(0.3, 1.0) * (1.0 + seconds[names[stage]]["seconds"]))
         process.send_signal(signal.SIGKILL)
         process.wait()
-        assert not _torn(copy)
+        assert not torn(copy)
     run(*arguments, folder=tmp_path)
     for later in STAGES[start + 1 :]:
         run(later, folder=tmp_path)
     assert contents(copy) == expected
 
 
-def _forget(workspace: Path, stage: str) -> None:
-    """Bring a finished workspace back to before ``stage``."""
-    from dnrpipe.stages import STAGES as ALL
-    from dnrpipe.stages import clear
-    from dnrpipe.workspace import Workspace
-
-    clear(ALL[stage], Workspace.open(workspace))
-
-
-def _torn(workspace: Path) -> list[Path]:
-    """Files under their final name that do not read: there must be none at any moment."""
-    from dnrtrain.contract import ContractError
-
-    torn = []
-    for path in workspace.rglob("[!.]*"):
-        try:
-            if path.suffix == ".exr" and not path.is_relative_to(workspace / "scene"):
-                read_exr(path)
-            elif path.suffix == ".json":
-                json.loads(path.read_text())
-        except (ContractError, ValueError):
-            torn.append(path)
-    return torn
-
-
 def test_interrupt_is_exit_code_130_and_resumable(tmp_path: Path, tiny: Path) -> None:
     copy = tmp_path / "demo.dnr"
     shutil.copytree(tiny, copy)
     for name in ("finetune", "evaluate"):
-        _forget(copy, name)
+        forget(copy, name)
     progress = copy / "checkpoints" / "step2" / "checkpoint.json"
     process = subprocess.Popen(
         command("finetune", "--epochs", "30"), cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True

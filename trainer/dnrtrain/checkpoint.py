@@ -3,12 +3,14 @@
 state.safetensors   after every epoch: weights, Adam's moments; JSON in its header (one file, so that
                     tensors and counters can never disagree); deleted when the stage is done
 model.safetensors   final weights; the fingerprint in its header
+(both with a SHA-256 of their tensors in the header: safetensors itself notices a wrong length only)
 model.json          settings, fingerprint, history; written last, so its presence means "complete"
 """
 
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,11 +24,12 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from .atomic import atomic_path, write_json
-from .contract import ContractError
+from .contract import ContractError, DamagedFile
 from .model import DNR
 from .settings import ModelSettings
 
 HEADER = "dnrtrain"
+CHECKSUM = "sha256"
 STATE = "state.safetensors"
 PROGRESS = "checkpoint.json"
 
@@ -42,7 +45,8 @@ class Saved:
 def save(path: Path, tensors: Mapping[str, Tensor], info: Mapping[str, Any]) -> None:
     """Write tensors and JSON into one safetensors file, atomically. NaN in ``info`` is refused."""
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    header = {HEADER: json.dumps(dict(info), allow_nan=False)}
+    # One entry: safetensors writes several in random order, and the same weights must be the same bytes.
+    header = {HEADER: json.dumps({**info, CHECKSUM: checksum(plain)}, allow_nan=False)}
     try:
         with atomic_path(path) as temporary:
             save_file(plain, temporary, metadata=header)
@@ -52,13 +56,30 @@ def save(path: Path, tensors: Mapping[str, Tensor], info: Mapping[str, Any]) -> 
 
 
 def load(path: Path) -> Saved | None:
-    """Read what :func:`save` wrote; None when the file is missing or damaged."""
+    """Read what :func:`save` wrote; None when the file is missing. Raises DamagedFile when it does not read."""
+    if not Path(path).exists():
+        return None
     try:
         with safe_open(path, framework="pt") as file:
             info = json.loads((file.metadata() or {})[HEADER])
-            return Saved({name: file.get_tensor(name) for name in file.keys()}, info)  # noqa: SIM118
-    except (OSError, SafetensorError, KeyError, ValueError):
-        return None
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except (OSError, SafetensorError, KeyError, ValueError, TypeError, RuntimeError, RecursionError) as error:
+        raise DamagedFile(path, str(error)) from None
+    if not isinstance(info, dict):
+        raise DamagedFile(path, "its header holds no JSON object")
+    if info.pop(CHECKSUM, "") not in ("", checksum(tensors)):
+        raise DamagedFile(path, "weights are not those that were written")
+    return Saved(tensors, info)
+
+
+def checksum(tensors: Mapping[str, Tensor]) -> str:
+    """SHA-256 of names, types, shapes and bytes, in order of names."""
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        tensor = tensors[name].detach().cpu().contiguous()
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
 
 
 def optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
@@ -105,8 +126,16 @@ def save_state(folder: Path, tensors: Mapping[str, Tensor], info: Mapping[str, A
 
 
 def load_state(folder: Path) -> Saved | None:
-    """The state of the last whole epoch, or None when there is none or it is damaged."""
+    """The state of the last whole epoch, or None when there is none. Raises DamagedFile."""
     return load(folder / STATE)
+
+
+def require_state(folder: Path, key: str) -> Saved:
+    """The state that the run ``key`` wrote last. Raises ContractError when it is gone, or another run's."""
+    saved = load_state(folder)
+    if saved is None or saved.info.get("run") != key:
+        raise ContractError(f"{folder / STATE}: was removed or replaced while training; run the same command again")
+    return saved
 
 
 def save_model(folder: Path, model: DNR, info: Mapping[str, Any]) -> None:
@@ -128,7 +157,7 @@ def read_record(folder: Path) -> dict[str, Any] | None:
         with safe_open(folder / "model.safetensors", framework="pt") as file:
             header = json.loads((file.metadata() or {})[HEADER])
         return record if record["fingerprint"] == header["fingerprint"] else None
-    except (OSError, SafetensorError, KeyError, ValueError, TypeError):
+    except (OSError, SafetensorError, KeyError, ValueError, TypeError, RecursionError):
         return None
 
 
@@ -136,16 +165,32 @@ def load_model(folder: Path, device: str | torch.device = "cpu") -> DNR:
     """A finished stage's renderer, ready for inference.
 
     Raises:
-        ContractError: nothing there, damaged, or weights and model.json are of different runs.
+        ContractError: nothing there, or it does not fit this version.
+        DamagedFile: damaged, or weights and model.json are of different runs.
     """
-    record, saved = read_record(folder), load(Path(folder) / "model.safetensors")
+    path = Path(folder) / "model.safetensors"
+    record, saved = read_record(folder), load(path)
+    if saved is not None and record is None:
+        raise DamagedFile(path, "model.json is missing, damaged or of other weights")
     if record is None or saved is None:
         raise ContractError(f"{folder}: holds no finished model; run `dnrpipe finetune` (again)")
     try:
+        _refuse_bomb(ModelSettings.model_validate(record["model"]), saved)
         model = DNR(ModelSettings.model_validate(record["model"]), seed=0)
         load_module(model, saved.tensors)
-    except (ValidationError, RuntimeError, KeyError) as error:
+    except (ValidationError, RuntimeError, KeyError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ContractError(f"{folder}: model does not fit this version ({reason}); train it again") from None
     model.use_bfloat16 = bool(record.get("bfloat16", False))
     return model.to(device).eval()
+
+
+def _refuse_bomb(settings: ModelSettings, saved: Saved) -> None:
+    """Raise ValueError where ``model.json`` wants textures larger than any tensor of the weights.
+
+    The model is made before its weights are put in: a few bytes of JSON must not make it take 70 GB.
+    """
+    texels = 0 if settings.aggregator == "early" else settings.texture_size**2 * settings.texture_channels
+    largest = max((tensor.numel() for tensor in saved.tensors.values()), default=0)
+    if texels > largest:
+        raise ValueError(f"textures of {settings.texture_size} texels, but no tensor of {texels} numbers")

@@ -36,6 +36,8 @@ from __future__ import annotations
 import json
 import math
 import re
+import zipfile
+import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -80,8 +82,26 @@ SPLITS = ("train", "val", "test")
 Split = Literal["train", "val", "test", "novel"]
 
 
+NPZ_ERRORS = (
+    *(OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, RuntimeError),
+    *(zipfile.BadZipFile, zlib.error),
+)
+"""What reading a damaged npz file may raise: numpy passes zip's and deflate's own errors through."""
+
+
 class ContractError(ValueError):
     """Input that breaks the data contract; the message names what, where and what to do."""
+
+
+class DamagedFile(ContractError):
+    """A file that a stage wrote does not read, or not as it was written. ``path`` is the file.
+
+    The pipeline makes such a file again (:func:`dnrpipe.stages.run_stage`); the message is for those who read it alone.
+    """
+
+    def __init__(self, path: Path | str, reason: str) -> None:
+        self.path, self.reason = Path(path), " ".join(reason.split())
+        super().__init__(f"{path}: damaged ({self.reason}); delete it and run its stage again")
 
 
 class View(BaseModel):
@@ -117,6 +137,8 @@ class View(BaseModel):
         if not np.isfinite(matrix).all():
             raise ValueError("transform contains NaN or infinity")
         rotation = matrix[:3, :3]
+        if np.abs(rotation).max() > 2:  # their products may overflow
+            raise ValueError("transform is not a rotation and a translation (scaled, sheared or mirrored)")
         if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
             raise ValueError("transform is not a rotation and a translation (scaled, sheared or mirrored)")
         return value
@@ -160,8 +182,16 @@ def write_cameras(path: Path, views: Sequence[View], split: str) -> None:
 
 
 def read_cameras(path: Path) -> list[View]:
-    """Read a ``transforms`` file that :func:`write_cameras` wrote; it may hold no view. Raises ContractError."""
-    return parse_transforms(path, may_be_empty=True)
+    """Read a ``transforms`` file that :func:`write_cameras` wrote; it may hold no view.
+
+    Raises ContractError when it is missing, DamagedFile when it does not read.
+    """
+    try:
+        return parse_transforms(path, may_be_empty=True)
+    except ContractError as error:
+        if not Path(path).is_file():
+            raise
+        raise DamagedFile(path, str(error).removeprefix(f"{path}: ")) from None
 
 
 def parse_transforms(
@@ -180,7 +210,7 @@ def parse_transforms(
         data: Any = json.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ContractError(f"{path}: no such camera file") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # also: not UTF-8, numbers of thousands of digits
         raise ContractError(f"{path}: not a JSON camera file ({error})") from None
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not (frames or may_be_empty):
@@ -191,7 +221,7 @@ def parse_transforms(
             raise ContractError(f"{path}: frame {index}: has no 'transform_matrix'")
         try:
             views.append(_parse_frame(frame, data, index, default_size))
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, OverflowError, RecursionError) as error:
             reason = str(error).replace("\n", " ")
             if hasattr(error, "errors"):
                 reason = "; ".join(e["msg"].removeprefix("Value error, ") for e in error.errors())  # type: ignore[attr-defined]
@@ -214,8 +244,11 @@ def unique_names(views: Sequence[View]) -> list[View]:
 
 
 def file_name(text: str) -> str:
-    """``text`` as a view's name: letters, digits, dot, dash and underscore of ASCII, 80 at most; others become "_"."""
-    return re.sub(r"[^A-Za-z0-9_.-]", "_", text)[:80] or "_"
+    """``text`` as a view's name: letters, digits, dot, dash and underscore of ASCII, 80 at most; others become "_".
+
+    So does a dot at the start: names are those of files, and such files are hidden.
+    """
+    return re.sub(r"^\.|[^A-Za-z0-9_.-]", "_", text)[:80] or "_"
 
 
 def _parse_frame(frame: Any, shared: dict[str, Any], index: int, size: tuple[int, int] | None) -> View:
@@ -238,10 +271,10 @@ def _parse_frame(frame: Any, shared: dict[str, Any], index: int, size: tuple[int
     if fl_x is None:
         if angle_x is None:
             raise ValueError("has no focal length ('fl_x' or 'camera_angle_x')")
-        fl_x = 0.5 * width / math.tan(0.5 * angle_x)
+        fl_x = _focal(width, angle_x)
     fl_y = value("fl_y")
     if fl_y is None:
-        fl_y = 0.5 * height / math.tan(0.5 * angle_y) if angle_y is not None else fl_x
+        fl_y = _focal(height, angle_y) if angle_y is not None else fl_x
     cx, cy = value("cx"), value("cy")
     name = Path(str(frame.get("file_path") or f"{index:04d}")).name
     stem = name.rsplit(".", 1)[0] if name.lower().endswith((".png", ".jpg", ".jpeg", ".exr")) else name
@@ -256,6 +289,13 @@ def _parse_frame(frame: Any, shared: dict[str, Any], index: int, size: tuple[int
         cy=height / 2 if cy is None else cy,
         c2w=tuple(tuple(float(x) for x in row) for row in matrix),
     )
+
+
+def _focal(length: float, angle: float) -> float:
+    """Focal length in pixels from the image's side and its angle of view in radians."""
+    if not 0 < angle < math.pi:
+        raise ValueError(f"camera angle {angle:g} is not between 0 and pi (radians)")
+    return 0.5 * length / math.tan(0.5 * angle)
 
 
 class SceneFrame(BaseModel):
@@ -277,7 +317,14 @@ class SceneFrame(BaseModel):
     exposure: float = 0.0
     gamma: float = 1.0
     view_transform: str = "Standard"
-    display_lut: str | None = None
+    display_lut: str | None = Field(default=None, pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")
+
+    @field_validator("near", "far", "radius", "exposure", "gamma")
+    @classmethod
+    def _finite(cls, value: float) -> float:
+        if not math.isfinite(value):
+            raise ValueError("must be finite")
+        return value
 
 
 def require_channels(

@@ -30,14 +30,18 @@ IDENTITY = 4.0
 """What the kernels' middle weight has ahead of the others before the softmax, so it starts with 0.87 of the sum."""
 
 
+LOG_CEILING = 30.0
+"""Log values above it (radiance of 2e30) count as it: the exponential would overflow, and its gradient with it."""
+
+
 def to_log(radiance: Tensor) -> Tensor:
     """Linear radiance >= 0 -> log(1 + k x) / log(1 + k); 0 stays 0, 1 stays 1."""
     return torch.log1p(LOG_SCALE * radiance) * (1.0 / math.log1p(LOG_SCALE))
 
 
 def from_log(value: Tensor) -> Tensor:
-    """Inverse of :func:`to_log`; below 0 (darker than black) it goes on continuously."""
-    return torch.expm1(value * math.log1p(LOG_SCALE)) / LOG_SCALE
+    """Inverse of :func:`to_log`; below 0 (darker than black) it goes on continuously, above LOG_CEILING it is flat."""
+    return torch.expm1(value.clamp_max(LOG_CEILING) * math.log1p(LOG_SCALE)) / LOG_SCALE
 
 
 def require_base(batch: Batch) -> tuple[Tensor, DisplayTransform]:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .contract import BASE_CHANNELS, RASTER_CHANNELS, ContractError, SceneFrame, View, require_channels
+from .contract import BASE_CHANNELS, RASTER_CHANNELS, ContractError, DamagedFile, SceneFrame, View, require_channels
 from .display import ALPHA_FLOOR, DisplayTransform
 
 INPUT_CHANNELS = ("depth.Z", "normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "mask", "coverage")
@@ -268,7 +268,7 @@ def _straight(premultiplied: Tensor, alpha: Tensor) -> Tensor:
 def _stack(path: Path, channels: dict[str, np.ndarray], names: Sequence[str]) -> Tensor:
     values = np.stack([channels[name] for name in names]).astype(np.float32, copy=False)
     if not np.isfinite(values).all():
-        raise ContractError(f"{path}: has non-finite values; delete it and run the stage again")
+        raise DamagedFile(path, "has non-finite values")
     return torch.from_numpy(values)
 
 

@@ -14,9 +14,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from .contract import ContractError, SceneFrame
+from .contract import NPZ_ERRORS, DamagedFile, SceneFrame
 from .precision import at_least_float32
 
+MAX_LUT_BYTES = 64 << 20
 ALPHA_FLOOR = 1e-6
 GAMMA_FLOOR = 1e-6
 """Below it Blender's extra gamma is its chord: the power's slope at black is infinite, and so would gradients be."""
@@ -38,7 +39,7 @@ class DisplayTransform:
         folder: where ``frame.display_lut`` lies (the workspace's ``scene`` folder).
 
     Raises:
-        ContractError: the LUT is missing, has another shape than [N, N, N, 3] or is not finite.
+        DamagedFile: the LUT is missing, too large, has another shape than [N, N, N, 3] or is not finite.
     """
 
     def __init__(self, frame: SceneFrame, folder: Path) -> None:
@@ -50,19 +51,21 @@ class DisplayTransform:
             self._read(Path(folder) / frame.display_lut)
 
     def _read(self, path: Path) -> None:
-        remedy = "run `dnrpipe prepare` again"
         if not path.is_file():
-            raise ContractError(f"{path}: the display transform is missing; {remedy}")
+            raise DamagedFile(path, "the display transform is missing")
         try:
             with np.load(path, allow_pickle=False) as data:
+                size = sum(entry.file_size for entry in data.zip.infolist())
+                if size > MAX_LUT_BYTES:
+                    raise ValueError(f"{size} bytes are no display transform")
                 lut = np.asarray(data["lut"], dtype=np.float32)
                 self.maximum, self.k = float(data["max"]), float(data["k"])
-        except (OSError, ValueError, KeyError) as error:
-            raise ContractError(f"{path}: not a display transform ({error}); {remedy}") from None
+        except NPZ_ERRORS as error:
+            raise DamagedFile(path, f"not a display transform: {error}") from None
         if lut.ndim != 4 or lut.shape[3] != 3 or len(set(lut.shape[:3])) != 1 or lut.shape[0] < 2:
-            raise ContractError(f"{path}: lut has shape {lut.shape}, expected [N, N, N, 3]; {remedy}")
+            raise DamagedFile(path, f"lut has shape {lut.shape}, expected [N, N, N, 3]")
         if not np.isfinite(lut).all() or not (self.maximum > 0 and self.k > 0):
-            raise ContractError(f"{path}: lut, max or k is not finite and positive; {remedy}")
+            raise DamagedFile(path, "lut, max or k is not finite and positive")
         # [1, 3, r, g, b] for grid_sample, whose coordinates run (x, y, z) = (b, g, r).
         self.lut = torch.from_numpy(np.ascontiguousarray(lut.transpose(3, 0, 1, 2)))[None]
 

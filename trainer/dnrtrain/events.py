@@ -42,10 +42,26 @@ class Selected:
 
 
 @dataclass(frozen=True)
+class Diverged:
+    """An epoch whose weights blew up: training goes on from the state before it, at a lower rate (``text`` says so).
+
+    Its time is lost but was spent: seconds, cpu_seconds, steps and device are as in :class:`EpochEnd`.
+    """
+
+    stage: str
+    epoch: int
+    text: str
+    seconds: float
+    cpu_seconds: float
+    steps: int
+    device: str = "cpu"
+
+
+@dataclass(frozen=True)
 class Note:
     """Something the user should know (weights missing, a loss term dropped, steps skipped)."""
 
     text: str
 
 
-Event = EpochEnd | Selected | Note
+Event = EpochEnd | Selected | Diverged | Note

@@ -27,6 +27,15 @@ from .textures import TexturePyramid
 STEP1, STEP2 = 1, 2
 GRADIENT_NORM = 10.0
 """Gradients are scaled down to this norm: far above ordinary steps, it only tames outliers."""
+BLOWN_UP = 10.0
+"""Photometric loss of display images in [0, 1] that no untrained network has: the weights have blown up."""
+WORSE = 10.0
+"""An epoch whose loss is so many times that of the best one has diverged, unless both are below NOTHING_LOST."""
+NOTHING_LOST = 0.1
+SLOWER = 0.1
+"""Factor of the learning rate at each restart."""
+MAX_RESTARTS = 6
+"""A training that diverges once more than this, at a millionth of its learning rate, is refused."""
 
 
 def step_random(seed: int, stage: int, epoch: int, step: int) -> np.random.Generator:
@@ -125,6 +134,60 @@ def averaged_weights(module: nn.Module, average: Averaged | None) -> Iterator[No
 def _put(module: nn.Module, weights: dict[str, Tensor]) -> None:
     for name, parameter in module.named_parameters():
         parameter.copy_(weights[name])
+
+
+@dataclass
+class Watch:
+    """Notices epochs that diverged. ``scale`` multiplies the learning rate; it falls at every restart.
+
+    restarts: one entry per restart: epoch, reason, scale from there on. Part of a run's checkpoint.
+    """
+
+    restarts: list[dict[str, Any]] = field(default_factory=list)
+
+    @property
+    def scale(self) -> float:
+        return float(self.restarts[-1]["scale"]) if self.restarts else 1.0
+
+    def trouble(
+        self, book: EpochBook, term: str, history: Sequence[dict[str, Any]], picture: Tensor, *modules: nn.Module
+    ) -> str | None:
+        """What shows that the epoch in ``book`` diverged, in words; None when it did not.
+
+        term: name of the photometric loss, in ``book`` and in the entries of ``history`` (the good epochs so far).
+        picture: any training view as the weights render it now: losses are those *before* each step.
+        modules: whose weights must be finite.
+        """
+        if 2 * book.skipped > book.steps:
+            return f"{book.skipped} of {book.steps} steps were not finite"
+        if not all(bool(torch.isfinite(p).all()) for module in modules for p in module.parameters()):
+            return "weights are not finite"
+        level = float(picture.square().mean())
+        if not level < BLOWN_UP:
+            return f"its weights render a mean square of {level:.3g} in display space"
+        loss = book.means().get(term)
+        if loss is None:
+            return None
+        best = min((entry["losses"].get(term, loss) for entry in history), default=loss)
+        if loss > BLOWN_UP or loss > max(WORSE * best, NOTHING_LOST):
+            return f"its {term} loss is {loss:.3g}" + (f" after {best:.3g}" if history else "")
+        return None
+
+    def restart(self, epoch: int, reason: str) -> str:
+        """Book a restart of ``epoch`` (one-based) at a lower rate -> the line that says so.
+
+        Raises ContractError after MAX_RESTARTS: lower rates do not help.
+        """
+        if len(self.restarts) == MAX_RESTARTS:
+            raise ContractError(
+                f"training diverges in epoch {epoch} ({reason}) even at {self.scale:.2g} of its learning rate;"
+                " look at the training images, or lower the learning rate"
+            )
+        self.restarts.append({"epoch": epoch, "reason": reason, "scale": self.scale * SLOWER})
+        return (
+            f"epoch {epoch} diverged ({reason}): back to the weights after epoch {epoch - 1},"
+            f" learning rate times {self.scale:.2g} from here"
+        )
 
 
 @dataclass

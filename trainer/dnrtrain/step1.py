@@ -21,14 +21,15 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from . import checkpoint
-from .contract import ContractError
+from .contract import ContractError, DamagedFile
 from .dataset import ViewSet
-from .events import EpochEnd, Event, Note, Selected
+from .events import Diverged, EpochEnd, Event, Note, Selected
 from .model import DNR
 from .precision import decide_bfloat16
 from .schedule import (
     STEP1,
     EpochBook,
+    Watch,
     adam,
     guarded_step,
     learning_rate,
@@ -132,6 +133,8 @@ class _Step1:
         if self.agent and settings.reward == "improvement":
             self.probes = FarthestPolicy().choose(candidates, min(PROBES, len(views)), seed).views
         self.scale = RewardScale(raw=settings.reward_scale == "raw")
+        self.notes: list[str] = []
+        self.watch = Watch()
         self.history: list[dict] = []
         self.book = EpochBook()
         self.step = 0
@@ -146,10 +149,15 @@ class _Step1:
             )
             return
         first = self._restore()
+        for text in self.notes:
+            yield Note(text)
         if first:
             yield Note(f"step 1 continues after epoch {first} of {self.settings.epochs}")
-        for epoch in range(first, self.settings.epochs):
-            yield self._epoch(epoch)
+        epoch = first
+        while epoch < self.settings.epochs:
+            done = self._epoch(epoch)
+            yield done
+            epoch += isinstance(done, EpochEnd)
         choice = self._select()
         names = [self.views.names[i] for i in choice.views]
         info = {
@@ -165,12 +173,14 @@ class _Step1:
             "gains": choice.gains,
             "why": choice.why,
             "bfloat16": self.dnr.use_bfloat16,
+            "restarts": self.watch.restarts,
             "history": self.history,
         }
         checkpoint.save_model(self.folder, self.dnr, info)
         yield Selected(names, self.policy, choice.details, choice.gains, choice.why)
 
-    def _epoch(self, epoch: int) -> EpochEnd:
+    def _epoch(self, epoch: int) -> EpochEnd | Diverged:
+        """One epoch; where it diverged, the state is that before it, at a lower rate."""
         self.book = EpochBook()
         self.step = epoch * self.episodes * self.budget
         if self.agent is None:
@@ -178,6 +188,24 @@ class _Step1:
         else:
             for episode in range(self.episodes):
                 self._episode(epoch, episode)
+        trained = [module for module in (self.dnr, self.agent) if module is not None]
+        with torch.no_grad():
+            picture = self.dnr(self.views.batch([0])).rgb
+        reason = self.watch.trouble(self.book, "dnr", self.history, picture, *trained)
+        if reason is not None:
+            text = self.watch.restart(epoch + 1, reason)
+            self._load(checkpoint.require_state(self.folder, self.key))
+            self._save(epoch)
+            spent = self.book.entry(epoch + 1, 0.0, {})
+            return Diverged(
+                "step1",
+                epoch + 1,
+                f"step 1: {text}",
+                spent["seconds"],
+                spent["cpu_seconds"],
+                spent["steps"],
+                self.device,
+            )
         scores = validate(self.dnr, self.val, self.settings.validation_views)
         entry = self.book.entry(epoch + 1, self._rate(self.step - 1), scores)
         self.history.append(entry)
@@ -197,7 +225,7 @@ class _Step1:
 
     def _rate(self, step: int) -> float:
         s = self.settings
-        return learning_rate(step, self.total_steps, s.learning_rate, s.learning_rate_end)
+        return self.watch.scale * learning_rate(step, self.total_steps, s.learning_rate, s.learning_rate_end)
 
     # -- one step --------------------------------------------------------------------------------------
 
@@ -304,17 +332,27 @@ class _Step1:
             "epoch": epoch,
             "bfloat16": self.dnr.use_bfloat16,
             "reward_mean": self.scale.mean,
+            "restarts": self.watch.restarts,
             "history": self.history,
         }
         checkpoint.save_state(self.folder, tensors, info)
 
     def _restore(self) -> int:
         """Load the state of an interrupted run of the same key; -> epochs done. Else start afresh."""
-        saved = checkpoint.load_state(self.folder)
+        try:
+            saved = checkpoint.load_state(self.folder)
+        except DamagedFile as damage:
+            self.notes.append(f"{damage.path}: damaged; training starts afresh")
+            saved = None
         if saved is None or saved.info.get("run") != self.key:
             self.dnr.use_bfloat16 = decide_bfloat16(self.settings.precision, self.device)
             self._save(0)
             return 0
+        self.watch.restarts = saved.info.get("restarts", [])
+        self._load(saved)
+        return int(saved.info["epoch"])
+
+    def _load(self, saved: checkpoint.Saved) -> None:
         self.dnr.use_bfloat16, self.history = saved.info["bfloat16"], saved.info["history"]
         self.scale = RewardScale(saved.info["reward_mean"], raw=self.settings.reward_scale == "raw")
         checkpoint.load_module(self.dnr, checkpoint.unprefixed("dnr", saved.tensors))
@@ -323,4 +361,3 @@ class _Step1:
             checkpoint.load_module(self.agent, checkpoint.unprefixed("agent", saved.tensors))
             checkpoint.load_module(self.slow, checkpoint.unprefixed("slow", saved.tensors))
             checkpoint.restore_optimiser(self.adam_agent, checkpoint.unprefixed("adam_agent", saved.tensors))
-        return int(saved.info["epoch"])

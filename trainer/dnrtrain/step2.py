@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from . import checkpoint
-from .contract import ContractError
+from .contract import ContractError, DamagedFile
 from .dataset import DIHEDRAL_ORDER, Batch, ViewSet
-from .events import EpochEnd, Event, Note
+from .events import Diverged, EpochEnd, Event, Note
 from .losses import Step2Loss
 from .model import DNR
 from .perceptual import PerceptualLoss
@@ -21,6 +21,7 @@ from .schedule import (
     STEP2,
     Averaged,
     EpochBook,
+    Watch,
     adam,
     averaged_weights,
     guarded_step,
@@ -100,6 +101,7 @@ class _Step2:
         self.steps_per_epoch = -(-len(views) // settings.batch)
         self.optimiser = adam([self.dnr], settings.learning_rate, device, settings.texture_rate_scale)
         self.average = Averaged(self.dnr, settings.ema) if settings.ema else None
+        self.watch = Watch()
         self.history: list[dict] = []
 
     def _from_coarse(self, folder: Path, model: ModelSettings) -> DNR:
@@ -129,13 +131,16 @@ class _Step2:
             return
         if self.wants_perceptual and self.loss.perceptual is None:
             yield Note("perceptual weights are missing: training goes on without the loss term L_p")
+        first = self._restore()
         for text in self.notes:
             yield Note(text)
-        first = self._restore()
         if first:
             yield Note(f"step 2 continues after epoch {first} of {self.settings.epochs}")
-        for epoch in range(first, self.settings.epochs):
-            yield self._epoch(epoch)
+        epoch = first
+        while epoch < self.settings.epochs:
+            done = self._epoch(epoch)
+            yield done
+            epoch += isinstance(done, EpochEnd)
         info = {
             "fingerprint": self.fingerprint,
             "run": self.key,
@@ -145,12 +150,14 @@ class _Step2:
             "views": list(self.views.names),
             "perceptual": self.loss.perceptual is not None,
             "bfloat16": self.dnr.use_bfloat16,
+            "restarts": self.watch.restarts,
             "history": self.history,
         }
         with averaged_weights(self.dnr, self.average):
             checkpoint.save_model(self.folder, self.dnr, info)
 
-    def _epoch(self, epoch: int) -> EpochEnd:
+    def _epoch(self, epoch: int) -> EpochEnd | Diverged:
+        """One epoch; where it diverged, the state is that before it, at a lower rate."""
         s, book = self.settings, EpochBook()
         order = step_random(self.seed, STEP2, epoch, -1).permutation(len(self.views))
         total = s.epochs * self.steps_per_epoch
@@ -164,6 +171,7 @@ class _Step2:
                 batch = batch.augment(int(random.integers(DIHEDRAL_ORDER)))
             assert batch.target is not None
             rate = learning_rate(epoch * self.steps_per_epoch + step, total, s.learning_rate, s.learning_rate_end)
+            rate *= self.watch.scale
             loss, terms = self.loss(self.dnr(batch), batch.target, random, bfloat16=self.dnr.use_bfloat16)
             taken = guarded_step(self.optimiser, loss, rate)
             book.count(taken)
@@ -171,6 +179,21 @@ class _Step2:
                 self.average.update()
             values = torch.stack([loss, *terms.values()]).detach().tolist()
             book.add(**dict(zip(["total", *terms], values, strict=True)))
+        reason = self.watch.trouble(book, "photometric", self.history, self._picture(), self.dnr)
+        if reason is not None:
+            text = self.watch.restart(epoch + 1, reason)
+            self._load(checkpoint.require_state(self.folder, self.key))
+            self._save(epoch)
+            spent = book.entry(epoch + 1, 0.0, {})
+            return Diverged(
+                "step2",
+                epoch + 1,
+                f"step 2: {text}",
+                spent["seconds"],
+                spent["cpu_seconds"],
+                spent["steps"],
+                self.device,
+            )
         with averaged_weights(self.dnr, self.average):
             scores = validate(self.dnr, self.val, s.validation_views)
         entry = book.entry(epoch + 1, rate, scores)
@@ -189,10 +212,21 @@ class _Step2:
             self.device,
         )
 
+    @torch.no_grad()
+    def _picture(self) -> Tensor:
+        """The first view as the weights of now render it."""
+        return self.dnr(random_patch(self.views.batch([0]), self.settings.patch, np.random.default_rng(0))).rgb
+
     def _save(self, epoch: int) -> None:
         tensors = checkpoint.prefixed("dnr", self.dnr.state_dict())
         tensors |= checkpoint.prefixed("adam", checkpoint.optimiser_tensors(self.optimiser))
-        info = {"run": self.key, "epoch": epoch, "bfloat16": self.dnr.use_bfloat16, "history": self.history}
+        info = {
+            "run": self.key,
+            "epoch": epoch,
+            "bfloat16": self.dnr.use_bfloat16,
+            "restarts": self.watch.restarts,
+            "history": self.history,
+        }
         if self.average is not None:
             tensors |= checkpoint.prefixed("average", self.average.sums)
             info["average_steps"] = self.average.steps
@@ -200,18 +234,26 @@ class _Step2:
 
     def _restore(self) -> int:
         """Load the state of an interrupted run of the same key; -> epochs done. Else start afresh."""
-        saved = checkpoint.load_state(self.folder)
+        try:
+            saved = checkpoint.load_state(self.folder)
+        except DamagedFile as damage:
+            self.notes.append(f"{damage.path}: damaged; training starts afresh")
+            saved = None
         if saved is None or saved.info.get("run") != self.key:
             if self.settings.precision != "auto" or self.settings.start == "fresh":  # else as step 1 decided
                 self.dnr.use_bfloat16 = decide_bfloat16(self.settings.precision, self.device)
             self._save(0)
             return 0
+        self.watch.restarts = saved.info.get("restarts", [])
+        self._load(saved)
+        return int(saved.info["epoch"])
+
+    def _load(self, saved: checkpoint.Saved) -> None:
         self.dnr.use_bfloat16, self.history = saved.info["bfloat16"], saved.info["history"]
         checkpoint.load_module(self.dnr, checkpoint.unprefixed("dnr", saved.tensors))
         checkpoint.restore_optimiser(self.optimiser, checkpoint.unprefixed("adam", saved.tensors))
         if self.average is not None:
             self.average.restore(checkpoint.unprefixed("average", saved.tensors), saved.info["average_steps"])
-        return int(saved.info["epoch"])
 
 
 def random_patch(batch: Batch, side: int, random: np.random.Generator) -> Batch:

@@ -12,7 +12,7 @@ from dnrpipe.errors import NothingVisible, UserError
 from .geometry.freeze import Frozen, freeze_scene
 
 TRIES = 12  # later frames looked at when the current one is empty
-FAR = 1e6  # a coordinate beyond this many scene sizes has no precision left in float32
+FAR = 1e4  # beyond so many scene sizes float32 leaves steps of a thousandth of the scene: shadows and edges suffer
 HUGE = 1e7
 
 

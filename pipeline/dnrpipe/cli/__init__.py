@@ -16,6 +16,7 @@ from . import information, pictures, scene, stages
 from .ablate import ablate
 from .bench_select import bench_select
 from .export import export_gltf, export_nerf, export_onnx, export_web
+from .verify import verify
 
 
 class _Group(click.Group):
@@ -62,6 +63,7 @@ for _command in (
     ablate,
     bench_select,
     information.status,
+    verify,
     information.costs,
     information.doctor,
     information.weights,

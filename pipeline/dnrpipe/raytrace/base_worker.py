@@ -45,12 +45,14 @@ class Worker:
         self.renderer = BaseRenderer(self.engine.mi, scene, light, int(common["samples"]))
         self.silhouettes: dict[tuple[int, int], Frames] = {}
         self.warm = False
+        self.masked = 0  # pixels of the view at hand that were not finite
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
         view = View.model_validate(task["view"])
         if not self.warm:
             self._channels(view)  # compiles the kernel, which is no cost of a frame
             self.warm = True
+        self.masked = 0
         started, cpu = time.monotonic(), time.process_time()
         channels = self._channels(view)
         numbers = {
@@ -59,6 +61,7 @@ class Worker:
             "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
             "kind": self.common["kind"],
             "samples": self.common["samples"],
+            "masked": self.masked,
         }
         write_exr(
             Path(task["output"]),
@@ -88,7 +91,9 @@ class Worker:
         integrator, _ = self.engine.integrator(self.bundle, common["integrator"], int(common["max_depth"]))
         sensor = self.engine.sensor(view)
         picture, _ = self.engine.frame(self.bundle, integrator, sensor, view, int(common["spp"]), int(common["seed"]))
-        picture = np.where(np.isfinite(picture).all(axis=-1, keepdims=True), picture, 0).astype(np.float32)
+        fine = np.isfinite(picture).all(axis=-1, keepdims=True)
+        self.masked = int((~fine).sum())
+        picture = np.where(fine, picture, 0).astype(np.float32)
         found = channels | {name: picture[..., i] for i, name in enumerate(COLOUR)}
         clean = denoised(found)
         return clean | {"base.A": found["base.A"]} | {f"diffuse.{c}": clean[f"base.{c}"] for c in "RGB"}

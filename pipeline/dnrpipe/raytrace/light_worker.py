@@ -11,6 +11,7 @@ import numpy as np
 
 from dnrpipe.errors import UserError
 from dnrtrain.atomic import atomic_path
+from dnrtrain.contract import NPZ_ERRORS
 
 from .engine import Engine
 from .lightmap import LightBaker
@@ -64,5 +65,5 @@ def read_light(path: Path) -> np.ndarray:
     try:
         with np.load(path, allow_pickle=False) as data:
             return np.asarray(data["light"], np.float32)
-    except (OSError, ValueError, KeyError, EOFError) as error:
-        raise UserError(f"{path}: no baked light ({error}); run the stage again") from None
+    except NPZ_ERRORS as error:
+        raise UserError(f"{path}: no baked light ({error}); delete it and run the stage again") from None

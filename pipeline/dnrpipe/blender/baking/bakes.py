@@ -85,7 +85,10 @@ class BakeBook:
         findings.add("baked", f"'{socket}'", note, material=material)
         self._warn(material, kind, nodes, findings)
         if path.is_file():
-            values = np.load(path, allow_pickle=False)
+            try:
+                values = np.load(path, allow_pickle=False)
+            except (OSError, ValueError, EOFError):  # damaged: it is baked again
+                values = np.empty(0)
             if values.shape == (len(region.texels), channels):
                 return Textured(values.astype(np.float32)[:, None, :], False, placement)
         groups = tuple(group.name for group in source.scope)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 
 from dnrpipe.errors import UserError
 from dnrtrain.atomic import atomic_path
+from dnrtrain.contract import NPZ_ERRORS
 
 GEOMETRY_VERSION = 2
 
@@ -170,7 +170,7 @@ def load_geometry(path: Path) -> list[FrozenMesh]:
             ]
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; run `dnrpipe prepare` first") from None
-    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
+    except NPZ_ERRORS as error:
         raise UserError(f"{path}: damaged geometry ({error}); run `dnrpipe prepare` again") from None
 
 

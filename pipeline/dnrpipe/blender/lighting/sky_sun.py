@@ -74,4 +74,6 @@ def measure(world: Any, sun: SkySun) -> np.ndarray:
     x, y = np.meshgrid(axis, axis)
     solid_angle = (2 * math.tan(half) / CLOSE_UP) ** 2 / (1 + x * x + y * y) ** 1.5
     excess = np.maximum(with_disc - sky, 0).astype(np.float64)
+    if not np.isfinite(excess).all():
+        raise ValueError("the sun of the sky texture has no finite radiance; check the world's nodes")
     return (excess * solid_angle[..., None]).sum(axis=(0, 1))

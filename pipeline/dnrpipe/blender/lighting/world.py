@@ -11,7 +11,7 @@ import numpy as np
 from ..bundle import xmltree
 from ..findings import Findings
 from ..shading.sockets import find_input, resolve, surface_source, walk
-from ..shading.textures import ImageReader, TextureStore, srgb_to_linear
+from ..shading.textures import ImageReader, TextureStore, finite_texels, srgb_to_linear
 from .lights import far_disc
 from .sky_sun import find_sun, measure, without_disc
 from .world_images import SIZE, render_equirect
@@ -161,6 +161,7 @@ def _rendered(
                 findings.add("exact", f"world '{world.name}' sun disc", "a far disc of the same light")
     finally:
         bpy.data.worlds.remove(copy)
+    pixels = finite_texels(pixels, f"world '{world.name}'", findings)
     if not np.any(pixels > 0):
         return sun is not None
     findings.add(

@@ -18,7 +18,10 @@ SAMPLES = 16
 
 
 def render_equirect(world: Any) -> np.ndarray:
-    """Radiance of ``world`` from the origin as float32 [H, W, 3], bottom row first, Blender's equirect layout."""
+    """Radiance of ``world`` from the origin as float32 [H, W, 3], bottom row first, Blender's equirect layout.
+
+    As Cycles hands it over: perhaps not finite.
+    """
 
     def panorama(camera: Any, body: Any) -> None:
         camera.type = "PANO"
@@ -86,6 +89,6 @@ def _read_pixels(path: Path) -> np.ndarray:
         width, height = image.size
         flat = np.empty(width * height * image.channels, dtype=np.float32)
         image.pixels.foreach_get(flat)
-        return np.nan_to_num(flat.reshape(height, width, -1)[..., :3], nan=0.0, posinf=65000.0, neginf=0.0)
+        return flat.reshape(height, width, -1)[..., :3]
     finally:
         bpy.data.images.remove(image)

@@ -196,7 +196,8 @@ class ImageReader:
         texels = _to_rgba(flat.reshape(height, width, channels))
         space = image.colorspace_settings.name
         if image.is_float:
-            return _finite(texels), False  # Blender hands float images over in the scene's linear space
+            # Blender hands float images over in the scene's linear space.
+            return finite_texels(texels, f"image '{image.name}'", self.findings), False
         codes = np.round(np.clip(texels, 0, 1) * 255).astype(np.uint8)
         if space == "sRGB":
             return codes, True
@@ -218,7 +219,13 @@ def _to_rgba(texels: np.ndarray) -> np.ndarray:
     return out
 
 
-def _finite(texels: np.ndarray) -> np.ndarray:
+def finite_texels(texels: np.ndarray, label: str, findings: Findings) -> np.ndarray:
+    """``texels`` [H, W, C] with NaN and -inf as 0 and +inf as HALF_MAX; a finding counts the texels."""
+    bad = ~np.isfinite(texels).all(axis=-1)
+    if not bad.any():
+        return texels
+    note = f"repaired: {int(bad.sum())} texels that are not finite; black stands for NaN, {HALF_MAX:.0f} for infinity"
+    findings.add("approximated", label, note)
     return np.nan_to_num(texels, nan=0.0, posinf=HALF_MAX, neginf=0.0)
 
 

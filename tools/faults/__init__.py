@@ -1,0 +1,1 @@
+"""Fault injection: mutated files, killed processes, full disks; each tool prints what it injected and what survived."""
