@@ -9,7 +9,7 @@ APT     := libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1 li
 APT_DEV := chromium
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system browser demo test lint types imports docs docs-check bench bench-effects bench-frames fidelity scenes clean
+.PHONY: help setup system browser demo test lint types imports docs docs-check robustness bench bench-effects bench-frames fidelity scenes clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -54,6 +54,13 @@ docs: $(STAMP)  ## regenerate the CLI reference from --help, the ablation's tabl
 docs-check: $(STAMP)
 	$(BIN)/python tools/cli_reference.py --check docs/cli.md
 	$(BIN)/python -m tools.result_tables --check docs/ablation.md docs/frames.md
+	$(BIN)/python -m tools.robustness_table --check docs/robustness.md
+
+robustness: setup  ## every case of docs/robustness.md, 2,000 damaged files of each format, 50 kills; an hour or more
+	$(BIN)/python -m tools.robustness_table --check docs/robustness.md
+	$(BIN)/pytest -q -n 2 --dist loadgroup $$($(BIN)/python -m tools.robustness_table --tests docs/robustness.md)
+	$(BIN)/python -m tools.faults.fuzz --count 2000
+	$(BIN)/python -m tools.faults.inject --kills 50
 
 bench-effects: setup  ## the effect plan against "everything on", on the benchmark scenes
 	$(BIN)/python tools/bench_effects.py
