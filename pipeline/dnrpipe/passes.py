@@ -99,6 +99,11 @@ def _tell(label: str, tasks: Sequence[dict[str, Any]], goal: Goal, console: Cons
         f"{label}: {min(spp)} to {max(spp)} spp, noise {100 * min(noise):.2f} to {100 * max(noise):.2f}% of the picture"
         + (" before the denoiser" if any(data.get("denoised") for data in found) else "")
     )
+    if bias := [data["denoiser_bias"] for data in found if data.get("denoiser_bias") is not None]:
+        console.say(
+            f"{label}: the denoiser's own error, which more samples lower but do not average out, stands out of the"
+            f" noise in {len(bias)} of {len(found)} views: {100 * min(bias):.2f} to {100 * max(bias):.2f}%"
+        )
     short = [data["view"]["name"] for data in found if data.get("ended_by") == "limit"]
     if goal.noise is not None and short:
         console.warn(

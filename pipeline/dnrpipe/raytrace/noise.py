@@ -69,6 +69,25 @@ def half_noise(half_a: np.ndarray, half_b: np.ndarray) -> Noise:
     return _noise(float(squares.mean()), spread, float(np.sqrt(np.mean(((a + b) / 2) ** 2))))
 
 
+def denoised_error(denoised: np.ndarray, others: np.ndarray) -> tuple[float, float]:
+    """(mean square error of a denoised picture in display space, its standard error), without a reference.
+
+    The denoiser's bias is in it. denoised: [H, W, 4], made from samples that are not in ``others`` [K, H, W, 4], K >= 2
+    means X_i of independent samples, all of them not denoised. For i != j, E (D - X_i)(D - X_j) = E (D - E X)²: noise of
+    different groups cancels in the product. Weighted by the slope of the display curve at D (first order), which is 0
+    where it clips. The mean may come out below 0. The alpha of D, which no denoiser touches, counts as exact.
+    """
+    alpha = denoised[..., 3:]
+    straight = np.where(alpha > 0, denoised[..., :3] / np.maximum(alpha, 1e-6), 2.0)
+    curved = 1.055 / 2.4 * np.maximum(straight, 1e-6) ** (1 / 2.4 - 1)
+    slope = np.where(straight <= 0.0031308, 12.92, np.where(straight < 1, curved, 0.0))
+    delta = (denoised - others)[..., :3] * slope
+    count = len(others)
+    products = (delta.sum(axis=0) ** 2 - (delta**2).sum(axis=0)) / (count * (count - 1))
+    pixels = products.mean(axis=-1)
+    return float(pixels.mean()), float(pixels.std(ddof=1) / math.sqrt(pixels.size))
+
+
 def _squares(groups: np.ndarray, halved: float = 1.0) -> np.ndarray:
     """v + b², [H, W, 3], of the mean of ``halved`` times as many samples."""
     count = len(groups)

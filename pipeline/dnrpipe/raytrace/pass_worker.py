@@ -120,8 +120,9 @@ class Worker:
     def _pictures(
         self, task: dict[str, Any], view: View, samples: Samples
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        noise = group_noise(samples.groups)
-        return finished(self.engine, self.bundle, view, samples.mean, samples.halves, noise, bool(task.get("denoise")))
+        noise, smooth = group_noise(samples.groups), bool(task.get("denoise"))
+        image, halves = samples.mean, samples.halves
+        return finished(self.engine, self.bundle, view, image, halves, noise, smooth, samples.groups)
 
     def _integrator(self, task: dict[str, Any]) -> tuple[Any, str]:
         return self.engine.integrator(self.bundle, task.get("integrator", "path"), int(task["max_depth"]))

@@ -64,7 +64,8 @@ def notes(
                 if quality.noise_limited
                 else "."
             )
-            + " Raise raytrace.evaluation_spp before reading more into small differences."
+            + " Raise raytrace.evaluation_spp, or set raytrace.evaluation_noise, before reading more into small "
+            "differences."
         )
     tracing = summary.get("tracing_all")
     if tracing and tracing["net_saved_seconds"] < 0:
