@@ -69,7 +69,7 @@ def test_single_bright_samples_in_the_dark() -> None:
     rng = np.random.default_rng(3)
     two, eight, true = [], [], []
     for _ in range(20):
-        groups = np.zeros((GROUPS, SIDE, SIDE, 4)) + [0.0, 0.0, 0.0, 1.0]
+        groups = np.tile([0.0, 0.0, 0.0, 1.0], (GROUPS, SIDE, SIDE, 1))
         groups[..., :3] += np.where(rng.random((GROUPS, SIDE, SIDE, 1)) < 0.002, 2.0, 0.0)
         mean = np.array([0.004, 0.004, 0.004, 1.0])
         true.append(np.sqrt(np.mean((display(groups.mean(axis=0)) - display(mean)) ** 2)))

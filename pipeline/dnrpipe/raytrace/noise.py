@@ -72,9 +72,9 @@ def half_noise(half_a: np.ndarray, half_b: np.ndarray) -> Noise:
 def denoised_error(denoised: np.ndarray, others: np.ndarray) -> tuple[float, float]:
     """(mean square error of a denoised picture in display space, its standard error), without a reference.
 
-    The denoiser's bias is in it. denoised: [H, W, 4], made from samples that are not in ``others`` [K, H, W, 4], K >= 2
-    means X_i of independent samples, all of them not denoised. For i != j, E (D - X_i)(D - X_j) = E (D - E X)²: noise of
-    different groups cancels in the product. Weighted by the slope of the display curve at D (first order), which is 0
+    The denoiser's bias is in it. denoised: D, [H, W, 4], made from samples that are not in ``others`` [K, H, W, 4]:
+    K >= 2 means X_i of independent samples as they were traced. For i != j, E (D - X_i)(D - X_j) = E (D - E X)²: noise
+    of different groups cancels in the product. Weighted by the slope of the display curve at D (first order), which is 0
     where it clips. The mean may come out below 0. The alpha of D, which no denoiser touches, counts as exact.
     """
     alpha = denoised[..., 3:]
