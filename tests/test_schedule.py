@@ -73,7 +73,14 @@ def test_every_view_reaches_its_target_in_few_passes() -> None:
         needed = (machine.scales[name] / 0.02) ** 2
         assert max(FIRST, needed) <= spp <= max(FIRST, 1.15 * needed + 2 * STEP)
     assert len(machine.adds) <= 4 * len(machine.done)
-    assert all(add // STEP % 2 == 1 and add % STEP == 0 for add in machine.adds)
+    assert all(add % STEP == 0 and (add // STEP % 2 == 1 or add <= 2 * STEP) for add in machine.adds)
+
+
+@pytest.mark.parametrize("target", [0.01, 0.02, 0.04, 0.05, 0.06])
+def test_a_target_is_hit_within_fifteen_percent_also_by_few_samples(target: float) -> None:
+    machine = _machine(scales={"x": 0.3}, cost={"x": 0.01}, workers=1)
+    machine.run(Goal(target, None, 10_000))
+    assert 0.85 * target <= 0.3 / math.sqrt(machine.done["x"]) <= target
 
 
 def test_stopping_on_a_noisy_estimate_does_not_stop_too_early() -> None:

@@ -23,6 +23,8 @@ from dataclasses import dataclass, field
 
 STEP = 8
 FIRST = 3 * STEP
+FEW = 10 * STEP
+"""Below so many samples, a noise target is approached in single steps: three at once would be more than 15% past it."""
 GROWTH = 8.0
 MARGIN = 1.04
 """More samples than the extrapolation says: each pass that just misses the target costs another launch."""
@@ -154,6 +156,10 @@ class Schedule:
         if self.goal.seconds is not None:
             seconds = min(seconds, self.left)
             add = min(add, SHARE * view.spp)
+        if self.goal.seconds is None and view.spp < FEW:
+            few = min(math.ceil(add / STEP) * STEP, room // STEP * STEP)
+            if few <= 2 * STEP:
+                return few, ""
         add = min(max(math.ceil(add), FIRST), room, self._within(view, seconds))
         if add < min(FIRST, room):
             if self.goal.seconds is not None and self.left <= PASS_SECONDS:

@@ -74,8 +74,8 @@ def denoised_error(denoised: np.ndarray, others: np.ndarray) -> tuple[float, flo
 
     The denoiser's bias is in it. denoised: D, [H, W, 4], made from samples that are not in ``others`` [K, H, W, 4]:
     K >= 2 means X_i of independent samples as they were traced. For i != j, E (D - X_i)(D - X_j) = E (D - E X)²: noise
-    of different groups cancels in the product. Weighted by the slope of the display curve at D (first order), which is 0
-    where it clips. The mean may come out below 0. The alpha of D, which no denoiser touches, counts as exact.
+    of different groups cancels in the product. Weighted by the slope of the display curve at D (first order), 0 where
+    it clips. The mean may come out below 0. The alpha of D, which no denoiser touches, counts as exact.
     """
     alpha = denoised[..., 3:]
     straight = np.where(alpha > 0, denoised[..., :3] / np.maximum(alpha, 1e-6), 2.0)
