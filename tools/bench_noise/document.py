@@ -31,10 +31,17 @@ def _row(name: str, target: float, runs: Sequence[dict[str, Any]]) -> str:
     estimated, measured = (_rms([run[key] for run in runs]) for key in ("estimate", "truth"))
     hits = [run["truth"] / target for run in runs]
     ends = ", ".join(sorted({_end(run) for run in runs}))
-    return (
-        f"| {name} | {_percent(target)} | {_span([run['spp'] for run in runs], 'd')} | {100 * estimated:.2f}%"
-        f" | {100 * measured:.2f}% | {estimated / measured if measured else math.nan:.2f} | {_span(hits, '.2f')} | {ends} |"
-    )
+    cells = [
+        name,
+        _percent(target),
+        _span([run["spp"] for run in runs], "d"),
+        f"{100 * estimated:.2f}%",
+        f"{100 * measured:.2f}%",
+        f"{estimated / measured if measured else math.nan:.2f}",
+        _span(hits, ".2f"),
+        ends,
+    ]
+    return f"| {' | '.join(cells)} |"
 
 
 def _sums(runs: Sequence[dict[str, Any]]) -> list[str]:
@@ -47,8 +54,8 @@ def _sums(runs: Sequence[dict[str, Any]]) -> list[str]:
         below = [run["truth"] <= (1 + WITHIN) * target for run in tried]
         mean = _rms([run["truth"] / target for run in tried]) if tried else math.nan
         lines.append(
-            f"Target {_percent(target)}: {len(tried)} of {len(these)} runs came to an end by it after more than the first"
-            f" pass; of these {sum(hits)} are within {100 * WITHIN:.0f}% of it, {sum(below)} within or below;"
+            f"Target {_percent(target)}: {len(tried)} of {len(these)} runs came to an end by it, after more than the"
+            f" first pass; of these {sum(hits)} are within {100 * WITHIN:.0f}% of it, {sum(below)} within or below;"
             f" measured / target {mean:.2f} (root mean square)."
         )
     return ["\n\n".join(lines)] if lines else []
