@@ -12,8 +12,8 @@ Notation
 v is unbiased where f is linear over the noise (Efron and Stein, "The jackknife estimate of variance", Annals of
 Statistics 9, 1981: never too small on average otherwise, for a mean of as many samples less one group). With two
 groups it is ((f(A) - f(B)) / 2)², which is far too small where single samples decide a dark pixel: f is steep there,
-so that a bright sample is worth less twice as bright. Measured on caustics: 0.45 of the true error with two groups,
-0.55-0.7 with eight, 0.65-0.85 with b² (docs/noise.md).
+so that a bright sample is worth less twice as bright.
+Eight groups with b² see nearly all of it (tests/test_noise.py).
 
 Its own uncertainty: v from the first half of the groups and v from the second are independent estimates of the same
 thing, and pixels are independent (box filter, independent samples), so that sum_p (v1 - v2)²/4 is the variance of
