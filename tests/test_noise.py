@@ -108,6 +108,7 @@ def test_samples_add_up_and_survive_the_disk(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     parts = rng.random((3, GROUPS, 6, 5, 4))
     path = tmp_path / "deep" / "0001.npz"
+    samples = read_samples(path, "print", 6, 5)
     sizes = (8, 24, 16)
     for part, size in zip(parts, sizes, strict=True):
         samples = read_samples(path, "print", 6, 5)
