@@ -189,6 +189,17 @@ def test_only_what_has_samples_per_pixel_is_ray_tracing() -> None:
     assert [r.name for r in traced_views(records, "evaluation")] == ["test/1"]
 
 
+def test_a_view_traced_further_costs_all_its_seconds_and_the_sums_count_each_once() -> None:
+    """Lower noise from the samples that are there: the second record holds the new seconds, and names the old."""
+    first = record(name="train/0001", spp=64, seconds=3.0, cpu_seconds=2.0)
+    earlier = {"earlier_seconds": 3.0, "earlier_cpu_seconds": 2.0}
+    second = record(name="train/0001", spp=256, seconds=9.0, cpu_seconds=8.0, detail=earlier)
+    (view,) = traced_views([first, second], "training")
+    assert (view.seconds, view.cpu_seconds, view.spp) == (12.0, 10.0, 256)
+    assert total([first, second]).seconds == 12.0
+    assert upfront_seconds([first, second]) == pytest.approx(12.0)
+
+
 def test_repeated_epochs_count_once_in_what_a_stage_costs() -> None:
     epochs = [
         record(stage="select", unit="epoch", name=f"epoch {i}", seconds=s, spp=None)

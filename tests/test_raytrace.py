@@ -13,7 +13,7 @@ import pytest
 from dnrpipe.cameras import make_cameras
 from dnrpipe.errors import UserError
 from dnrpipe.executors import TaskResult, run_tasks
-from dnrpipe.raytrace.tracer import estimate_noise
+from dnrpipe.raytrace.noise import half_noise
 from dnrpipe.raytrace.variants import choose_variant, llvm_libraries
 from dnrpipe.settings import CameraSettings
 from dnrtrain.exr import read_exr
@@ -120,7 +120,7 @@ def test_the_noise_estimate_is_the_error_of_the_mean() -> None:
     rng = np.random.default_rng(0)
     truth = np.ones((400, 400, 4)) * [0.3, 0.3, 0.3, 1.0]
     halves = [truth + rng.normal(0, 0.02, truth.shape) * [1, 1, 1, 0] for _ in range(2)]
-    _, estimated = estimate_noise(*halves)
+    estimated = half_noise(*halves).rmse
     slope = 1.055 / 2.4 * 0.3 ** (1 / 2.4 - 1)
     assert estimated == pytest.approx(slope * 0.02 / np.sqrt(2), rel=0.03)
 

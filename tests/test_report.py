@@ -363,6 +363,12 @@ def test_durations(seconds: float, text: str) -> None:
     assert words.duration(seconds) == text
 
 
+def test_sample_counts_in_words() -> None:
+    assert words.several([64]) == "64"
+    assert words.several([32, 64, 128]) == "32, 64, 128"
+    assert words.several([80, 112, 160, 664]) == "80 to 664"
+
+
 @needs_browser
 @pytest.mark.slow
 @pytest.mark.parametrize(("width", "dark"), [(1280, False), (1280, True), (375, False)])

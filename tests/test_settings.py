@@ -117,3 +117,55 @@ def test_paths_per_texel_of_the_baked_light() -> None:
     assert of(800)[1] == 32
     assert of(256, light_size=512) == (512, 128)
     assert of(256, light_spp=7) == (1024, 7)
+
+
+def test_targets_of_tracing_are_one_wish() -> None:
+    """Flags forget what others said before; with a target, --spp is its limit; settings read the same amounts."""
+    from dnrpipe.cli.options import tracing_overrides
+
+    both = tracing_overrides("1%", "10m", 4096, None)
+    assert both == {"raytrace": {"noise": 0.01, "time": 600.0, "max_spp": 4096}}
+    assert tracing_overrides("1%", None, None, None)["raytrace"] == {"noise": 0.01, "time": None}
+    assert tracing_overrides(None, None, 64, None)["raytrace"] == {"spp": 64, "noise": None, "time": None}
+    assert tracing_overrides(None, None, None, "none") == {"raytrace": {"denoise": False}}
+    assert tracing_overrides(None, None, None, None) == {}
+    settings = resolve(
+        "draft", {"raytrace": {"noise": "1%", "time": "1m30s", "evaluation_noise": 0.02}}, environment={}
+    )
+    assert (settings.raytrace.noise, settings.raytrace.time, settings.raytrace.evaluation_noise) == (0.01, 90.0, 0.02)
+
+
+@pytest.mark.parametrize(
+    ("noise", "time", "spp", "words"),
+    [
+        ("0", None, None, "--noise 0: expected a share"),
+        ("150%", None, None, "--noise 150%: expected a share"),
+        (None, "soon", None, "--time soon: expected a time above 0, e.g. 90s"),
+        ("1%", None, 4, "--spp 4: with --noise or --time at least 8"),
+        (None, None, 0, "--spp 0: must be at least 1"),
+    ],
+)
+def test_bad_targets_are_named(noise: str | None, time: str | None, spp: int | None, words: str) -> None:
+    from dnrpipe.cli.options import tracing_overrides
+
+    with pytest.raises(UserError) as caught:
+        tracing_overrides(noise, time, spp, None)
+    assert words in str(caught.value)
+
+
+def test_a_target_of_tracing_changes_no_fingerprint_where_there_is_none() -> None:
+    """Workspaces made before there were targets stay done; with one, the plain count no longer matters."""
+    from dnrpipe.stages import STAGES
+
+    def tracing(**changes: object) -> list[object]:
+        settings = resolve("draft", {"raytrace": changes}, environment={})
+        return [STAGES[name].settings(settings)[0] for name in ("raytrace", "evaluate")]
+
+    plain = tracing()
+    assert plain[0] == {"spp": 128, "max_depth": "auto", "denoise": True, "seed": 0}
+    assert plain[1] == {"evaluation_spp": 512, "max_depth": "auto", "evaluation_denoise": True, "seed": 0}
+    assert tracing(max_spp=100) == plain
+    assert tracing(noise=0.01) == tracing(noise=0.01, spp=7)
+    assert tracing(noise=0.01)[0] != tracing(noise=0.02)[0]
+    assert tracing(noise=0.01)[1] == plain[1]
+    assert tracing(evaluation_noise=0.01)[0] == plain[0]

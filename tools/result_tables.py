@@ -1,9 +1,9 @@
-"""Write the generated parts of docs/ablation.md and docs/frames.md: rows from the code, tables from committed results.
+"""Write the generated parts of the pages of results: rows from the code, tables from committed results.
 
-A part stands between ``<!-- rows -->``, ``<!-- results FILE -->`` (of `dnrpipe ablate`) or ``<!-- frames FILE -->``
-(of tools.bench_frames), FILE beside docs/, and ``<!-- end -->``.
+A part stands between ``<!-- rows -->``, ``<!-- results FILE -->`` (of `dnrpipe ablate`), ``<!-- frames FILE -->``
+(of tools.bench_frames) or ``<!-- noise FILE -->`` (of tools.bench_noise), FILE beside docs/, and ``<!-- end -->``.
 
-python -m tools.result_tables [--check] docs/ablation.md docs/frames.md
+python -m tools.result_tables [--check] docs/ablation.md docs/frames.md docs/noise.md
 """
 
 from __future__ import annotations
@@ -15,12 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from tools.bench_frames.document import markdown as frames_markdown
+from tools.bench_noise.document import markdown as noise_markdown
 
 from dnrpipe.ablation.results import read_results
 from dnrpipe.ablation.rows import GROUPS, ROWS
 from dnrpipe.ablation.tables import markdown
 
-PART = re.compile(r"(<!-- (rows|results|frames)(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
+PART = re.compile(r"(<!-- (rows|results|frames|noise)(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def rows_table() -> str:
@@ -40,6 +41,8 @@ def generate(text: str, folder: Path) -> str:
             body = rows_table()
         elif match[2] == "results":
             body = markdown(read_results(folder / match[3])).rstrip()
+        elif match[2] == "noise":
+            body = noise_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
         else:
             body = frames_tables(json.loads((folder / match[3]).read_text(encoding="utf-8")))
         return f"{match[1]}{body}\n{match[4]}"

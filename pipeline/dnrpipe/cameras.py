@@ -185,6 +185,22 @@ def split_views(views: Sequence[View], settings: CameraSettings) -> dict[str, li
     }
 
 
+def scaled_to(view: View, side: int) -> View:
+    """The same picture with at most ``side`` pixels on its longer side; smaller views stay as they are."""
+    scale = min(1.0, side / max(view.width, view.height))
+    width, height = max(8, round(view.width * scale)), max(8, round(view.height * scale))
+    return view.model_copy(
+        update={
+            "width": width,
+            "height": height,
+            "fl_x": view.fl_x * scale,
+            "fl_y": view.fl_y * scale,
+            "cx": view.cx * width / view.width,
+            "cy": view.cy * height / view.height,
+        }
+    )
+
+
 def depth_range(views: Sequence[View], summary: dict[str, Any]) -> tuple[float, float]:
     """(near, far) planar depth, scene units, that holds the bounding sphere for every view."""
     center = np.asarray(summary["bounds"]["center"])

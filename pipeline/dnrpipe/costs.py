@@ -201,7 +201,16 @@ def traced_views(records: Sequence[CostRecord], purpose: str, only: Collection[s
         traced = record.unit == "view" and record.spp is not None and record.stage in ("raytrace", "evaluate")
         if traced and record.purpose == purpose and not record.cache_hit:
             latest[record.name] = record
-    return [record for name, record in latest.items() if only is None or name in only]
+    return [_whole(record) for name, record in latest.items() if only is None or name in only]
+
+
+def _whole(record: CostRecord) -> CostRecord:
+    """With the seconds of earlier runs whose samples went into it (booked then): what the view costs."""
+    earlier = record.detail.get("earlier_seconds", 0.0)
+    cpu = record.detail.get("earlier_cpu_seconds", 0.0)
+    if not earlier:
+        return record
+    return record.model_copy(update={"seconds": record.seconds + earlier, "cpu_seconds": record.cpu_seconds + cpu})
 
 
 def latest_epochs(records: Sequence[CostRecord], stage: str) -> list[CostRecord]:
@@ -230,7 +239,7 @@ def upfront_seconds(records: Sequence[CostRecord], only: Collection[str] | None 
         unwanted = only is not None and record.name.removeprefix("base/") not in only
         if record.stage == "raytrace" and record.unit == "view" and unwanted:
             continue
-        latest[(record.stage, record.unit, record.name)] = record
+        latest[(record.stage, record.unit, record.name)] = _whole(record)
     return total(latest.values()).wall_seconds
 
 

@@ -72,6 +72,8 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
                 "name": view.name,
                 "flip": error,
                 "ceiling_psnr": _ceiling(traced.get("noise_rmse")),
+                "reference_noise": traced.get("noise"),
+                "reference_noise_error": traced.get("noise_error"),
                 "seconds_traced": traced.get("seconds"),
                 "seconds_neural": seconds,
                 "seconds_base": base.get("seconds"),
@@ -89,13 +91,16 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
         "perceptual": perceptual is not None,
         "trained_with_perceptual": workspace.manifest.stages["finetune"].detail.get("perceptual", False),
         "device": torch_name,
+        "reference_noise_target": settings.raytrace.evaluation_noise,
         "neural_ms": 1000 * float(np.median([row["seconds_neural"] for row in rows])),
     }
     _remove_strangers(workspace, {view.name for view in views})
     write_json(workspace.evaluation / "metrics.json", report)
     mean = report["mean"]
     console.say(
-        f"held-out over {len(rows)} views: PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.4f},"
+        f"held-out over {len(rows)} views: PSNR {mean['psnr']:.2f} dB"
+        + (f" (ceiling {mean['ceiling_psnr']:.1f} dB)" if mean["ceiling_psnr"] is not None else "")
+        + f", SSIM {mean['ssim']:.4f},"
         f" FLIP {mean['flip']:.4f}"
         + (f", LPIPS {mean['lpips_alex']:.4f} (alex)" if mean["lpips_alex"] is not None else ", no LPIPS weights")
     )
@@ -159,7 +164,7 @@ def _image(tensor: Any) -> np.ndarray:
 
 
 def _ceiling(noise_rmse: float | None) -> float | None:
-    """The PSNR that a perfect renderer would measure against this noisy reference, dB."""
+    """The PSNR that a perfect renderer would measure against this noisy reference, dB; a denoiser's bias not in it."""
     return None if not noise_rmse else -20 * math.log10(noise_rmse)
 
 

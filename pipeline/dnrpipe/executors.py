@@ -22,8 +22,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +71,7 @@ def run_tasks(
     log: Path,
     timeout: float = 3600.0,
     environment: dict[str, str] | None = None,
+    follow: Callable[[TaskResult], Sequence[dict[str, Any]]] | None = None,
 ) -> Iterator[TaskResult | Retry]:
     """Run ``tasks`` on ``workers`` processes; yield a TaskResult per task, and a Retry for each new try.
 
@@ -80,6 +81,7 @@ def run_tasks(
         log: file to which the workers' output is appended.
         timeout: seconds after which a silent task counts as hung; its worker is killed.
         environment: variables added to the workers' environment.
+        follow: called with each TaskResult before it is yielded; returns tasks to do after it.
 
     Closing the iterator (Ctrl-C in the consumer) kills the workers.
     """
@@ -116,13 +118,11 @@ def run_tasks(
                     return
                 seconds = time.monotonic() - started
                 if "error" not in answer:
-                    open_tasks.add(-1)
                     outcomes.put(TaskResult(task, answer["result"], None, attempt, seconds))
                 elif attempt < MAX_ATTEMPTS and answer.get("retry", True):
                     outcomes.put(Retry(task, answer["error"]))
                     pending.put((task, attempt + 1))
                 else:
-                    open_tasks.add(-1)
                     died, number = answer.get("died", False), answer.get("errno")
                     outcomes.put(TaskResult(task, None, answer["error"], attempt, seconds, died, number))
         finally:
@@ -132,10 +132,13 @@ def run_tasks(
     for thread in threads:
         thread.start()
     try:
-        yielded = 0
-        while yielded < len(tasks):
+        while open_tasks.value > 0:
             outcome = outcomes.get()
-            yielded += isinstance(outcome, TaskResult)
+            if isinstance(outcome, TaskResult):
+                more = follow(outcome) if follow is not None else ()
+                for task in more:
+                    pending.put((task, 1))
+                open_tasks.value += len(more) - 1
             yield outcome
     finally:
         stopping.set() if open_tasks.value > 0 else None
@@ -153,12 +156,9 @@ class WorkerDied(RuntimeError):
 
 @dataclass
 class _Counter:
-    value: int
-    lock: threading.Lock = field(default_factory=threading.Lock)
+    """Tasks not answered for yet. Written by the consumer of the answers alone, read by the workers' threads."""
 
-    def add(self, step: int) -> None:
-        with self.lock:
-            self.value += step
+    value: int
 
 
 def _spawn(module: str, common: dict[str, Any], log: Path, environment: dict[str, str]) -> subprocess.Popen[str]:

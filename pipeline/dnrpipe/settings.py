@@ -18,6 +18,7 @@ from pydantic import Field, ValidationError, field_validator
 from dnrtrain.selector.names import TRAINED_NAMES, PolicyName, full_name
 from dnrtrain.settings import LossWeights, ModelSettings, Step1Settings, Step2Settings, Strict
 
+from .amounts import parse_seconds, parse_share
 from .effects.plan import EffectName
 from .errors import UserError
 
@@ -56,8 +57,24 @@ class PassSettings(Strict):
 class RaytraceSettings(Strict):
     """Path tracing with Mitsuba."""
 
-    spp: int = Field(default=256, ge=1, le=1_000_000)
-    evaluation_spp: int = Field(default=512, ge=1, le=1_000_000, description="samples of held-out references")
+    spp: int = Field(
+        default=256, ge=1, le=1_000_000, description="samples per pixel, where neither noise nor time is set"
+    )
+    noise: float | None = Field(
+        default=None, gt=0, lt=1, description="trace each view until its relative RMSE in display space is this: 1%"
+    )
+    time: float | None = Field(
+        default=None, gt=0, description="seconds (90s, 10m) for all views together; shared so that noise is least"
+    )
+    max_spp: int = Field(
+        default=16384, ge=8, le=1_000_000, description="samples per pixel at most, where noise or time is the target"
+    )
+    evaluation_spp: int = Field(
+        default=512, ge=1, le=1_000_000, description="samples of held-out references, without evaluation_noise"
+    )
+    evaluation_noise: float | None = Field(
+        default=None, gt=0, lt=1, description="trace held-out references until their noise is this"
+    )
     max_depth: Annotated[int, Field(ge=1, le=10_000)] | Literal["auto"] = Field(
         default="auto", description="path vertices, 2 = direct light; auto: as deep as the scene needs, by a pilot"
     )
@@ -66,6 +83,16 @@ class RaytraceSettings(Strict):
     evaluation_denoise: bool = Field(default=False, description="denoise the held-out references")
     seed: int = Field(default=0, ge=0)
     workers: int = Field(default=0, ge=0, description="0 = one per core")
+
+    @field_validator("noise", "evaluation_noise", mode="before")
+    @classmethod
+    def _share(cls, value: Any) -> Any:
+        return parse_share(value) if isinstance(value, str) else value
+
+    @field_validator("time", mode="before")
+    @classmethod
+    def _seconds(cls, value: Any) -> Any:
+        return parse_seconds(value) if isinstance(value, str) else value
 
 
 class BaseSettings(Strict):

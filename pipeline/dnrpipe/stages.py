@@ -60,6 +60,20 @@ def _light(settings: Settings) -> dict[str, Any]:
     return chosen | {key: sorted(set(chosen[key]) - NEURAL) for key in ("enable", "disable")}
 
 
+def _tracing(settings: Settings, *, test: bool) -> dict[str, Any]:
+    """Settings that decide how the views of one kind are ray-traced; targets only where they are set."""
+    raytrace = settings.raytrace
+    names = ["evaluation_noise"] if test else ["noise", "time"]
+    targets = {name: value for name in names if (value := getattr(raytrace, name)) is not None}
+    if targets:
+        targets["max_spp"] = raytrace.max_spp
+    else:
+        names = ["evaluation_spp"] if test else ["spp"]
+        targets = {name: getattr(raytrace, name) for name in names}
+    common = {"max_depth", "evaluation_denoise" if test else "denoise", "seed"}
+    return raytrace.model_dump(include=common) | targets
+
+
 def _base(settings: Settings) -> list[Any]:
     """Settings that decide the base images."""
     return [settings.model.base, settings.base.model_dump()]
@@ -118,7 +132,7 @@ STAGES: dict[str, Stage] = {
             reads=("scene", "selection.json"),
             writes=("raytraced/train", "base/train"),
             settings=lambda s: [
-                s.raytrace.model_dump(exclude={"workers", "evaluation_spp", "evaluation_denoise", "variant"}),
+                _tracing(s, test=False),
                 _light(s),
                 _base(s),
             ],
@@ -144,7 +158,7 @@ STAGES: dict[str, Stage] = {
             reads=("passes/test", "checkpoints/step2"),
             writes=("raytraced/test", "base/test", "evaluation"),
             settings=lambda s: [
-                s.raytrace.model_dump(exclude={"workers", "spp", "denoise", "variant"}),
+                _tracing(s, test=True),
                 _light(s),
                 _base(s),
             ],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from dnrtrain.exr import read_metadata
 
 from .console import Console
 from .costs import CostRecord
-from .executors import Retry, run_tasks
+from .executors import Retry, TaskResult, run_tasks
 from .workspace import Workspace
 
 
@@ -54,32 +54,55 @@ def run_view_tasks(
     if not due:
         return 0
     count = max(1, min(workers, len(due)))
-    failed: list[str] = []
     log = workspace.log(stage)
     with console.bar(label, len(tasks), len(tasks) - len(due)) as bar:
         outcomes = run_tasks(module, common, due, workers=count, log=log, environment=environment)
-        try:
-            for outcome in outcomes:
-                name = task_name(outcome.task)
-                if isinstance(outcome, Retry):
-                    console.warn(f"{label}: {name}: {outcome.reason}; trying once more")
-                elif outcome.errno == errno.ENOSPC:
-                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), outcome.task["output"])
-                elif outcome.result is None:
-                    console.warn(f"{label}: {name} failed twice: {outcome.error}")
-                    failed.append(name)
-                    bar.advance()
-                else:
-                    workspace.ledger.append(book(outcome.task, outcome.result, count))
-                    bar.advance(note=name)
-        finally:
-            outcomes.close()  # type: ignore[attr-defined]
+
+        def done(outcome: TaskResult) -> None:
+            if outcome.result is not None:
+                workspace.ledger.append(book(outcome.task, outcome.result, count))
+            bar.advance(note=task_name(outcome.task) if outcome.result is not None else "")
+
+        failed = consume(label, outcomes, console, done)
+    report_failed(label, failed, len(tasks), log)
+    return len(due)
+
+
+def consume(
+    label: str,
+    outcomes: Iterator[TaskResult | Retry],
+    console: Console,
+    done: Callable[[TaskResult], None],
+) -> list[str]:
+    """Go through the outcomes of tasks, telling of retries and failures; names of the tasks that failed.
+
+    done: called with every TaskResult. Raises OSError: the disk is full. The workers end with this call.
+    """
+    failed: list[str] = []
+    try:
+        for outcome in outcomes:
+            name = task_name(outcome.task)
+            if isinstance(outcome, Retry):
+                console.warn(f"{label}: {name}: {outcome.reason}; trying once more")
+                continue
+            if outcome.errno == errno.ENOSPC:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), outcome.task["output"])
+            if outcome.result is None:
+                console.warn(f"{label}: {name} failed twice: {outcome.error}")
+                failed.append(name)
+            done(outcome)
+    finally:
+        outcomes.close()  # type: ignore[attr-defined]
+    return failed
+
+
+def report_failed(label: str, failed: Sequence[str], total: int, log: Path) -> None:
+    """Raise TasksFailed where there are any."""
     if failed:
         raise TasksFailed(
-            f"{label}: {len(failed)} of {len(tasks)} failed ({', '.join(failed[:5])}{'…' if len(failed) > 5 else ''});"
+            f"{label}: {len(failed)} of {total} failed ({', '.join(failed[:5])}{'…' if len(failed) > 5 else ''});"
             f" the others are done. See {log}; run the same command to try again"
         )
-    return len(due)
 
 
 def task_name(task: dict[str, Any]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zlib
+from pathlib import Path
 from typing import Any
 
 from dnrtrain.contract import ContractError, View
@@ -11,15 +12,18 @@ from .base import RENDERED, base_path, base_views
 from .console import Console
 from .costs import CostRecord
 from .effects.store import lenses, resolve_plan, trace_config, variant_for
+from .passes import run_passes
 from .prepare import split_views
 from .scene_files import scene_fingerprint
+from .schedule import Goal
 from .settings import Settings
 from .stages import Outcome
-from .tasks import is_made, run_view_tasks, view_record, warn_repairs, worker_count
+from .tasks import is_made, run_view_tasks, task_name, view_record, warn_repairs, worker_count
 from .training import read_selection
 from .workspace import Workspace, digest
 
 TRACE_VERSION = 3
+SAMPLES_VERSION = 1
 
 
 def run(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
@@ -40,10 +44,12 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
     bases = base_views(
         workspace, settings, console, run_id, views=selected, split="train", stage="raytrace", purpose="training"
     )
-    return Outcome(
-        digest([task["fingerprint"] for task in [*tasks, *bases]]),
-        {"views": [view.name for view in selected], "spp": settings.raytrace.spp},
-    )
+    made: list[Any] = [task["fingerprint"] for task in [*tasks, *bases]]
+    spp = [(read_metadata(Path(task["output"])) or {}).get("spp") for task in tasks]
+    if goal_of(settings, "train") is not None:
+        made.append(spp)  # with a time, how many samples were taken is not known before
+    traced: Any = settings.raytrace.spp if goal_of(settings, "train") is None else spp
+    return Outcome(digest(made), {"views": [view.name for view in selected], "spp": traced})
 
 
 def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
@@ -74,11 +80,15 @@ def trace_views(
     stage: str,
     purpose: str,
 ) -> list[dict[str, Any]]:
-    """Path-trace ``views`` into ``raytraced/<split>``; views already there are kept. Returns all tasks."""
+    """Path-trace ``views`` into ``raytraced/<split>``; views already there are kept. Returns all tasks.
+
+    spp: samples per pixel, where the settings name no noise or time for the split (:func:`goal_of`).
+    """
     scene_print = scene_fingerprint(workspace)
     plan = resolve_plan(workspace, settings, console, run_id, stage)
     known = lenses(workspace, settings) if plan.on("depth-of-field") else {}
-    tasks = [
+    goal = goal_of(settings, split)
+    tasks: list[dict[str, Any]] = [
         {
             "view": view.model_dump(mode="json"),
             "output": str(workspace.raytraced(split, view.name)),
@@ -94,6 +104,12 @@ def trace_views(
     wanted = settings.raytrace.evaluation_denoise if split == "test" else settings.raytrace.denoise
     for task in tasks:
         decisive = {key: task[key] for key in ("view", "spp", "integrator", "max_depth", "lens", "seed")}
+        if goal is not None:
+            del task["spp"], decisive["spp"]
+            path = workspace.raytraced(split, task_name(task).partition("/")[2])
+            task["samples"] = str(path.parent / "samples" / f"{path.stem}.npz")
+            task["samples_print"] = digest([SAMPLES_VERSION, scene_print, decisive, light])
+            decisive["goal"] = [goal.noise, goal.seconds, goal.limit]
         if wanted:
             task["denoise"] = decisive["denoise"] = True
         task["fingerprint"] = digest([TRACE_VERSION, scene_print, decisive, light])
@@ -115,20 +131,29 @@ def trace_views(
             device=f"mitsuba {choice.variant}",
         )
 
-    run_view_tasks(
-        "ray tracing" if split == "train" else "ray tracing test views",
-        "dnrpipe.raytrace.tracer",
-        {"bundle": config["bundle"], "variant": choice.variant, "threads": 1},
-        tasks,
-        workspace=workspace,
-        console=console,
-        stage=stage,
-        workers=workers,
-        book=book,
-        environment=choice.environment,
-    )
+    label = "ray tracing" if split == "train" else "ray tracing test views"
+    common = {"bundle": config["bundle"], "variant": choice.variant, "threads": 1}
+    arguments: dict[str, Any] = {
+        "workspace": workspace,
+        "console": console,
+        "stage": stage,
+        "workers": workers,
+        "book": book,
+        "environment": choice.environment,
+    }
+    if goal is None:
+        run_view_tasks(label, "dnrpipe.raytrace.tracer", common, tasks, **arguments)
+    else:
+        run_passes(label, common, tasks, goal, **arguments)
     warn_repairs(tasks, console)
     return tasks
+
+
+def goal_of(settings: Settings, split: str) -> Goal | None:
+    """The noise or time that views of the split are traced to; None: the samples per pixel are set."""
+    raytrace = settings.raytrace
+    noise, seconds = (raytrace.evaluation_noise, None) if split == "test" else (raytrace.noise, raytrace.time)
+    return None if noise is None and seconds is None else Goal(noise, seconds, raytrace.max_spp)
 
 
 def view_seed(seed: int, split: str, name: str) -> int:

@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from ..session import Session
     from ..settings import Settings
 
+SAMPLES_AT_ONCE = 8
+"""The least that is traced towards a target: schedule.STEP, which is not imported for --help."""
+
 
 def common(function: Callable[..., Any]) -> Callable[..., Any]:
     """Options every stage has."""
@@ -123,3 +126,33 @@ def select_overrides(options: dict[str, Any]) -> dict[str, Any]:
         raise UserError(f"--budget {chosen['budget']}: must be at least 1 view")
     given = {key: value for key, value in chosen.items() if value is not None}
     return {"select": given} if given else {}
+
+
+def tracing_overrides(noise: str | None, time: str | None, spp: int | None, denoise: str | None) -> dict[str, Any]:
+    """How far views are traced. Flags name one wish together: what they leave out of it is forgotten."""
+    from ..amounts import parse_seconds, parse_share
+
+    raytrace: dict[str, Any] = {}
+    if noise is not None or time is not None:
+        raytrace = {
+            "noise": _amount("--noise", noise, parse_share),
+            "time": _amount("--time", time, parse_seconds),
+        }
+        if spp is not None:
+            if spp < SAMPLES_AT_ONCE:
+                raise UserError(f"--spp {spp}: with --noise or --time at least {SAMPLES_AT_ONCE}, one in each group")
+            raytrace["max_spp"] = spp
+    elif spp is not None:
+        if spp < 1:
+            raise UserError(f"--spp {spp}: must be at least 1")
+        raytrace = {"spp": spp, "noise": None, "time": None}
+    if denoise is not None:
+        raytrace["denoise"] = denoise == "oidn"
+    return {"raytrace": raytrace} if raytrace else {}
+
+
+def _amount(flag: str, text: str | None, parse: Callable[[str], float]) -> float | None:
+    try:
+        return None if text is None else parse(text)
+    except ValueError as error:
+        raise UserError(f"{flag} {text}: {error}") from None

@@ -17,6 +17,7 @@ from .options import (
     options,
     select_overrides,
     strict_override,
+    tracing_overrides,
 )
 
 
@@ -64,17 +65,32 @@ def select(**options: Any) -> None:
 
 
 @click.command("raytrace-selected")
-@click.option("--spp", type=int, metavar="N", help="Samples per pixel.")
+@click.option("--noise", metavar="SHARE", help="Trace each view until its noise is this, e.g. 1% (or 0.01).")
+@click.option("--time", metavar="TIME", help="Trace for this long (90s, 10m, 1h30m), shared over the views.")
+@click.option("--spp", type=int, metavar="N", help="Samples per pixel; with --noise or --time: at most so many.")
+@click.option(
+    "--denoise", type=click.Choice(["oidn", "none"]), help="Open Image Denoise on the views to be trained on, or not."
+)
 @common
-def raytrace_selected(spp: int | None, **options: Any) -> None:
+def raytrace_selected(
+    noise: str | None, time: str | None, spp: int | None, denoise: str | None, **options: Any
+) -> None:
     """Path-trace the selected views with Mitsuba, and no others.
+
+    Noise is the relative RMSE of a view in display space (sRGB over white), before the denoiser, estimated while
+    tracing. With both --noise and --time, views that are good enough leave the time to the others. The time is that
+    of tracing; baked light and base images come on top. --noise, --time and --spp are remembered; naming one of them
+    forgets the others. What is traced is kept: a lower noise or a longer time goes on from it.
 
     \b
     Examples:
       dnrpipe raytrace-selected
       dnrpipe raytrace-selected --spp 512
+      dnrpipe raytrace-selected --noise 1%
+      dnrpipe raytrace-selected --noise 0.5% --spp 4096 --denoise none
+      dnrpipe raytrace-selected --time 10m
     """
-    overrides: dict[str, Any] = {"raytrace": {"spp": spp}} if spp is not None else {}
+    overrides = tracing_overrides(noise, time, spp, denoise)
     with open_session("raytrace-selected", options, overrides=overrides) as session:
         session.stages("raytrace")
 

@@ -9,9 +9,9 @@ from typing import Any
 from pydantic import ValidationError
 
 from dnrtrain.atomic import write_json
-from dnrtrain.contract import View, read_cameras
+from dnrtrain.contract import read_cameras
 
-from ..cameras import view_lenses
+from ..cameras import scaled_to, view_lenses
 from ..console import Console
 from ..costs import CostRecord
 from ..errors import UserError
@@ -127,22 +127,10 @@ def pilot_views(workspace: Workspace, settings: Settings, plan: EffectPlan) -> l
     count = min(PILOT_VIEWS, len(views))
     chosen = [views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)]
     known = lenses(workspace, settings) if plan.on("depth-of-field") else {}
-    return [{"view": _small(view).model_dump(mode="json"), "lens": known.get(view.name)} for view in chosen]
-
-
-def _small(view: View) -> View:
-    scale = min(1.0, PILOT_RESOLUTION / max(view.width, view.height))
-    width, height = max(8, round(view.width * scale)), max(8, round(view.height * scale))
-    return view.model_copy(
-        update={
-            "width": width,
-            "height": height,
-            "fl_x": view.fl_x * scale,
-            "fl_y": view.fl_y * scale,
-            "cx": view.cx * width / view.width,
-            "cy": view.cy * height / view.height,
-        }
-    )
+    return [
+        {"view": scaled_to(view, PILOT_RESOLUTION).model_dump(mode="json"), "lens": known.get(view.name)}
+        for view in chosen
+    ]
 
 
 def _pilot_print(workspace: Workspace, settings: Settings, plan: EffectPlan) -> str:

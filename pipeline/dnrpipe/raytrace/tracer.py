@@ -1,33 +1,30 @@
 """The ray-tracing worker: path-traces views of a Mitsuba bundle into EXR files.
 
 Notation
-    A, B     two independent half renders of a view, each spp/2 samples per pixel
-    noise    estimated relative RMSE of (A+B)/2 in display space: rms((A-B)/2) / rms(value); of denoised views, A and
-             B are denoised first: the noise that is left, not the denoiser's own error
+    A, B     two independent half renders of a view, each spp/2 samples per pixel: they cost nothing extra, as their
+             mean is the image
+    noise    estimated relative RMSE of (A+B)/2 in display space (:func:`.noise.half_noise`); of denoised views, A and
+             B are denoised first: the noise that is left, not the denoiser's own error. raw_noise: before the denoiser
 
-Two halves cost nothing extra (their mean is the image) and give an unbiased estimate of the variance.
+This is tracing with so many samples per pixel; to a noise level or within a time it is :mod:`.pass_worker` that traces.
 """
 
 from __future__ import annotations
 
 import resource
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dnrpipe.effects.statistics import display
 from dnrtrain.contract import View
 from dnrtrain.exr import write_exr
 
-from .denoise import denoise
 from .engine import Engine
+from .noise import half_noise
+from .pictures import finished, repair
 from .sensors import sensor_dict
-
-REPAIR_ROUNDS = 3
-AUXILIARY_SPP = 64
 
 
 class Worker:
@@ -56,17 +53,16 @@ class Worker:
 
         half_a, done_a = render((spp + 1) // 2, seed * 2)
         half_b, done_b = render(spp // 2, seed * 2 + 1) if spp > 1 else (half_a, 0)
-        half_a, half_b, repaired, masked = _repair(render, half_a, half_b, max(1, spp // 2), seed)
+
+        def again(attempt: int, half: int) -> np.ndarray:
+            return render(max(1, spp // 2), 0x80000 + seed + 0x1000 * (attempt * 2 + half))[0]
+
+        repaired, masked = repair([half_a, half_b], again)
         total = done_a + done_b
         image = (half_a * done_a + half_b * done_b) / total
-        channels = {channel: image[..., i] for i, channel in enumerate("RGBA")}
-        if task.get("denoise"):
-            channels |= {f"raw.{channel}": image[..., i] for i, channel in enumerate("RGB")}
-            halves = [image, half_a, half_b] if done_b else [image]
-            clean = self._denoised(halves, view)
-            channels |= {channel: clean[0][..., i] for i, channel in enumerate("RGB")}
-            half_a, half_b = clean[1:] if done_b else (half_a, half_b)
-        noise, noise_rmse = estimate_noise(half_a, half_b) if done_b else (None, None)
+        halves = (half_a, half_b) if done_b else None
+        raw = half_noise(half_a, half_b) if done_b else None
+        channels, left = finished(self.engine, self.bundle, view, image, halves, raw, bool(task.get("denoise")))
         numbers = {
             "spp": total,
             "max_depth": depth,
@@ -77,8 +73,7 @@ class Worker:
             "cpu_seconds": time.process_time() - cpu,
             "load_seconds": self.engine.load_seconds,
             "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-            "noise": noise,
-            "noise_rmse": noise_rmse,
+            **left,
             "repaired": repaired,
             "masked": masked,
             "denoised": bool(task.get("denoise")),
@@ -90,48 +85,5 @@ class Worker:
         )
         return numbers
 
-    def _denoised(self, images: list[np.ndarray], view: View) -> list[np.ndarray]:
-        """The images [H, W, 4] without noise; one thread, so that bits repeat."""
-        albedo, normal = self.engine.auxiliary(self.bundle, view, AUXILIARY_SPP)
-        return [denoise(image, albedo, normal, threads=1).astype(np.float64) for image in images]
 
-
-def _repair(
-    render: Callable[[int, int], tuple[np.ndarray, int]],
-    half_a: np.ndarray,
-    half_b: np.ndarray,
-    spp: int,
-    seed: int,
-) -> tuple[np.ndarray, np.ndarray, int, int]:
-    """Non-finite pixels are traced again with other seeds; what stays is set to 0 and counted."""
-    repaired = masked = 0
-    halves = []
-    for offset, half in enumerate((half_a, half_b)):
-        bad = ~np.isfinite(half).all(axis=-1)
-        for attempt in range(REPAIR_ROUNDS):
-            if not bad.any():
-                break
-            again, _ = render(spp, 0x80000 + seed + 0x1000 * (attempt * 2 + offset))
-            good = bad & np.isfinite(again).all(axis=-1)
-            half[good] = again[good]
-            repaired += int(good.sum())
-            bad &= ~good
-        half[bad] = 0.0
-        masked += int(bad.sum())
-        halves.append(half)
-    return halves[0], halves[1], repaired, masked
-
-
-def estimate_noise(half_a: np.ndarray, half_b: np.ndarray) -> tuple[float, float]:
-    """(relative, absolute) RMSE of the mean of two independent halves, in sRGB display space over white.
-
-    E[((A-B)/2)^2] = Var[(A+B)/2] for independent, equally noisy A and B (first order through the
-    display curve). Absolute in display units [0, 1]; relative to the rms of the picture.
-    """
-    a, b = display(half_a), display(half_b)
-    rmse = float(np.sqrt(np.mean(((a - b) / 2) ** 2)))
-    level = float(np.sqrt(np.mean(((a + b) / 2) ** 2)))
-    return (rmse / level if level > 0 else 0.0), rmse
-
-
-__all__ = ["Worker", "estimate_noise", "sensor_dict"]
+__all__ = ["Worker", "sensor_dict"]

@@ -11,7 +11,7 @@ from dnrtrain.contract import View
 
 from .data import Missing, Quality, Selection, Training
 from .quality import perceptual_note
-from .words import duration
+from .words import duration, several
 
 
 def missing(
@@ -54,7 +54,7 @@ def notes(
             "broken one); they are left out of its mean."
         )
     if quality and quality.noise_share_mean is not None and quality.noise_share_mean >= 0.1:
-        spp = f" ({', '.join(map(str, quality.spp))} samples per pixel)" if quality.spp else ""
+        spp = f" ({several(quality.spp)} samples per pixel)" if quality.spp else ""
         found.append(
             f"The reference images are noisy themselves{spp}: a perfect renderer would measure about "
             f"{quality.ceiling_mean:.1f} dB against them. That noise makes up "
@@ -64,7 +64,8 @@ def notes(
                 if quality.noise_limited
                 else "."
             )
-            + " Raise raytrace.evaluation_spp before reading more into small differences."
+            + " Raise raytrace.evaluation_spp, or set raytrace.evaluation_noise, before reading more into small "
+            "differences."
         )
     tracing = summary.get("tracing_all")
     if tracing and tracing["net_saved_seconds"] < 0:

@@ -43,7 +43,7 @@ def render_html(data: ReportData) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(duration=words.duration, count=words.count)
+    environment.filters.update(duration=words.duration, count=words.count, several=words.several)
     script = (files / "report.js").read_text(encoding="utf-8")
     script_hash = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     quality, selection = data.quality, data.selection

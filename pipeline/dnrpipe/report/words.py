@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from .data import Quality, Selection
 
 
@@ -27,6 +29,11 @@ def duration(seconds: float) -> str:
 def count(number: int) -> str:
     """Thousands set apart by thin spaces."""
     return f"{number:,}".replace(",", "\u2009")
+
+
+def several(numbers: Sequence[int]) -> str:
+    """``64``, ``64, 128``, or from least to most where views have each their own number: ``80 to 664``."""
+    return ", ".join(map(str, numbers)) if len(numbers) <= 3 else f"{min(numbers)} to {max(numbers)}"
 
 
 def ratio(slow: float, fast: float) -> str:
