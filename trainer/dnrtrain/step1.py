@@ -131,6 +131,8 @@ class _Step1:
         self.probes: list[int] = []
         if self.agent and settings.reward == "improvement":
             self.probes = FarthestPolicy().choose(candidates, min(PROBES, len(views)), seed).views
+        elif self.agent and settings.reward == "improvement-all":
+            self.probes = list(range(len(views)))
         self.scale = RewardScale(raw=settings.reward_scale == "raw")
         self.history: list[dict] = []
         self.book = EpochBook()
@@ -239,7 +241,10 @@ class _Step1:
             values = agent(selected, agent.encode(texture))
             view = epsilon_greedy(values.detach(), selected, epsilon, random)
             loss, texture = self._train_view(view)
-            after = self._probe_loss()
+            if s.reward == "improvement-own":
+                probe, after = loss, self._loss_on([view])
+            else:
+                after = self._probe_loss()
             reward = reward_of(s.reward, self.scale.reward(loss), probe, after)
             probe = after
             selected = selected.clone()
@@ -253,12 +258,14 @@ class _Step1:
             follow(self.slow, agent)
             self.book.add(rl=float(loss_rl.detach()), reward=reward, q=float(values[view].detach()))
 
-    @torch.no_grad()
     def _probe_loss(self) -> float | None:
-        if not self.probes:
-            return None
+        return self._loss_on(self.probes) if self.probes else None
+
+    @torch.no_grad()
+    def _loss_on(self, views: list[int]) -> float:
+        """Mean L_DNRc of some candidates."""
         losses = []
-        for view in self.probes:
+        for view in views:
             batch = self.views.batch([view])
             assert batch.target is not None
             losses.append(F.mse_loss(self.dnr(batch).rgb, batch.target))

@@ -50,6 +50,8 @@ _CONTENDERS = (
     _paper("rl-paper", "-loss (the paper's)", "neg-loss"),
     _paper("rl-hard", "+loss", "pos-loss"),
     _paper("rl-decrease", "decrease of the error on probe views", "improvement"),
+    _paper("rl-own", "decrease of the error on the view itself", "improvement-own"),
+    _paper("rl-all", "decrease of the error on all candidates", "improvement-all"),
 )
 CONTENDERS: dict[str, Contender] = {contender.name: contender for contender in _CONTENDERS}
 SIMPLE = ("farthest", "kmedoids", "coverage")
