@@ -67,12 +67,15 @@ def _base(settings: Settings) -> list[Any]:
 
 def _selection(settings: Settings) -> list[Any]:
     """Settings that decide which views are chosen, and the coarse model where there is one."""
+    parts: list[Any] = []
+    if settings.select.rounds > 1:  # what is traced decides what is chosen next
+        parts = [settings.select.rounds, STAGES["raytrace"].settings(settings)]
     if not settings.trains_step1:
-        return [settings.select.model_dump(include={"budget", "policy", "seed"})]
-    select = settings.select.model_dump()
+        return [settings.select.model_dump(include={"budget", "policy", "seed"}), *parts]
+    select = settings.select.model_dump(exclude={"rounds"})
     if select["policy"] == "rl-paper":
         select["policy"] = "rl"  # its first name: what was trained under it stays done
-    return [settings.model.coarse().model_dump(), select, _neural(settings)]
+    return [settings.model.coarse().model_dump(), select, _neural(settings), *parts]
 
 
 def _neural(settings: Settings) -> dict[str, list[str]]:
