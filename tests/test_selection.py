@@ -28,7 +28,7 @@ def told(policy: str = "kmedoids", budget: int = BUDGET, **changes: Any) -> Sett
     return resolve(None, {"select": {"budget": budget, "policy": policy}, **changes}, environment={})
 
 
-COARSE = {"finetune": {"step2": {"start": "coarse"}}}
+COARSE: dict[str, Any] = {"finetune": {"step2": {"start": "coarse"}}}
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def choose(workspace: Workspace, settings: Settings, capsys: pytest.CaptureFixtu
     return read_selection(workspace), capsys.readouterr().out
 
 
-@pytest.mark.parametrize("policy", ["auto", "kmedoids", "coverage", "d-optimal", "farthest", "random"])
+@pytest.mark.parametrize("policy", ["auto", "kmedoids", "coverage", "d-optimal", "dqn", "farthest", "random"])
 def test_a_choice_without_training(workspace: Workspace, capsys: pytest.CaptureFixture[str], policy: str) -> None:
     left = workspace.checkpoints("step1") / "model.json"
     left.parent.mkdir(parents=True)

@@ -16,10 +16,10 @@ from .console import Console
 from .errors import UserError
 from .settings import SelectSettings, Settings
 from .trace import trace_views
-from .training import load
 from .workspace import Workspace
 
 if TYPE_CHECKING:
+    from dnrtrain.dataset import ViewSet
     from dnrtrain.selector.protocol import Candidates, Choice, Tick
 
 LOOKING_AGAIN = "auto"
@@ -49,16 +49,12 @@ def trace_round(workspace: Workspace, settings: Settings, console: Console, run_
     base_views(workspace, settings, console, run_id, **told)
 
 
-def go_on(
-    workspace: Workspace, settings: Settings, candidates: Candidates, views: list[View], chosen: Choice, budget: int,
-    tick: Tick | None = None,
-) -> Choice:  # fmt: skip
-    """``chosen``, all of it traced, completed to ``budget`` by a second look at what those views show."""
+def go_on(candidates: Candidates, chosen: Choice, traced: ViewSet, budget: int, tick: Tick | None = None) -> Choice:
+    """``chosen`` completed to ``budget`` by a second look at ``traced``: its views with ray-traced targets."""
     from dnrtrain.selector.auto import second_look
     from dnrtrain.selector.protocol import Choice
     from dnrtrain.selector.remaining import cell_errors
 
-    traced = load(workspace, [views[i] for i in chosen.views], "train", raytraced=True, base=settings.model.base)
     assert candidates.sightings is not None  # its policy looks
     errors = cell_errors(traced, candidates.sightings.grid)
     rest = second_look(candidates, chosen.views, budget, errors, tick)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import shutil
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dnrtrain.atomic import write_json
@@ -72,12 +73,22 @@ def check_budget(budget: int, candidates: int) -> None:
         )
 
 
-def _choose(workspace: Workspace, settings: Settings, console: Console, run_id: str, views: list[View]) -> Selected:
+def rule_of(settings: Settings) -> Policy | None:
+    """The policy, with its weights where they are named; None for one that step 1 must train."""
     from dnrtrain.selector.policies import untrained
 
+    select = settings.select
+    if select.policy == "dqn" and select.weights:
+        from dnrtrain.selector.learned import DqnPolicy
+
+        return DqnPolicy(Path(select.weights))
+    return untrained(select.policy)
+
+
+def _choose(workspace: Workspace, settings: Settings, console: Console, run_id: str, views: list[View]) -> Selected:
     policy = settings.select.policy
     console.say(f"select: no training; policy {policy} needs none, and step 2 starts fresh")
-    rule = untrained(policy)
+    rule = rule_of(settings)
     assert rule is not None  # settings.trains_step1 is False
     choice = _choose_by(rule, workspace, settings, console, run_id, views)
     # A model of another policy's run would pass for this one's in the report.
@@ -99,7 +110,7 @@ def _choose_by(
     clock, cpu = time.monotonic(), time.process_time()
     positions = np.stack([view.position for view in views])
     directions = np.stack([-view.matrix[:3, 2] for view in views])
-    sightings = _look(workspace, console, views) if rule.looks else None
+    sightings = look(workspace, console, views) if rule.looks else None
     candidates = Candidates(positions, directions, sightings)
     choice: Choice | None = None
     for number, budget in enumerate(stages, start=1):
@@ -113,7 +124,9 @@ def _choose_by(
             if choice is None:
                 choice = rule.choose(candidates, budget, select.seed, tick)
             else:
-                choice = go_on(workspace, settings, candidates, views, choice, budget, tick)
+                names = [views[i] for i in choice.views]
+                traced = load(workspace, names, "train", raytraced=True, base=settings.model.base)
+                choice = go_on(candidates, choice, traced, budget, tick)
             tick(bar.total)
     assert choice is not None  # there is at least one round
     _book(workspace, run_id, "selection" if len(stages) == 1 else f"selection {len(stages)}", clock, cpu)
@@ -146,14 +159,13 @@ def _train_and_choose(
 ) -> Selected:
     import numpy as np
 
-    from dnrtrain.selector.policies import untrained
     from dnrtrain.step1 import run_step1
 
     select = settings.select
     if select.policy not in TRAINED_NAMES:
         console.say(f"select: policy {select.policy} needs no training, but step 2 starts from the coarse model")
-    rule = untrained(select.policy)
-    sightings = _look(workspace, console, views) if rule is not None and rule.looks else None
+    rule = rule_of(settings)
+    sightings = look(workspace, console, views) if rule is not None and rule.looks else None
     validation = split_views(workspace)["val"]
     stamp = fingerprint(STAGES["select"], workspace, settings)
     assert stamp is not None  # its inputs were required
@@ -176,14 +188,13 @@ def _train_and_choose(
         if isinstance(event, Selected):
             chosen = event
     assert chosen is not None  # run_step1 ends with Selected
-    if select.rounds == 1:
+    if rule is None or (select.rounds == 1 and not select.weights):
         return chosen
-    assert rule is not None  # checked: the policy is one that can look again
     choice = _choose_by(rule, workspace, settings, console, run_id, views)
     return Selected([views[i].name for i in choice.views], select.policy, choice.details, choice.gains, choice.why)
 
 
-def _look(workspace: Workspace, console: Console, views: list[View]) -> Sightings:
+def look(workspace: Workspace, console: Console, views: list[View]) -> Sightings:
     """What the candidates see, from their pass files."""
     from dnrtrain.selector.sightings import read_sightings
 

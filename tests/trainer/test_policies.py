@@ -22,7 +22,7 @@ from dnrtrain.selector.protocol import Candidates
 from dnrtrain.selector.sightings import Sighting, collect, look_at
 
 SIDE, GRID = 16, 8
-DETERMINISTIC = ("auto", "kmedoids", "coverage", "d-optimal")
+DETERMINISTIC = ("auto", "kmedoids", "coverage", "d-optimal", "dqn")
 
 
 def turned_away(view: View) -> View:
@@ -122,7 +122,7 @@ def test_without_sightings(pool: Candidates) -> None:
     poses = Candidates(pool.positions, pool.directions)
     assert len(set(UNTRAINED["auto"].choose(poses, 4, 0).views)) == 4
     assert "nothing is known" in UNTRAINED["auto"].choose(poses, 4, 0).details["note"]
-    for name in ("coverage", "d-optimal"):
+    for name in ("coverage", "d-optimal", "dqn"):
         with pytest.raises(ContractError, match=f"'{name}' needs the candidates' sightings"):
             UNTRAINED[name].choose(poses, 4, 0)
 

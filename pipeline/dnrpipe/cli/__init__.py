@@ -15,6 +15,7 @@ from .. import __version__
 from . import information, pictures, scene, stages
 from .ablate import ablate
 from .bench_select import bench_select
+from .train_selector import train_selector
 
 
 class _Group(click.Group):
@@ -56,6 +57,7 @@ for _command in (
     stages.run,
     ablate,
     bench_select,
+    train_selector,
     information.status,
     information.costs,
     information.doctor,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
-UntrainedName = Literal["auto", "kmedoids", "coverage", "d-optimal", "farthest", "random"]
+UntrainedName = Literal["auto", "kmedoids", "coverage", "d-optimal", "dqn", "farthest", "random"]
 TrainedName = Literal["rl-paper"]
 PolicyName = Literal[UntrainedName, TrainedName]
 

@@ -72,12 +72,20 @@ class Surrogate:
 
     def add(self, view: int) -> float:
         """Train on one more view; returns by how much the error on all candidates falls (below 0 where it grows)."""
+        self.chosen.append(view)
+        return self._change(view, 1.0)
+
+    def remove(self, view: int) -> float:
+        """Forget a chosen view; returns by how much the error falls."""
+        self.chosen.remove(view)
+        return self._change(view, -1.0)
+
+    def _change(self, view: int, sign: float) -> float:
         before = self._error
-        inverse, sums, rows, residual = self._after(view)
+        inverse, sums, rows, residual = self._after(view, sign)
         where = self.place[self.sightings.of(view)]
         self.inverse[where], self.sums[where] = inverse, sums
         self.residual[rows] = residual
-        self.chosen.append(view)
         self._total()
         return before - self._error
 
@@ -101,10 +109,10 @@ class Surrogate:
     def _total(self) -> None:
         self._error = float(self.residual @ self.weights)
 
-    def _after(self, view: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def _after(self, view: int, sign: float = 1.0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """(A⁻¹ and sums of the cells that the view sees, sightings in those cells, their squared residuals)."""
         part = self.sightings.of(view)
-        where, h, p = self.place[part], self.basis[part], self.pixels[part]
+        where, h, p = self.place[part], self.basis[part], sign * self.pixels[part]
         inverse = self.inverse[where]
         solved = np.einsum("eij,ej->ei", inverse, h)
         scale = p / (1.0 + p * np.einsum("ei,ei->e", h, solved))
