@@ -165,7 +165,8 @@ def _train_and_choose(
     if select.policy not in TRAINED_NAMES:
         console.say(f"select: policy {select.policy} needs no training, but step 2 starts from the coarse model")
     rule = rule_of(settings)
-    sightings = look(workspace, console, views) if rule is not None and rule.looks else None
+    looks = rule.looks if rule is not None else select.policy != "rl-paper"
+    sightings = look(workspace, console, views) if looks else None
     validation = split_views(workspace)["val"]
     stamp = fingerprint(STAGES["select"], workspace, settings)
     assert stamp is not None  # its inputs were required

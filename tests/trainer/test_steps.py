@@ -64,7 +64,7 @@ def step2(
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("policy", ["rl", "random", "auto"])
+@pytest.mark.parametrize("policy", ["rl", "random", "auto", "fisher"])
 def test_selection_and_books(scene: Scene, tmp_path: Path, policy: str) -> None:
     events = step1(scene.raster, tmp_path, policy=policy, val=scene.raster.subset([0, 1]))
     epochs = [event for event in events if isinstance(event, EpochEnd)]

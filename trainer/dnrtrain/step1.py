@@ -1,8 +1,9 @@
 """Step 1: the coarse DNR on rasterised images, and the view selector (paper equations 2 to 5).
 
 With ``rl-paper`` an episode walks ``budget`` candidate views; every view taken is one training step of the DNR
-and gives the agent its reward. With a policy that needs no training the DNR trains on all candidates in random
-order for the same number of steps, without an agent: that is worth its time where step 2 starts from its weights.
+and gives the agent its reward. With any other policy the DNR trains on all candidates in random order for the same
+number of steps, without an agent: ``fisher`` asks the finished DNR, and for a policy that needs no training it is worth
+its time where step 2 starts from its weights.
 
 The joint loss 0.1·L_RL + 1.0·L_DNRc (equation 5) is stepped by two Adam optimisers: the observation is
 detached, so the two gradients touch disjoint parameters and the sum splits exactly. L_RL = Σ_t (equation
@@ -39,6 +40,7 @@ from .schedule import (
 )
 from .selector.agent import RewardScale, best_action, epsilon_at, epsilon_greedy, follow, reward_of, td_target
 from .selector.baselines import FarthestPolicy
+from .selector.fisher import choose_by_fisher
 from .selector.names import full_name
 from .selector.policies import untrained
 from .selector.protocol import Candidates, Choice, check_budget
@@ -46,6 +48,8 @@ from .selector.qnetwork import QNetwork
 from .selector.sightings import Sightings
 from .settings import ModelSettings, Step1Settings
 
+AGENTS = "rl-paper"
+"""The policy whose agent learns while the renderer trains; others that step 1 trains for ask the finished renderer."""
 PROBES = 4
 """Views whose loss the ``improvement`` reward watches."""
 
@@ -123,7 +127,7 @@ class _Step1:
         self.dnr = DNR(model, seed).to(device)
         self.agent: QNetwork | None = None
         self.slow: QNetwork | None = None
-        if self.rule is None:
+        if policy == AGENTS:
             shape = (len(views), model.texture_channels, settings.embedding, seed + 1)
             self.agent, self.slow = QNetwork(*shape).to(device), QNetwork(*shape).to(device)
         self.adam_dnr = adam([self.dnr], settings.learning_rate, device, settings.texture_rate_scale)
@@ -273,11 +277,16 @@ class _Step1:
 
     # -- the selection ---------------------------------------------------------------------------------
 
-    @torch.no_grad()
     def _select(self) -> Choice:
         """The policy's choice: by the trained agent's greedy roll-out where there is one."""
         if self.rule is not None:
             return self.rule.choose(self.candidates, self.budget, self.seed)
+        if self.agent is None:
+            return choose_by_fisher(self.dnr, self.views, self.candidates, self.budget, self.seed)
+        return self._roll_out()
+
+    @torch.no_grad()
+    def _roll_out(self) -> Choice:
         assert self.agent is not None
         random = step_random(self.seed, STEP1, -1, -1)
         order = [int(random.integers(len(self.views)))]

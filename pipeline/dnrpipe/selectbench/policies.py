@@ -51,6 +51,7 @@ _CONTENDERS = (
     Contender("auto", "the default: k-medoids, then swaps that count what is seen, too", "auto"),
     Contender("auto-2", "auto in two rounds: half is traced, the rest goes where that shows errors", "auto", rounds=2),
     Contender("dqn", "learned on a surrogate of texture training, other scenes; never worse by it than rules", "dqn"),
+    Contender("fisher", "Fisher information of the coarse renderer, redundancy controlled", "fisher", rule=False),
     _paper("rl-paper", "-loss (the paper's)", "neg-loss"),
     _paper("rl-hard", "+loss", "pos-loss"),
     _paper("rl-decrease", "decrease of the error on probe views", "improvement"),
@@ -63,7 +64,7 @@ SIMPLE = ("farthest", "kmedoids", "coverage")
 GROUPS: dict[str, tuple[str, ...]] = {
     "core": tuple(c.name for c in _CONTENDERS if c.rule and c.rounds == 1),
     "simple": ("random", *SIMPLE),
-    "rewards": tuple(c.name for c in _CONTENDERS if not c.rule),
+    "rewards": tuple(c.name for c in _CONTENDERS if c.policy == LEARNED),
     "all": tuple(CONTENDERS),
 }
 

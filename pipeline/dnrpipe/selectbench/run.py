@@ -31,7 +31,7 @@ from ..rounds import portions
 from ..settings import Settings
 from ..training import perceptual_weights
 from ..workspace import digest
-from .policies import LEARNED, Contender, rules_fingerprint, settings_of
+from .policies import Contender, rules_fingerprint, settings_of
 from .pools import Placed, Pool, place_pool, share_light
 
 CHOICE_VERSION = 1  # raise when what a selection's file holds changes
@@ -115,7 +115,7 @@ class Bench:
                         chosen[place] = self._choice(pool, contender, first, seed)
                         rules.append(chosen[place])
                     else:
-                        chosen[place] = self._step1(pool, settings, LEARNED, seed)
+                        chosen[place] = self._step1(pool, settings, contender.policy, seed)
                         trained.append(chosen[place])
                     if settings.finetune.step2.start == "coarse":
                         own = self._step1(pool, settings, SHARED_COARSE, seed) if contender.rule else chosen[place]

@@ -7,7 +7,8 @@ with no view, plus γ Φ(s') − Φ(s) of the ``auto`` cost: potential shaping, 
 al. 1999). Double Q-learning (van Hasselt et al. 2016), masked actions, replay, an averaged target network.
 
 :mod:`.learned` makes a policy of it: single views are exchanged while the surrogate's error falls, and whatever the
-surrogate says is best is answered: learned, ``auto``, ``kmedoids`` or ``coverage`` (``details["guard"]``).
+surrogate says is best is answered: learned, ``auto`` (as it is, or with the same exchanges), ``kmedoids`` or
+``coverage`` (``details["guard"]``).
 """
 
 from __future__ import annotations

@@ -55,6 +55,7 @@ class DqnPolicy:
         if tick is not None:
             tick(len(candidates))
         options = {name: [place[view] for view in views] for name, views in chosen.items()}
+        options["auto, exchanged"] = exchange(environment, options["auto"])
         options["learned"] = exchange(environment, rollout(environment, network))
         errors = {name: environment.surrogate.run(views) / environment.start for name, views in options.items()}
         best = min(errors, key=lambda name: (errors[name], name))

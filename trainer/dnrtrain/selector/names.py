@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal, get_args
 
 UntrainedName = Literal["auto", "kmedoids", "coverage", "d-optimal", "dqn", "farthest", "random"]
-TrainedName = Literal["rl-paper"]
+TrainedName = Literal["rl-paper", "fisher"]
 PolicyName = Literal[UntrainedName, TrainedName]
 
 UNTRAINED_NAMES: tuple[UntrainedName, ...] = get_args(UntrainedName)
