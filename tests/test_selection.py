@@ -68,7 +68,7 @@ def test_a_choice_without_training(workspace: Workspace, capsys: pytest.CaptureF
     assert found["policy"] == policy and found["budget"] == BUDGET
     assert len(set(found["views"])) == len(found["gains"]) == len(found["why"]) == BUDGET
     if policy not in ("farthest", "random"):
-        assert 0 <= found["details"]["uncovered"] < 0.5
+        assert 0 <= found["details"]["uncovered"] < 0.55
     booked = workspace.ledger.read()
     assert [(r.stage, r.name, r.unit) for r in booked] == [("select", "selection", "scene")]
 
