@@ -209,7 +209,7 @@ def test_harmonics_are_orthonormal_over_the_sphere() -> None:
 
 def sighting(cells: list[int], toward: tuple[float, float, float], picture: int) -> Sighting:
     share = np.full(len(cells), 0.5 / len(cells), np.float32)
-    towards = np.tile(np.float32(toward), (len(cells), 1))
+    towards = np.tile(np.array(toward, np.float32), (len(cells), 1))
     return Sighting(np.array(cells, np.int32), share, towards, np.zeros((len(cells), 3), np.float32), 0.5, 0.0, picture)
 
 
