@@ -340,6 +340,21 @@ def test_cells_train_equally_long_and_policies_that_agree_share_one(smoke: tuple
     assert before.items() <= work(out).items()
 
 
+@pytest.mark.slow
+def test_a_second_round_sees_what_the_first_traced(smoke: tuple[Path, dict[str, Any]]) -> None:
+    out, _ = smoke
+    done = bench(out, "--pools", "dome", "--budgets", "4", "--policies", "auto-2")
+    assert done.returncode == 0, done.stderr
+    cell = json.loads(done.stdout)["cells"][0]
+    made = [json.loads(path.read_text()) for path in (out / "selections" / "emissive_only-dome").glob("*.json")]
+    rounds = {len(one["views"]): one for one in made if one["details"].get("rounds") or len(one["views"]) == 2}
+    last, first = rounds[4], rounds[2]
+    assert sorted(last["views"]) == sorted(cell["views"])
+    assert [one["views"] for one in last["details"]["rounds"]] == [2, 2]
+    assert last["details"]["rounds"][1]["error_found"] > 0
+    assert last["seconds"] > 0 and len(set(last["views"])) == 4 and len(first["views"]) == 2
+
+
 def test_bad_requests_are_one_line_and_leave_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from dnrpipe.cli import _main
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import shutil
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dnrtrain.atomic import write_json
@@ -11,17 +13,19 @@ from dnrtrain.contract import View
 from dnrtrain.events import Selected
 from dnrtrain.selector.names import TRAINED_NAMES
 
-from .console import Console
+from .console import Bar, Console
 from .costs import CostRecord
 from .effects.store import plan_of
 from .errors import UserError
 from .prepare import split_views
+from .rounds import check_rounds, go_on, portions, trace_round
 from .settings import Settings
 from .stages import STAGES, Outcome, fingerprint
 from .training import epochs_done, follow, load, torch_device
 from .workspace import Workspace, digest, file_sha256
 
 if TYPE_CHECKING:
+    from dnrtrain.selector.protocol import Choice, Policy
     from dnrtrain.selector.sightings import Sightings
 
 
@@ -29,6 +33,7 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
     """Choose ``budget`` views and write ``selection.json``; train the coarse DNR on the way where it is wanted."""
     views = split_views(workspace)["train"]
     check_budget(settings.select.budget, len(views))
+    check_rounds(settings.select)
     if settings.trains_step1:
         chosen = _train_and_choose(workspace, settings, console, run_id, views)
         made: list[object] = [chosen.views, file_sha256(workspace.checkpoints("step1") / "model.safetensors")]
@@ -41,6 +46,7 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
             "policy": chosen.policy,
             "budget": settings.select.budget,
             "seed": settings.select.seed,
+            "rounds": settings.select.rounds,
             "views": chosen.views,
             "gains": chosen.gains,
             "why": chosen.why,
@@ -67,28 +73,72 @@ def check_budget(budget: int, candidates: int) -> None:
         )
 
 
-def _choose(workspace: Workspace, settings: Settings, console: Console, run_id: str, views: list[View]) -> Selected:
-    import numpy as np
-
+def rule_of(settings: Settings) -> Policy | None:
+    """The policy, with its weights where they are named; None for one that step 1 must train."""
     from dnrtrain.selector.policies import untrained
-    from dnrtrain.selector.protocol import Candidates
 
+    select = settings.select
+    if select.policy == "dqn" and select.weights:
+        from dnrtrain.selector.learned import DqnPolicy
+
+        return DqnPolicy(Path(select.weights))
+    return untrained(select.policy)
+
+
+def _choose(workspace: Workspace, settings: Settings, console: Console, run_id: str, views: list[View]) -> Selected:
     policy = settings.select.policy
     console.say(f"select: no training; policy {policy} needs none, and step 2 starts fresh")
-    rule = untrained(policy)
+    rule = rule_of(settings)
     assert rule is not None  # settings.trains_step1 is False
+    choice = _choose_by(rule, workspace, settings, console, run_id, views)
+    # A model of another policy's run would pass for this one's in the report.
+    if workspace.checkpoints("step1").exists():
+        shutil.rmtree(workspace.checkpoints("step1"))
+    return Selected([views[i].name for i in choice.views], policy, choice.details, choice.gains, choice.why)
+
+
+def _choose_by(
+    rule: Policy, workspace: Workspace, settings: Settings, console: Console, run_id: str, views: list[View]
+) -> Choice:
+    """The rule's choice, in as many rounds as are wanted."""
+    import numpy as np
+
+    from dnrtrain.selector.protocol import Candidates
+
+    select = settings.select
+    stages = portions(select.budget, select.rounds)
     clock, cpu = time.monotonic(), time.process_time()
     positions = np.stack([view.position for view in views])
     directions = np.stack([-view.matrix[:3, 2] for view in views])
-    sightings = _look(workspace, console, views) if rule.looks else None
+    sightings = look(workspace, console, views) if rule.looks else None
     candidates = Candidates(positions, directions, sightings)
-    with console.bar(f"choosing by {policy}", len(views) * rule.effort) as bar:
+    choice: Choice | None = None
+    for number, budget in enumerate(stages, start=1):
+        if choice is not None:
+            _book(workspace, run_id, f"selection {number - 1}", clock, cpu)
+            trace_round(workspace, settings, console, run_id, [views[i] for i in choice.views])
+            clock, cpu = time.monotonic(), time.process_time()
+        title = f"choosing by {select.policy}" + (f", round {number} of {len(stages)}" if len(stages) > 1 else "")
+        with console.bar(title, len(views) * rule.effort) as bar:
+            tick = functools.partial(_advance, bar)
+            if choice is None:
+                choice = rule.choose(candidates, budget, select.seed, tick)
+            else:
+                names = [views[i] for i in choice.views]
+                traced = load(workspace, names, "train", raytraced=True, base=settings.model.base)
+                choice = go_on(candidates, choice, traced, budget, tick)
+            tick(bar.total)
+    assert choice is not None  # there is at least one round
+    _book(workspace, run_id, "selection" if len(stages) == 1 else f"selection {len(stages)}", clock, cpu)
+    return choice
 
-        def tick(weighed: int) -> None:
-            bar.advance(min(weighed, bar.total - bar.done))  # the effort is an estimate
 
-        choice = rule.choose(candidates, settings.select.budget, settings.select.seed, tick)
-        tick(bar.total)
+def _advance(bar: Bar, weighed: int) -> None:
+    bar.advance(min(weighed, bar.total - bar.done))  # a policy's effort is an estimate
+
+
+def _book(workspace: Workspace, run_id: str, name: str, clock: float, cpu: float) -> None:
+    """Book what choosing took since ``clock`` (monotonic) and ``cpu`` (processor seconds)."""
     workspace.ledger.append(
         CostRecord(
             time=time.time(),
@@ -96,16 +146,12 @@ def _choose(workspace: Workspace, settings: Settings, console: Console, run_id: 
             stage="select",
             purpose="training",
             unit="scene",
-            name="selection",
+            name=name,
             seconds=time.monotonic() - clock,
             cpu_seconds=time.process_time() - cpu,
             device="cpu",
         )
     )
-    # A model of another policy's run would pass for this one's in the report.
-    if workspace.checkpoints("step1").exists():
-        shutil.rmtree(workspace.checkpoints("step1"))
-    return Selected([views[i].name for i in choice.views], policy, choice.details, choice.gains, choice.why)
 
 
 def _train_and_choose(
@@ -113,14 +159,14 @@ def _train_and_choose(
 ) -> Selected:
     import numpy as np
 
-    from dnrtrain.selector.policies import untrained
     from dnrtrain.step1 import run_step1
 
     select = settings.select
     if select.policy not in TRAINED_NAMES:
         console.say(f"select: policy {select.policy} needs no training, but step 2 starts from the coarse model")
-    rule = untrained(select.policy)
-    sightings = _look(workspace, console, views) if rule is not None and rule.looks else None
+    rule = rule_of(settings)
+    looks = rule.looks if rule is not None else select.policy != "rl-paper"
+    sightings = look(workspace, console, views) if looks else None
     validation = split_views(workspace)["val"]
     stamp = fingerprint(STAGES["select"], workspace, settings)
     assert stamp is not None  # its inputs were required
@@ -143,10 +189,13 @@ def _train_and_choose(
         if isinstance(event, Selected):
             chosen = event
     assert chosen is not None  # run_step1 ends with Selected
-    return chosen
+    if rule is None or (select.rounds == 1 and not select.weights):
+        return chosen
+    choice = _choose_by(rule, workspace, settings, console, run_id, views)
+    return Selected([views[i].name for i in choice.views], select.policy, choice.details, choice.gains, choice.why)
 
 
-def _look(workspace: Workspace, console: Console, views: list[View]) -> Sightings:
+def look(workspace: Workspace, console: Console, views: list[View]) -> Sightings:
     """What the candidates see, from their pass files."""
     from dnrtrain.selector.sightings import read_sightings
 

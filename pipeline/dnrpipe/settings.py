@@ -129,6 +129,12 @@ class SelectSettings(Strict):
 
     budget: int = Field(default=25, ge=1, description="views to ray-trace")
     policy: PolicyName = Field(default="rl-paper", description="how they are chosen (docs/method.md)")
+    weights: str = Field(
+        default="", description="file of `dnrpipe train-selector` for policy dqn; empty: the shipped one"
+    )
+    rounds: int = Field(
+        default=1, ge=1, description="2 or more: trace a part, look where the base image is wrong, choose the rest"
+    )
     seed: int = Field(default=0, ge=0)
     step1: Step1Settings = Step1Settings()
 

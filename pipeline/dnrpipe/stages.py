@@ -23,7 +23,7 @@ from .effects.plan import NEURAL
 from .errors import UserError
 from .scene_files import scene_fingerprint
 from .settings import Settings
-from .workspace import Workspace, digest
+from .workspace import Workspace, digest, file_sha256
 
 
 @dataclass(frozen=True)
@@ -81,12 +81,26 @@ def _base(settings: Settings) -> list[Any]:
 
 def _selection(settings: Settings) -> list[Any]:
     """Settings that decide which views are chosen, and the coarse model where there is one."""
+    parts: list[Any] = []
+    if settings.select.rounds > 1:  # what is traced decides what is chosen next
+        parts = [settings.select.rounds, STAGES["raytrace"].settings(settings)]
+    if settings.select.policy == "dqn":
+        parts.append(_selector_weights(settings))
     if not settings.trains_step1:
-        return [settings.select.model_dump(include={"budget", "policy", "seed"})]
-    select = settings.select.model_dump()
+        return [settings.select.model_dump(include={"budget", "policy", "seed"}), *parts]
+    select = settings.select.model_dump(exclude={"rounds", "weights"})
     if select["policy"] == "rl-paper":
         select["policy"] = "rl"  # its first name: what was trained under it stays done
-    return [settings.model.coarse().model_dump(), select, _neural(settings)]
+    return [settings.model.coarse().model_dump(), select, _neural(settings), *parts]
+
+
+def _selector_weights(settings: Settings) -> str:
+    """Hash of the learned selector's weights; "" while there are none."""
+    import dnrtrain.selector
+
+    named = settings.select.weights
+    path = Path(named) if named else Path(dnrtrain.selector.__path__[0]) / "dqn.safetensors"
+    return file_sha256(path) if path.is_file() else ""
 
 
 def _neural(settings: Settings) -> dict[str, list[str]]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from dnrtrain.contract import ContractError, View
+from dnrtrain.exr import read_metadata
 
 from .base import RENDERED, base_path, base_views
 from .console import Console

@@ -22,7 +22,7 @@ from dnrtrain.selector.protocol import Candidates
 from dnrtrain.selector.sightings import Sighting, collect, look_at
 
 SIDE, GRID = 16, 8
-DETERMINISTIC = ("auto", "kmedoids", "coverage", "d-optimal")
+DETERMINISTIC = ("auto", "kmedoids", "coverage", "d-optimal", "dqn")
 
 
 def turned_away(view: View) -> View:
@@ -122,7 +122,7 @@ def test_without_sightings(pool: Candidates) -> None:
     poses = Candidates(pool.positions, pool.directions)
     assert len(set(UNTRAINED["auto"].choose(poses, 4, 0).views)) == 4
     assert "nothing is known" in UNTRAINED["auto"].choose(poses, 4, 0).details["note"]
-    for name in ("coverage", "d-optimal"):
+    for name in ("coverage", "d-optimal", "dqn"):
         with pytest.raises(ContractError, match=f"'{name}' needs the candidates' sightings"):
             UNTRAINED[name].choose(poses, 4, 0)
 
@@ -209,7 +209,8 @@ def test_harmonics_are_orthonormal_over_the_sphere() -> None:
 
 def sighting(cells: list[int], toward: tuple[float, float, float], picture: int) -> Sighting:
     share = np.full(len(cells), 0.5 / len(cells), np.float32)
-    return Sighting(np.array(cells, np.int32), share, np.tile(np.float32(toward), (len(cells), 1)), 0.5, 0.0, picture)
+    towards = np.tile(np.array(toward, np.float32), (len(cells), 1))
+    return Sighting(np.array(cells, np.int32), share, towards, np.zeros((len(cells), 3), np.float32), 0.5, 0.0, picture)
 
 
 @pytest.mark.parametrize("name", ["coverage", "d-optimal", "auto"])

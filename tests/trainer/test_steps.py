@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Generator
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ from dnrtrain.metrics import psnr
 from dnrtrain.model import render_views
 from dnrtrain.precision import decide_bfloat16
 from dnrtrain.schedule import guarded_step, learning_rate
+from dnrtrain.selector.agent import Reward
 from dnrtrain.settings import LossWeights, ModelSettings, Step1Settings, Step2Settings
 from dnrtrain.step1 import run_step1
 from dnrtrain.step2 import _Step2, random_patch, run_step2
@@ -62,7 +64,7 @@ def step2(
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("policy", ["rl", "random", "auto"])
+@pytest.mark.parametrize("policy", ["rl", "random", "auto", "fisher"])
 def test_selection_and_books(scene: Scene, tmp_path: Path, policy: str) -> None:
     events = step1(scene.raster, tmp_path, policy=policy, val=scene.raster.subset([0, 1]))
     epochs = [event for event in events if isinstance(event, EpochEnd)]
@@ -81,7 +83,7 @@ def test_selection_and_books(scene: Scene, tmp_path: Path, policy: str) -> None:
 
 
 @pytest.mark.parametrize("budget", [1, 3, 10])
-@pytest.mark.parametrize("reward", ["neg-loss", "pos-loss", "improvement"])
+@pytest.mark.parametrize("reward", get_args(Reward))
 def test_every_budget_and_reward(scene: Scene, tmp_path: Path, budget: int, reward: str) -> None:
     settings = QUICK1.model_copy(update={"epochs": 1, "reward": reward})
     events = step1(scene.raster, tmp_path, budget=budget, settings=settings)

@@ -76,7 +76,10 @@ class Step1Settings(Strict):
     gamma: float = Field(default=0.99, ge=0, le=1, description="discount factor")
     epsilon_start: float = Field(default=0.9, ge=0, le=1)
     epsilon_end: float = Field(default=0.05, ge=0, le=1)
-    reward: Literal["neg-loss", "pos-loss", "improvement"] = "neg-loss"
+    reward: Literal["neg-loss", "pos-loss", "improvement", "improvement-own", "improvement-all"] = Field(
+        default="neg-loss",
+        description="of taking a view: -loss, +loss, or the loss's decrease on probe views, the view, all candidates",
+    )
     reward_scale: Literal["relative", "raw"] = Field(
         default="relative", description="relative: loss rewards over the running mean loss; raw: the paper's"
     )

@@ -1,8 +1,9 @@
 """Step 1: the coarse DNR on rasterised images, and the view selector (paper equations 2 to 5).
 
 With ``rl-paper`` an episode walks ``budget`` candidate views; every view taken is one training step of the DNR
-and gives the agent its reward. With a policy that needs no training the DNR trains on all candidates in random
-order for the same number of steps, without an agent: that is worth its time where step 2 starts from its weights.
+and gives the agent its reward. With any other policy the DNR trains on all candidates in random order for the same
+number of steps, without an agent: ``fisher`` asks the finished DNR, and for a policy that needs no training it is worth
+its time where step 2 starts from its weights.
 
 The joint loss 0.1·L_RL + 1.0·L_DNRc (equation 5) is stepped by two Adam optimisers: the observation is
 detached, so the two gradients touch disjoint parameters and the sum splits exactly. L_RL = Σ_t (equation
@@ -40,6 +41,7 @@ from .schedule import (
 )
 from .selector.agent import RewardScale, best_action, epsilon_at, epsilon_greedy, follow, reward_of, td_target
 from .selector.baselines import FarthestPolicy
+from .selector.fisher import choose_by_fisher
 from .selector.names import full_name
 from .selector.policies import untrained
 from .selector.protocol import Candidates, Choice, check_budget
@@ -47,6 +49,8 @@ from .selector.qnetwork import QNetwork
 from .selector.sightings import Sightings
 from .settings import ModelSettings, Step1Settings
 
+AGENTS = "rl-paper"
+"""The policy whose agent learns while the renderer trains; others that step 1 trains for ask the finished renderer."""
 PROBES = 4
 """Views whose loss the ``improvement`` reward watches."""
 
@@ -124,7 +128,7 @@ class _Step1:
         self.dnr = DNR(model, seed).to(device)
         self.agent: QNetwork | None = None
         self.slow: QNetwork | None = None
-        if self.rule is None:
+        if policy == AGENTS:
             shape = (len(views), model.texture_channels, settings.embedding, seed + 1)
             self.agent, self.slow = QNetwork(*shape).to(device), QNetwork(*shape).to(device)
         self.adam_dnr = adam([self.dnr], settings.learning_rate, device, settings.texture_rate_scale)
@@ -132,6 +136,8 @@ class _Step1:
         self.probes: list[int] = []
         if self.agent and settings.reward == "improvement":
             self.probes = FarthestPolicy().choose(candidates, min(PROBES, len(views)), seed).views
+        elif self.agent and settings.reward == "improvement-all":
+            self.probes = list(range(len(views)))
         self.scale = RewardScale(raw=settings.reward_scale == "raw")
         self.notes: list[str] = []
         self.watch = Watch()
@@ -267,7 +273,10 @@ class _Step1:
             values = agent(selected, agent.encode(texture))
             view = epsilon_greedy(values.detach(), selected, epsilon, random)
             loss, texture = self._train_view(view)
-            after = self._probe_loss()
+            if s.reward == "improvement-own":
+                probe, after = loss, self._loss_on([view])
+            else:
+                after = self._probe_loss()
             reward = reward_of(s.reward, self.scale.reward(loss), probe, after)
             probe = after
             selected = selected.clone()
@@ -281,12 +290,14 @@ class _Step1:
             follow(self.slow, agent)
             self.book.add(rl=float(loss_rl.detach()), reward=reward, q=float(values[view].detach()))
 
-    @torch.no_grad()
     def _probe_loss(self) -> float | None:
-        if not self.probes:
-            return None
+        return self._loss_on(self.probes) if self.probes else None
+
+    @torch.no_grad()
+    def _loss_on(self, views: list[int]) -> float:
+        """Mean L_DNRc of some candidates."""
         losses = []
-        for view in self.probes:
+        for view in views:
             batch = self.views.batch([view])
             assert batch.target is not None
             losses.append(F.mse_loss(self.dnr(batch).rgb, batch.target))
@@ -294,11 +305,16 @@ class _Step1:
 
     # -- the selection ---------------------------------------------------------------------------------
 
-    @torch.no_grad()
     def _select(self) -> Choice:
         """The policy's choice: by the trained agent's greedy roll-out where there is one."""
         if self.rule is not None:
             return self.rule.choose(self.candidates, self.budget, self.seed)
+        if self.agent is None:
+            return choose_by_fisher(self.dnr, self.views, self.candidates, self.budget, self.seed)
+        return self._roll_out()
+
+    @torch.no_grad()
+    def _roll_out(self) -> Choice:
         assert self.agent is not None
         random = step_random(self.seed, STEP1, -1, -1)
         order = [int(random.integers(len(self.views)))]

@@ -202,27 +202,34 @@ class Worker:
         self, workspace: Workspace, split: str, names: list[str] | None, *, raytraced: bool, base: str
     ) -> ViewSet:
         """Views of the split (None: all), with ray-traced or rasterised targets; from memory if they are there."""
-        from dnrtrain.dataset import load_views
-
         key = repr((workspace.root, split, names, raytraced, base))
         if key not in self.memory:
-            views = {view.name: view for view in split_views(workspace)[split]}
-            chosen = [views[name] for name in names or views]
-            passes = [workspace.passes(split, view.name) for view in chosen]
-            extra: dict[str, Any] = {}
-            if base == "raster":
-                extra = {"base": base}
-                if split == "test":
-                    passes = [raster_file(workspace, view.name) for view in chosen]
-            elif base != "none":
-                extra = {"base": base, "base_files": [base_file(workspace, base, split, view.name) for view in chosen]}
-            images = [workspace.raytraced(split, view.name) for view in chosen] if raytraced else None
-            frame = read_frame(workspace)
-            self.memory[key] = load_views(passes, images, frame, cameras=chosen, folder=workspace.scene, **extra)
+            self.memory[key] = load_cell_views(workspace, split, names, raytraced=raytraced, base=base)
         self.memory.move_to_end(key)
         while len(self.memory) > KEPT_SETS:
             self.memory.popitem(last=False)
         return self.memory[key]
+
+
+def load_cell_views(
+    workspace: Workspace, split: str, names: list[str] | None, *, raytraced: bool, base: str
+) -> ViewSet:
+    """Views of the split (None: all) with ray-traced or rasterised targets and their base images."""
+    from dnrtrain.dataset import load_views
+
+    views = {view.name: view for view in split_views(workspace)[split]}
+    chosen = [views[name] for name in names or views]
+    passes = [workspace.passes(split, view.name) for view in chosen]
+    extra: dict[str, Any] = {}
+    if base == "raster":
+        extra = {"base": base}
+        if split == "test":
+            passes = [raster_file(workspace, view.name) for view in chosen]
+    elif base != "none":
+        extra = {"base": base, "base_files": [base_file(workspace, base, split, view.name) for view in chosen]}
+    images = [workspace.raytraced(split, view.name) for view in chosen] if raytraced else None
+    frame = read_frame(workspace)
+    return load_views(passes, images, frame, cameras=chosen, folder=workspace.scene, **extra)
 
 
 def _history(folder: Path) -> list[dict[str, Any]]:

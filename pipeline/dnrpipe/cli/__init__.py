@@ -16,6 +16,7 @@ from . import information, pictures, scene, stages
 from .ablate import ablate
 from .bench_select import bench_select
 from .export import export_gltf, export_nerf, export_onnx, export_web
+from .train_selector import train_selector
 from .verify import verify
 
 
@@ -62,6 +63,7 @@ for _command in (
     stages.run,
     ablate,
     bench_select,
+    train_selector,
     information.status,
     verify,
     information.costs,

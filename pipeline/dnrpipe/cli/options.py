@@ -57,7 +57,13 @@ SELECT_OPTIONS = [
     click.option(
         "--policy",
         type=click.Choice([*NAMES, *ALIASES]),
-        help="How to choose them; rl-paper (alias rl) trains step 1 for it, the others take seconds.",
+        help="How to choose them; rl-paper (alias rl) and fisher train step 1 for it, the others take seconds.",
+    ),
+    click.option(
+        "--rounds",
+        type=int,
+        metavar="K",
+        help="Choose in K rounds (policy auto): trace a part, look where it is still wrong, choose on (default 1).",
     ),
 ]
 
@@ -121,9 +127,11 @@ def camera_overrides(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def select_overrides(options: dict[str, Any]) -> dict[str, Any]:
-    chosen = {key: options.pop(key) for key in ("budget", "policy")}
+    chosen = {key: options.pop(key) for key in ("budget", "policy", "rounds")}
     if chosen["budget"] is not None and chosen["budget"] < 1:
         raise UserError(f"--budget {chosen['budget']}: must be at least 1 view")
+    if chosen["rounds"] is not None and chosen["rounds"] < 1:
+        raise UserError(f"--rounds {chosen['rounds']}: must be at least 1 round")
     given = {key: value for key, value in chosen.items() if value is not None}
     return {"select": given} if given else {}
 

@@ -22,18 +22,20 @@ class Contender:
     """One line of the tables.
 
     policy: the trainer's name of it. changes: nested settings. rule: whether a line that needs no training; the best
-    of the simple ones is what others are compared with.
+    of the simple ones is what others are compared with. rounds: 2 or more choose on after ray tracing a part.
     """
 
     name: str
     what: str
     policy: str
     rule: bool = True
+    rounds: int = 1
     changes: Mapping[str, Any] = field(default_factory=dict)
 
 
 def _paper(name: str, what: str, reward: str) -> Contender:
-    return Contender(name, f"the paper's RL selector, reward: {what}", LEARNED, False, _reward(reward))
+    what = f"the paper's RL selector, reward: {what}"
+    return Contender(name, what, LEARNED, rule=False, changes=_reward(reward))
 
 
 def _reward(name: str) -> dict[str, Any]:
@@ -47,17 +49,22 @@ _CONTENDERS = (
     Contender("coverage", "greedy coverage: surface x view direction x resolution", "coverage"),
     Contender("d-optimal", "greedy D-optimal design of the neural texture", "d-optimal"),
     Contender("auto", "the default: k-medoids, then swaps that count what is seen, too", "auto"),
+    Contender("auto-2", "auto in two rounds: half is traced, the rest goes where that shows errors", "auto", rounds=2),
+    Contender("dqn", "learned on a surrogate of texture training, other scenes; never worse by it than rules", "dqn"),
+    Contender("fisher", "Fisher information of the coarse renderer, redundancy controlled", "fisher", rule=False),
     _paper("rl-paper", "-loss (the paper's)", "neg-loss"),
     _paper("rl-hard", "+loss", "pos-loss"),
     _paper("rl-decrease", "decrease of the error on probe views", "improvement"),
+    _paper("rl-own", "decrease of the error on the view itself", "improvement-own"),
+    _paper("rl-all", "decrease of the error on all candidates", "improvement-all"),
 )
 CONTENDERS: dict[str, Contender] = {contender.name: contender for contender in _CONTENDERS}
 SIMPLE = ("farthest", "kmedoids", "coverage")
 """The simple rules; the best of them in a pool is the rival."""
 GROUPS: dict[str, tuple[str, ...]] = {
-    "core": tuple(c.name for c in _CONTENDERS if c.rule),
+    "core": tuple(c.name for c in _CONTENDERS if c.rule and c.rounds == 1),
     "simple": ("random", *SIMPLE),
-    "rewards": tuple(c.name for c in _CONTENDERS if not c.rule),
+    "rewards": tuple(c.name for c in _CONTENDERS if c.policy == LEARNED),
     "all": tuple(CONTENDERS),
 }
 

@@ -27,10 +27,11 @@ from ..ablation.scenes import base_file, make_bases, trace_references, trace_tra
 from ..console import Console
 from ..effects.store import plan_of
 from ..errors import UserError
+from ..rounds import portions
 from ..settings import Settings
 from ..training import perceptual_weights
 from ..workspace import digest
-from .policies import LEARNED, Contender, rules_fingerprint, settings_of
+from .policies import Contender, rules_fingerprint, settings_of
 from .pools import Placed, Pool, place_pool, share_light
 
 CHOICE_VERSION = 1  # raise when what a selection's file holds changes
@@ -110,10 +111,11 @@ class Bench:
                     place = Place(pool.scene, pool.name, budget, contender.name, seed)
                     settings = settings_of(contender, self._settings(pool), budget)
                     if contender.rule:
-                        chosen[place] = self._choice(pool, contender, budget, seed)
+                        first = portions(budget, contender.rounds)[0]
+                        chosen[place] = self._choice(pool, contender, first, seed)
                         rules.append(chosen[place])
                     else:
-                        chosen[place] = self._step1(pool, settings, LEARNED, seed)
+                        chosen[place] = self._step1(pool, settings, contender.policy, seed)
                         trained.append(chosen[place])
                     if settings.finetune.step2.start == "coarse":
                         own = self._step1(pool, settings, SHARED_COARSE, seed) if contender.rule else chosen[place]
@@ -121,6 +123,7 @@ class Bench:
                         coarse.append(own)
         label = f", seed {seed}"
         self.crew.work(f"selections{label}", "dnrpipe.selectbench.choosing", _once(rules))
+        self._further_rounds(chosen, label)
         self.crew.work(f"step 1{label}", "dnrpipe.ablation.cells", _once([*trained, *coarse]))
         for pool in self.pools:
             places = [place for place in chosen if (place.scene, place.pool) == (pool.scene, pool.name)]
@@ -170,6 +173,40 @@ class Bench:
             "label": f"{pool.folder} step 1",
         }
 
+    def _further_rounds(self, chosen: dict[Place, dict[str, Any]], label: str) -> None:
+        """Policies of several rounds: trace what they chose so far, let them look at it and choose on."""
+        rounds = {contender.name: contender.rounds for contender in self.request.policies}
+        for number in range(2, max(rounds.values()) + 1):
+            due = []
+            for pool in self.pools:
+                here = [
+                    p for p in chosen if (p.scene, p.pool) == (pool.scene, pool.name) and rounds[p.policy] >= number
+                ]
+                views = {place: read_choice(chosen[place])["views"] for place in here}
+                if not here:
+                    continue
+                traced, bases = self._trace(pool, sorted({name for names in views.values() for name in names}))
+                for place in here:
+                    before, names = chosen[place], views[place]
+                    seen = [[traced[name], bases.get(f"train/{name}")] for name in names]
+                    budget = portions(place.budget, rounds[place.policy])[number - 1]
+                    key = digest([CHOICE_VERSION, before["key"], budget, seen])
+                    output = str(self.request.out / "selections" / pool.folder / f"{key}.json")
+                    base = self._settings(pool).model.base
+                    task = {"key": key, "budget": budget, "before": before["output"], "base": base, "output": output}
+                    chosen[place] = {**before, **task}
+                    due.append(chosen[place])
+            self.crew.work(f"selections, round {number}{label}", "dnrpipe.selectbench.choosing", _once(due))
+
+    def _trace(self, pool: Pool, names: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
+        """Ray-trace candidates and render base images; -> fingerprints, see ``trace_train`` and ``make_bases``."""
+        settings = self._settings(pool)
+        traced = trace_train(pool.data, settings, self.console, names)
+        if settings.model.base == "none":
+            return traced, {}
+        share_light([other for other in self.pools if other.scene == pool.scene])
+        return traced, make_bases(pool.data, settings, self.console, names)
+
     # -- cells -----------------------------------------------------------------------------------------
 
     def _trace_and_plan(
@@ -181,11 +218,7 @@ class Bench:
         # In the pool's order: two policies that choose the same views in another order are the same cell.
         views = {place: sorted(read_choice(task)["views"], key=order.__getitem__) for place, task in chosen.items()}
         everything = sorted({name for names in views.values() for name in names})
-        traced = trace_train(pool.data, settings, self.console, everything)
-        bases: dict[str, str] = {}
-        if settings.model.base != "none":
-            share_light([other for other in self.pools if other.scene == pool.scene])
-            bases = make_bases(pool.data, settings, self.console, everything)
+        traced, bases = self._trace(pool, everything)
         for place, names in views.items():
             self.cells[place] = self._cell(pool, settings, place, names, traced, bases, starts.get(place))
             self.cells[place]["choice"] = chosen[place]["output"]

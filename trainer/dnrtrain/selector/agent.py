@@ -13,7 +13,7 @@ from .qnetwork import QNetwork
 TARGET_KEEP = 0.98
 """Share of itself that the slow network keeps per update; MVSelect's 0.99 suits ten times longer training."""
 
-Reward = Literal["neg-loss", "pos-loss", "improvement"]
+Reward = Literal["neg-loss", "pos-loss", "improvement", "improvement-own", "improvement-all"]
 
 
 def best_action(values: Tensor, selected: Tensor) -> int:
@@ -95,8 +95,9 @@ def reward_of(kind: Reward, relative: float, probe_before: float | None, probe_a
 
     neg-loss     −L_DNRc on that view (the paper's choice), as :class:`RewardScale` measures it
     pos-loss     the negative of that (the paper's comparison: hard views first)
-    improvement  relative decrease of the raster loss on a fixed set of probe views by this step: the
-                 objective itself, at the price of rendering the probes after every step
+    improvement, improvement-own, improvement-all
+                 relative decrease by this step of the raster loss on a fixed set of probe views, on the view itself,
+                 or on all candidates: the objective itself, at the price of rendering them after every step
     """
     if kind == "neg-loss":
         return relative

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
-UntrainedName = Literal["auto", "kmedoids", "coverage", "d-optimal", "farthest", "random"]
-TrainedName = Literal["rl-paper"]
+UntrainedName = Literal["auto", "kmedoids", "coverage", "d-optimal", "dqn", "farthest", "random"]
+TrainedName = Literal["rl-paper", "fisher"]
 PolicyName = Literal[UntrainedName, TrainedName]
 
 UNTRAINED_NAMES: tuple[UntrainedName, ...] = get_args(UntrainedName)

@@ -8,6 +8,7 @@ from .baselines import FarthestPolicy, RandomPolicy
 from .coverage import CoveragePolicy
 from .doptimal import DOptimalPolicy
 from .kmedoids import KMedoidsPolicy
+from .learned import DqnPolicy
 from .names import NAMES, full_name
 from .protocol import Policy
 
@@ -16,6 +17,7 @@ UNTRAINED: dict[str, Policy] = {
     "kmedoids": KMedoidsPolicy(),
     "coverage": CoveragePolicy(),
     "d-optimal": DOptimalPolicy(),
+    "dqn": DqnPolicy(),
     "farthest": FarthestPolicy(),
     "random": RandomPolicy(),
 }

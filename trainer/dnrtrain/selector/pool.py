@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -17,19 +17,37 @@ def choose_useful(candidates: Candidates, budget: int, choose: Callable[[Candida
     so a permutation of the candidates does not change the chosen set. Duplicates (the same picture; without
     sightings the same pose) come once. Views that see nothing come last.
     """
+    return complete_useful(candidates, (), budget, lambda some, _, count: choose(some, count))
+
+
+def complete_useful(
+    candidates: Candidates,
+    kept: Sequence[int],
+    budget: int,
+    choose: Callable[[Candidates, list[int], int], Choice],
+) -> Choice:
+    """The views that complete ``kept`` to ``budget``, as :func:`choose_useful` chooses; a kept view's duplicates wait.
+
+    ``choose(some, kept, count)`` answers with ``count`` further views of ``some``.
+    """
     check_budget(budget, len(candidates))
     order = canonical_order(candidates)
     ranked = candidates.take(order)
+    place = np.argsort(order)
+    old = np.zeros(len(order), bool)
+    old[place[np.asarray(kept, np.int64)]] = True
     sees = np.ones(len(order), bool) if ranked.sightings is None else ranked.sightings.seen > 0
-    first = _first_of_its_kind(ranked)
+    first = _first_of_its_kind(ranked, old)
     useful = np.flatnonzero(sees & first)
     chosen = Choice([], [], [])
-    if len(useful):
-        chosen = choose(ranked.take(useful), min(budget, len(useful)))
+    wanted = min(budget - int(old.sum()), int((~old[useful]).sum()))
+    if wanted > 0:
+        inside = np.searchsorted(useful, [int(place[view]) for view in kept if (sees & first)[place[view]]])
+        chosen = choose(ranked.take(useful), [int(i) for i in inside], wanted)
     views = [int(useful[i]) for i in chosen.views]
     gains, why = list(chosen.gains), list(chosen.why)
     for group, reason in ((sees & ~first, "a duplicate: all else was chosen"), (~sees, "sees nothing: all else was")):
-        extra = _spread(ranked, np.flatnonzero(group), budget - len(views))
+        extra = _spread(ranked, np.flatnonzero(group & ~old), budget - int(old.sum()) - len(views))
         views += extra
         gains += [0.0] * len(extra)
         why += [reason] * len(extra)
@@ -46,14 +64,15 @@ def canonical_order(candidates: Candidates) -> np.ndarray:
     return np.lexsort(keys[::-1])
 
 
-def _first_of_its_kind(candidates: Candidates) -> np.ndarray:
-    """Whether each view is the first of its duplicates, bool [N]."""
+def _first_of_its_kind(candidates: Candidates, old: np.ndarray) -> np.ndarray:
+    """Whether each view is the first of its duplicates, bool [N]; ``old`` [N] ones are before all others."""
     first = np.zeros(len(candidates), bool)
     if candidates.sightings is not None:
         kinds = candidates.sightings.pictures[:, None]
     else:
         kinds = np.concatenate([candidates.positions, candidates.directions], axis=1)
-    first[np.unique(kinds, axis=0, return_index=True)[1]] = True
+    order = np.argsort(~old, kind="stable")
+    first[order[np.unique(kinds[order], axis=0, return_index=True)[1]]] = True
     return first
 
 

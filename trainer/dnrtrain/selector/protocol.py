@@ -24,11 +24,13 @@ class Candidates:
 
     positions, directions: camera centres and unit viewing directions in world space, float64 [N, 3] each.
     sightings: what each of them sees of the surface, or None where nobody looked.
+    facts: what a trained model says of each, [N, ...], for the policies that ask one; else None.
     """
 
     positions: np.ndarray
     directions: np.ndarray
     sightings: Sightings | None = None
+    facts: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         count = len(self.positions)
@@ -46,7 +48,8 @@ class Candidates:
     def take(self, order: np.ndarray) -> Candidates:
         """The candidates at ``order``, in that order."""
         sightings = None if self.sightings is None else self.sightings.take(order)
-        return Candidates(self.positions[order], self.directions[order], sightings)
+        facts = None if self.facts is None else self.facts[order]
+        return Candidates(self.positions[order], self.directions[order], sightings, facts)
 
 
 @dataclass(frozen=True)
