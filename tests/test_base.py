@@ -106,6 +106,20 @@ def test_light_in_a_white_furnace_is_one_on_both_sides(tmp_path: Path) -> None:
     assert chart.mean() == pytest.approx(1, abs=0.01)
 
 
+def test_scenes_lit_by_shining_meshes_alone_are_recorded_at_the_first_call(tmp_path: Path) -> None:
+    """A textured one makes its distribution at its first use, which must not fall into the recording."""
+    grey = {"type": "diffuse", "reflectance": rgb(0.5, 0.5, 0.5)}
+    picture = mi.Bitmap(np.linspace(0, 1, 48, dtype=np.float32).reshape(4, 4, 3))
+    shining = {"type": "area", "radiance": {"type": "bitmap", "bitmap": picture, "raw": True}}
+    screen = quad(tmp_path / "s.ply", [[-1, 0, 0.2], [1, 0, 0.2], [1, 0, 1], [-1, 0, 1]], (0.05, 0.55), grey)
+    bulb = quad(tmp_path / "b.ply", [[-1, 0, 2], [-1, 1, 2], [1, 1, 2], [1, 0, 2]], (0.55, 0.55), grey)
+    bulb["emitter"] = {"type": "area", "radiance": rgb(3, 3, 3)}
+    scene = corner_room(tmp_path, grey, grey, screen | {"emitter": shining}, bulb=bulb)
+    renderer = BaseRenderer(mi, scene, np.ones((2, 2, 16, 16, 3), np.float32), 2)
+    assert colour(renderer.frame(camera())).max() > 0.5
+    assert renderer.kernel.n_recordings == 1
+
+
 @pytest.mark.parametrize("kind", ["diffuse", "dnr_principled"])
 def test_base_is_the_path_traced_picture_where_all_is_diffuse(tmp_path: Path, kind: str) -> None:
     name = "reflectance" if kind == "diffuse" else "base_color"
