@@ -128,7 +128,7 @@ class SelectSettings(Strict):
     """Which of the candidates are ray-traced."""
 
     budget: int = Field(default=25, ge=1, description="views to ray-trace")
-    policy: PolicyName = Field(default="rl-paper", description="how they are chosen (docs/method.md)")
+    policy: PolicyName = Field(default="auto", description="how they are chosen (docs/method.md)")
     weights: str = Field(
         default="", description="file of `dnrpipe train-selector` for policy dqn; empty: the shipped one"
     )
@@ -209,7 +209,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     # DNR (Thies et al. 2019) at the paper's sizes: what DNRSelect is compared with.
     "vanilla": {
         "model": {"modalities": "uv"},
-        "select": {"step1": {"reward_scale": "raw", "q_target": "plain"}},
+        "select": {"policy": "rl-paper", "step1": {"reward_scale": "raw", "q_target": "plain"}},
         "effects": {"enable": ["view-dependence"]},
         "finetune": {
             "step2": {
@@ -223,7 +223,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     # The paper's numbers: every other default of the models above is the paper's.
     "paper": {
-        "select": {"step1": {"reward_scale": "raw", "q_target": "plain"}},
+        "select": {"policy": "rl-paper", "step1": {"reward_scale": "raw", "q_target": "plain"}},
         "effects": {"enable": ["view-dependence", "depth", "normal"]},
     },
 }

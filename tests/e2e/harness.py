@@ -20,6 +20,7 @@ TINY = {
     "DNRPIPE_CAMERAS__WIDTH": "64",
     "DNRPIPE_CAMERAS__HEIGHT": "64",
     "DNRPIPE_SELECT__BUDGET": "3",
+    "DNRPIPE_SELECT__POLICY": "rl-paper",  # trains step 1; the demo chooses without
     "DNRPIPE_SELECT__STEP1__EPOCHS": "6",
     "DNRPIPE_FINETUNE__STEP2__EPOCHS": "6",
     "DNRPIPE_RAYTRACE__SPP": "32",
