@@ -22,7 +22,7 @@ from .effects.plan import EffectName
 from .errors import UserError
 
 ENVIRONMENT_PREFIX = "DNRPIPE_"
-ENVIRONMENT_OTHER = {"DNRPIPE_WORKSPACE", "DNRPIPE_CACHE", "DNRPIPE_PRESET"}
+ENVIRONMENT_OTHER = {"DNRPIPE_WORKSPACE", "DNRPIPE_CACHE", "DNRPIPE_PRESET", "DNRPIPE_EVENTS"}
 
 
 class CameraSettings(Strict):
