@@ -19,6 +19,10 @@ _EXTRAS = {
     "PIL": "render",
     "jinja2": "render",
     "matplotlib": "render",
+    "fastapi": "serve",
+    "uvicorn": "serve",
+    "websockets": "serve",
+    "httpx": "serve",
 }
 
 

@@ -15,6 +15,8 @@ from .. import __version__
 from . import information, pictures, scene, stages
 from .ablate import ablate
 from .bench_select import bench_select
+from .jobs import cancel, jobs, logs, retry, submit
+from .serve import bench_live, serve
 
 
 class _Group(click.Group):
@@ -56,6 +58,7 @@ for _command in (
     stages.run,
     ablate,
     bench_select,
+    *(serve, submit, jobs, logs, cancel, retry, bench_live),
     information.status,
     information.costs,
     information.doctor,

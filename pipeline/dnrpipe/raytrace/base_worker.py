@@ -67,9 +67,9 @@ class Worker:
         )
         return numbers
 
-    def channels(self, view: View) -> dict[str, np.ndarray]:
-        """Base image and G-buffer of a view in scene units, float32 [H, W] each."""
-        channels = self.renderer.frame(scaled_view(view, self.engine.unit_scale))
+    def channels(self, view: View, renderer: BaseRenderer | None = None) -> dict[str, np.ndarray]:
+        """Base image and G-buffer of a view in scene units, float32 [H, W] each. renderer: one of other samples."""
+        channels = (renderer or self.renderer).frame(scaled_view(view, self.engine.unit_scale))
         channels["depth.Z"] = channels["depth.Z"] / self.engine.unit_scale
         channels["coverage"] = self._frames(view).coverage(view, channels["mask"] > 0.5)
         if self.common["kind"] != "baked":

@@ -152,9 +152,11 @@ class Guard:
                 return 429, "too many wrong tokens; wait a minute", {"retry-after": "60"}
             if not hmac.compare_digest(_given_token(scope, headers), self.token):
                 self.refusals.take(client)
-                return 401, "wrong or missing token; send it as Authorization: Bearer TOKEN", {
-                    "www-authenticate": "Bearer"
-                }
+                return (
+                    401,
+                    "wrong or missing token; send it as Authorization: Bearer TOKEN",
+                    {"www-authenticate": "Bearer"},
+                )
         wait = self.rates.take(client)
         if wait > 0:
             return 429, "too many requests; slow down", {"retry-after": str(max(1, math.ceil(wait)))}

@@ -22,9 +22,11 @@ from PIL import Image
 
 from dnrpipe.errors import UserError
 from dnrpipe.evaluate import flip_error
+from dnrpipe.raytrace.base import BaseRenderer
 from dnrpipe.raytrace.base_worker import Worker as BaseWorker
 from dnrpipe.raytrace.engine import Engine
 from dnrpipe.raytrace.frames import Frames
+from dnrpipe.raytrace.light_worker import read_light
 from dnrtrain.checkpoint import load_model
 from dnrtrain.contract import RASTER_CHANNELS, SceneFrame, View, require_channels
 from dnrtrain.dataset import view_in_memory
@@ -40,8 +42,9 @@ class Worker:
 
     common: {"scene" folder, "frame", "checkpoint", "device", "kind" of base image, "bundle", "variant", "integrator",
     "max_depth", "base": common of the base image worker or None}.
-    task: {"view" as JSON, "mode", "spp" to add to a reference, "fine": best quality, "file" for nearest}; the answer is
-    {"picture": base64, "type", "ms": {stage: milliseconds}, "spp", "width", "height"}.
+    task: {"view" as JSON, "mode", "samples": rays per pixel of a base image, None for the model's own, "spp": to add to
+    a reference, "fine": best quality, "file": for nearest}; the answer is {"picture": base64, "type", "ms": {stage:
+    milliseconds}, "spp", "width", "height"}.
     """
 
     def __init__(self, common: dict[str, Any]) -> None:
@@ -59,6 +62,7 @@ class Worker:
             raise UserError("the live view needs a jit variant of Mitsuba (LLVM or CUDA; see `dnrpipe doctor`)")
         self.model = load_model(Path(common["checkpoint"]), common["device"])
         self.kernels: dict[tuple[int, int], Frames] = {}
+        self.renderers: dict[int, BaseRenderer] = {}
         self.traced: tuple[str, np.ndarray, int] | None = None
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
@@ -72,7 +76,7 @@ class Worker:
         elif mode == "reference":
             picture, spp = self._timed(ms, "path tracing", self._reference, view, int(task["spp"]))
         else:
-            channels = self._timed(ms, "base image" if self.base else "G-buffer", self._channels, view)
+            channels = self._timed(ms, "base image" if self.base else "G-buffer", self._channels, view, task["samples"])
             if mode in ("neural", "error"):
                 picture = self._timed(ms, "network", self._neural, view, channels)
             else:
@@ -97,11 +101,17 @@ class Worker:
         ms[name] = 1000 * (time.perf_counter() - started)
         return result
 
-    def _channels(self, view: View) -> dict[str, np.ndarray]:
+    def _channels(self, view: View, samples: int | None) -> dict[str, np.ndarray]:
         """Base image and G-buffer, or the G-buffer alone."""
-        if self.base is not None:
+        if self.base is None:
+            return self._frames(view).gbuffer(view)
+        if samples is None or samples >= self.base.renderer.samples or self.kind != "baked":
             return self.base.channels(view)
-        return self._frames(view).gbuffer(view)
+        if samples not in self.renderers:
+            light = read_light(Path(self.common["base"]["light"]))
+            scene = self.engine.scenes[str(self.bundle)]
+            self.renderers[samples] = BaseRenderer(self.engine.mi, scene, light, samples)
+        return self.base.channels(view, self.renderers[samples])
 
     def _neural(self, view: View, channels: dict[str, np.ndarray]) -> np.ndarray:
         """Display RGB over white, float32 [H, W, 3] in [0, 1]."""

@@ -105,8 +105,8 @@ class Queue:
                 if waiting >= most_queued:
                     raise QueueFull(f"{waiting} jobs wait already, which is the limit; try again when some are done")
             row = db.execute(
-                "INSERT INTO jobs (state, workspace, priority, request, created, token) VALUES ('queued', ?, ?, ?, ?, ?)"
-                f" RETURNING {_COLUMNS}",
+                "INSERT INTO jobs (state, workspace, priority, request, created, token)"
+                f" VALUES ('queued', ?, ?, ?, ?, ?) RETURNING {_COLUMNS}",
                 (request.workspace, request.priority, request.model_dump_json(), time.time(), token),
             ).fetchone()
             _note_state(db, row["id"], "queued")

@@ -6,12 +6,9 @@ import contextlib
 import json
 import logging
 import os
-import re
-import stat
 import sys
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import uvicorn
@@ -26,7 +23,6 @@ from .root import ServiceRoot
 from .state import Feed, State
 from .supervisor import Supervisor
 
-TOKEN_PATTERN = r"[A-Za-z0-9_-]{16,256}"
 SHUTDOWN_SECONDS = 3
 
 
@@ -101,22 +97,6 @@ def _alone(root: ServiceRoot) -> Iterator[None]:
         yield
     finally:
         lock.release()
-
-
-def read_token(path: Path) -> str:
-    """The token in a file. Raises UserError: unreadable, readable by others, too short or of other letters."""
-    try:
-        mode, text = path.stat().st_mode, path.read_text(encoding="utf-8").strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: cannot be read as a token file ({error})") from None
-    if mode & (stat.S_IRGRP | stat.S_IROTH):
-        raise UserError(f"{path}: others can read it; run `chmod 600 {path}`")
-    if not re.fullmatch(TOKEN_PATTERN, text):
-        raise UserError(
-            f"{path}: a token is 16 to 256 letters, digits, dashes and underscores;"
-            f" make one with `python -c 'import secrets; print(secrets.token_urlsafe(32))' > {path}`"
-        )
-    return text
 
 
 class _JsonLines(logging.Formatter):

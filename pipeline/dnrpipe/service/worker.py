@@ -149,9 +149,9 @@ class EventReader:
                 event["time"], event["kind"] = float(event["time"]), str(event["kind"])
             except (ValueError, KeyError, TypeError):
                 continue
-            if event["kind"] == "progress" and found and found[-1]["kind"] == "progress":
-                if found[-1].get("label") == event.get("label"):
-                    found.pop()
+            before = found[-1] if found else {}
+            if event["kind"] == before.get("kind") == "progress" and before.get("label") == event.get("label"):
+                found.pop()
             found.append(event)
         return found
 
