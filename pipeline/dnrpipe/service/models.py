@@ -174,12 +174,16 @@ class CostState(_Wire):
 
 
 class WorkspaceDetail(_Wire):
-    """What the dashboard shows of a workspace."""
+    """What the dashboard shows of a workspace.
+
+    sphere: the cameras as SVG, seen from ``eye`` (azimuth, elevation in radians); None before there are any.
+    """
 
     name: str
     stages: list[StageState]
     views: list[PlacedView]
-    radius: float
+    sphere: str | None
+    eye: tuple[float, float]
     training: list[Curve]
     tests: list[TestPicture]
     costs: CostState

@@ -15,13 +15,17 @@ from .routes_jobs import NOT_FOUND, REFUSED
 from .state import Shared
 
 STATIC = Path(__file__).parent / "static"
+REPORT = Path(__file__).parents[1] / "report"
+SCRIPT, STYLE, PAGE = "text/javascript", "text/css", "text/html"
 PAGES = {
-    "app.js": "text/javascript",
-    "plots.js": "text/javascript",
-    "sphere.js": "text/javascript",
-    "viewer.js": "text/javascript",
-    "style.css": "text/css",
-    "viewer.html": "text/html",
+    "api.js": (STATIC, SCRIPT),
+    "app.js": (STATIC, SCRIPT),
+    "plots.js": (STATIC, SCRIPT),
+    "viewer.js": (STATIC, SCRIPT),
+    "style.css": (STATIC, STYLE),
+    "viewer.html": (STATIC, PAGE),
+    "sphere.js": (REPORT, SCRIPT),
+    "report.css": (REPORT, STYLE),
 }
 TEXT: dict[int | str, dict[str, Any]] = {200: {"content": {"text/plain": {}}, "description": "Prometheus text format"}}
 
@@ -76,4 +80,5 @@ def static(file: str) -> FileResponse:
     """One of the named files; there is no listing."""
     if file not in PAGES:
         raise HTTPException(404, "no such page")
-    return FileResponse(STATIC / file, media_type=PAGES[file])
+    folder, kind = PAGES[file]
+    return FileResponse(folder / file, media_type=kind)

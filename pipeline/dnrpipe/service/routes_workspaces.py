@@ -15,6 +15,7 @@ from starlette.requests import ClientDisconnect
 
 from ..errors import UserError
 from ..report.collect import outline
+from ..report.sphere import AZIMUTH, ELEVATION, sphere_svg
 from ..session import resolve_settings
 from ..stages import status
 from ..workspace import Workspace
@@ -86,7 +87,8 @@ def get_workspace(name: NamePath, service: Shared) -> WorkspaceDetail:
         name=name,
         stages=[StageState(**{key: row[key] for key in StageState.model_fields}) for row in rows],
         views=[PlacedView(**view.model_dump()) for view in sphere.views] if sphere else [],
-        radius=sphere.radius if sphere else 0.0,
+        sphere=str(sphere_svg(sphere, "oblique")) if sphere else None,
+        eye=(AZIMUTH, ELEVATION),
         training=[Curve(title=t.title, losses=t.losses, psnr=t.psnr) for t in known.training],
         tests=[TestPicture(view=view, psnr=psnr) for view, psnr in known.psnr.items()],
         costs=CostState(
