@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
-_FLAGS = (
+FLAGS = (
     "--headless",
     "--no-sandbox",
     "--disable-gpu",
@@ -58,7 +58,7 @@ def _run(flags: list[str], page: Path) -> str:
         raise RuntimeError("no Chromium is installed")
     with tempfile.TemporaryDirectory() as profile:
         result = subprocess.run(
-            [chromium, *_FLAGS, f"--user-data-dir={profile}", *flags, page.as_uri()],
+            [chromium, *FLAGS, f"--user-data-dir={profile}", *flags, page.as_uri()],
             capture_output=True,
             text=True,
             timeout=120,

@@ -27,6 +27,8 @@ from dnrpipe.raytrace.base_worker import Worker as BaseWorker
 from dnrpipe.raytrace.engine import Engine
 from dnrpipe.raytrace.frames import Frames
 from dnrpipe.raytrace.light_worker import read_light
+from dnrpipe.settings import Settings
+from dnrpipe.training import torch_device
 from dnrtrain.checkpoint import load_model
 from dnrtrain.contract import RASTER_CHANNELS, SceneFrame, View, require_channels
 from dnrtrain.dataset import view_in_memory
@@ -40,8 +42,8 @@ BASE_ONLY = ("base", "albedo")
 class Worker:
     """Renders pictures of one workspace.
 
-    common: {"scene" folder, "frame", "checkpoint", "device", "kind" of base image, "bundle", "variant", "integrator",
-    "max_depth", "base": common of the base image worker or None}.
+    common: {"scene" folder, "frame", "checkpoint", "device" (setting), "kind" of base image, "bundle", "variant",
+    "integrator", "max_depth", "base": common of the base image worker or None}.
     task: {"view" as JSON, "mode", "samples": rays per pixel of a base image, None for the model's own, "spp": to add to
     a reference, "fine": best quality, "file": for nearest}; the answer is {"picture": base64, "type", "ms": {stage:
     milliseconds}, "spp", "width", "height"}.
@@ -60,7 +62,8 @@ class Worker:
         self.engine = self.base.engine if self.base is not None else Engine(common["variant"], 0, [self.bundle])
         if not self.engine.compiled:
             raise UserError("the live view needs a jit variant of Mitsuba (LLVM or CUDA; see `dnrpipe doctor`)")
-        self.model = load_model(Path(common["checkpoint"]), common["device"])
+        self.device = torch_device(Settings(device=common["device"]))
+        self.model = load_model(Path(common["checkpoint"]), self.device)
         self.kernels: dict[tuple[int, int], Frames] = {}
         self.renderers: dict[int, BaseRenderer] = {}
         self.traced: tuple[str, np.ndarray, int] | None = None
@@ -117,7 +120,7 @@ class Worker:
         """Display RGB over white, float32 [H, W, 3] in [0, 1]."""
         data = view_in_memory(channels, self.frame, view, display=self.display, base=self.kind)
         with self.torch.inference_mode():
-            output = self.model(data.tensors.to(self.common["device"]))
+            output = self.model(data.tensors.to(self.device))
             return output.rgb[0].float().clamp(0, 1).permute(1, 2, 0).cpu().numpy()
 
     def _shown(self, mode: str, channels: dict[str, np.ndarray]) -> np.ndarray:

@@ -20,7 +20,7 @@ from ..errors import UserError
 from ..scene_files import read_frame, read_summary
 from ..session import resolve_settings
 from ..settings import Settings
-from ..training import read_selection, torch_device
+from ..training import read_selection
 from ..workspace import Workspace
 
 SIZES = (64, 1024)
@@ -113,7 +113,7 @@ def open_scene(root: Path) -> LiveScene:
             "scene": str(workspace.scene),
             "frame": frame.model_dump(mode="json"),
             "checkpoint": str(workspace.checkpoints("step2")),
-            "device": torch_device(settings),
+            "device": settings.device,
             "kind": kind,
             "base": base,
             **{key: config[key] for key in ("bundle", "variant", "integrator", "max_depth")},

@@ -67,7 +67,8 @@ def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], Non
         server = _Server(settings, lambda: ready(f"http://{host}:{socket.getsockname()[1]}"))
         supervisor.start()
         try:
-            server.run(sockets=[socket])
+            with contextlib.suppress(KeyboardInterrupt):  # the usual end; uvicorn raises it again when it has shut down
+                server.run(sockets=[socket])
         finally:
             supervisor.stop()
             queue.close()
