@@ -46,7 +46,9 @@ class Server:
         if "--devices" not in command:
             command += ["--devices", "cpu"]
         with self.log.open("a") as sink:
-            self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=sink, text=True, env=dict(os.environ))
+            self.process = subprocess.Popen(
+                command, stdout=subprocess.PIPE, stderr=sink, text=True, env=dict(os.environ)
+            )
         assert self.process.stdout is not None
         for line in self.process.stdout:
             if line.startswith("dashboard: "):
