@@ -33,7 +33,7 @@ def trained(server: Server) -> str:
         for event in client.events(job.id):
             epochs += event.kind == "epoch" and event.data["stage"] == "finetune"
             assert event.data.get("state") not in ("done", "failed"), client.log(job.id).text
-            if epochs == 5:
+            if epochs == 3:
                 break
     server.kill()
     server.start()

@@ -28,7 +28,7 @@ TINY: dict[str, bool | int | float | str] = {
     "passes.raster": "cycles-direct",
     "model.texture_size": 32,
     "model.width": 8,
-    "finetune.step2.epochs": 60,
+    "finetune.step2.epochs": 24,
     "finetune.step2.perceptual_crop": 0,
 }
 
@@ -37,12 +37,13 @@ class Server:
     """``dnrpipe serve`` in ``root``."""
 
     def __init__(self, root: Path, *options: str) -> None:
-        self.root, self.options = root, options
+        self.root, self.options, self.port = root, options, 0
         self.log = root.parent / f"{root.name}.server.log"
         self.start()
 
     def start(self) -> None:
-        command = [sys.executable, "-m", "dnrpipe.cli", "serve", "--root", str(self.root), "--port", "0", *self.options]
+        command = [sys.executable, "-m", "dnrpipe.cli", "serve", "--root", str(self.root)]
+        command += ["--port", str(self.port), *self.options]
         if "--devices" not in command:
             command += ["--devices", "cpu"]
         with self.log.open("a") as sink:
@@ -53,6 +54,7 @@ class Server:
         for line in self.process.stdout:
             if line.startswith("dashboard: "):
                 self.url = line.removeprefix("dashboard: ").strip()
+                self.port = int(self.url.rpartition(":")[2])  # the same one after a restart
                 return
         raise AssertionError(f"the server did not start:\n{self.log.read_text()}")
 

@@ -43,7 +43,7 @@ def test_killed_while_it_trains(server: Server, trained: str) -> None:
         assert job.state == "done" and job.starts == 2 and job.crashes == 0
         events = list(client.events(job.id))
         epochs = [e.data["epoch"] for e in events if e.kind == "epoch" and e.data["stage"] == "finetune"]
-        assert sorted(set(epochs)) == list(range(1, 61)) or sorted(set(epochs)) == list(range(60))
+        assert sorted(set(epochs)) == list(range(1, 25))
         assert len(epochs) - len(set(epochs)) <= 1  # at most the one that was under way
         states = [e.data["state"] for e in events if e.kind == "state"]
         assert states == ["queued", "running", "queued", "running", "done"]
@@ -135,30 +135,36 @@ def test_stopped_in_order(tmp_path: Path) -> None:
         server.stop()
 
 
-def test_many_clients_lose_nothing(server: Server) -> None:
-    """200 clients at once submit 1,000 jobs, while the worker works on them: each answer is a job of its own."""
-    names = [f"crowd{i}" for i in range(10)]
-    for name in names:
-        empty_workspace(server.root, name)
-    start = threading.Barrier(200)
+def test_many_clients_lose_nothing(tmp_path: Path) -> None:
+    """200 clients at once submit 1,000 jobs; the server is killed with -9 among them and started again.
 
-    def client(number: int) -> list[int]:
-        start.wait(timeout=60)
-        with server.client() as connection:
-            return [connection.submit(_failing(names[(number + i) % 10])).id for i in range(5)]
+    Every client gets five jobs of its own, all are in the queue exactly once, and none of another's.
+    """
+    server = Server(tmp_path / "root", "--rate", "5000")
+    try:
+        empty_workspace(server.root, "crowd")
+        start = threading.Barrier(201)
 
-    with concurrent.futures.ThreadPoolExecutor(200) as pool:
-        ids = [job for found in pool.map(client, range(200)) for job in found]
-    assert len(ids) == len(set(ids)) == 1000
-    with server.client() as connection:
-        found = [job for job in connection.jobs() if job.request.workspace in names]
-        assert sorted(job.id for job in found) == sorted(ids)
-        for job in found:
-            if job.state == "queued":
-                try:
-                    connection.cancel(job.id)
-                except Refused as refused:  # the worker was quicker
-                    assert refused.status == 409
-        ended = [job for job in connection.jobs() if job.request.workspace in names]
-        assert {job.state for job in ended} <= {"failed", "cancelled", "running"}
-        assert all(job.starts <= 1 for job in ended)
+        def crowd(number: int) -> list[int]:
+            with Client(server.url, patience=120) as client:
+                start.wait(timeout=60)
+                return [
+                    client.submit(_failing("crowd").model_copy(update={"priority": number % 7})).id for _ in range(5)
+                ]
+
+        with concurrent.futures.ThreadPoolExecutor(200) as pool:
+            found = [pool.submit(crowd, number) for number in range(200)]
+            start.wait(timeout=60)
+            time.sleep(0.5)
+            server.kill()
+            server.start()
+            ids = [job for answer in found for job in answer.result()]
+        assert len(ids) == len(set(ids)) == 1000
+        with server.client() as client:
+            jobs = list(client.jobs())
+        assert sorted(job.id for job in jobs) == sorted(ids)
+        assert {job.state for job in jobs} <= {"queued", "running", "failed"}
+        ended = [job for job in jobs if job.state == "failed"]
+        assert all(job.exit_code == 2 for job in ended)
+    finally:
+        server.stop()

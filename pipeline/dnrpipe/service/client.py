@@ -9,8 +9,10 @@ with Client("http://127.0.0.1:8420") as client:
 
 from __future__ import annotations
 
+import functools
 import json
 import secrets
+import ssl
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -23,9 +25,11 @@ from ..errors import UserError
 from .models import Health, Job, JobEvent, JobPage, JobRequest, LogPage, Scene, State, WorkspaceDetail, WorkspaceSummary
 
 DEFAULT_SERVER = "http://127.0.0.1:8420"
-TRIES = 8
+PATIENCE = 4.0
+"""Seconds that a server may be away (it is being started again) before that is an error."""
 PAUSE = 0.5
 LONGEST_WAIT = 60.0
+MOST_WAITS = 5
 PIECE = 1 << 20
 Answer = TypeVar("Answer", bound=BaseModel)
 
@@ -44,11 +48,18 @@ class Client:
     Raises UserError: cannot be reached, or (Refused) says no.
     """
 
-    def __init__(self, server: str = DEFAULT_SERVER, token: str | None = None, *, timeout: float = 60.0) -> None:
-        self.server = server
+    def __init__(
+        self,
+        server: str = DEFAULT_SERVER,
+        token: str | None = None,
+        *,
+        timeout: float = 60.0,
+        patience: float = PATIENCE,
+    ) -> None:
+        self.server, self.patience = server, patience
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         try:
-            self._http = httpx.Client(base_url=server, headers=headers, timeout=timeout)
+            self._http = httpx.Client(base_url=server, headers=headers, timeout=timeout, verify=_trust())
         except (httpx.InvalidURL, ValueError) as error:
             raise UserError(f"--server {server}: not an address ({error}); e.g. {DEFAULT_SERVER}") from None
 
@@ -101,17 +112,17 @@ class Client:
 
     def events(self, job: int, after: int = 0) -> Iterator[JobEvent]:
         """The job's events until it has ended; a stream that breaks is taken up where it broke."""
-        last, tries = after, 0
+        last, deadline = after, time.monotonic() + self.patience
         while True:
             try:
                 for event in self._stream(job, last):
                     if event is None:
                         return
-                    last, tries = event.id, 0
+                    last = event.id
                     yield event
+                    deadline = time.monotonic() + self.patience
             except httpx.TransportError as error:
-                tries += 1
-                if tries >= TRIES:
+                if time.monotonic() > deadline:
                     raise UserError(f"{self.server}: the event stream broke ({error})") from None
             time.sleep(PAUSE)
 
@@ -165,28 +176,35 @@ class Client:
 
     def _ask(self, method: str, path: str, **options: Any) -> httpx.Response:
         """What can be asked twice: everything but uploads. Submissions carry a key."""
-        for last in (*([False] * (TRIES - 1)), True):
+        deadline, turned_away = time.monotonic() + self.patience, 0
+        while True:
             try:
                 answer = self._http.request(method, path, **options)
             except httpx.TransportError as error:
-                if last:
+                if time.monotonic() > deadline:
                     raise UserError(
                         f"{self.server}: cannot be reached ({error}); is `dnrpipe serve` running there?"
                     ) from None
                 time.sleep(PAUSE)
                 continue
             wait = answer.headers.get("retry-after", "")
-            if answer.status_code == 429 and wait.isdigit() and not last:
+            if answer.status_code == 429 and wait.isdigit() and turned_away < MOST_WAITS:
+                turned_away += 1
                 time.sleep(min(float(wait), LONGEST_WAIT))
                 continue
             return _checked(answer)
-        raise AssertionError("unreachable")
 
     def _read(self, answer: httpx.Response, model: type[Answer]) -> Answer:
         try:
             return model.model_validate_json(answer.content)
         except ValueError:
             raise UserError(f"{self.server}: is not a dnrpipe server, or one of another version") from None
+
+
+@functools.cache
+def _trust() -> ssl.SSLContext:
+    """The system's certificates, read once: it takes longer than most requests."""
+    return ssl.create_default_context()
 
 
 def _checked(answer: httpx.Response) -> httpx.Response:

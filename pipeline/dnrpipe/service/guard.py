@@ -12,6 +12,7 @@ import hmac
 import json
 import logging
 import math
+import re
 import time
 from collections import OrderedDict
 from collections.abc import Iterable
@@ -197,11 +198,9 @@ def _client(scope: Scope) -> str:
 
 
 def _name_of(host: str) -> str:
-    """``[::1]:8420`` -> ``::1``."""
-    try:
-        return urlsplit(f"//{host}").hostname or ""
-    except ValueError:
-        return ""
+    """``[::1]:8420`` -> ``::1``; empty where it is no host and port."""
+    found = re.fullmatch(r"(?:\[([0-9a-f:]+)\]|([a-z0-9.-]+))(?::[0-9]{1,5})?", host.lower())
+    return (found[1] or found[2]) if found else ""
 
 
 def _is_open(scope: Scope) -> bool:

@@ -9,6 +9,7 @@ root/
 
 from __future__ import annotations
 
+import contextlib
 import re
 from pathlib import Path
 
@@ -66,9 +67,14 @@ class ServiceRoot:
         return path
 
     def workspaces(self) -> list[str]:
-        """Names of the workspaces, sorted."""
-        found = (path.parent.name.removesuffix(SUFFIX) for path in self.folder.glob(f"*{SUFFIX}/manifest.json"))
-        return sorted(name for name in found if re.fullmatch(NAME_PATTERN, name))
+        """Names of the workspaces, sorted; links that lead out of the root are none."""
+        names = []
+        for path in self.folder.glob(f"*{SUFFIX}/manifest.json"):
+            with contextlib.suppress(UnknownName):
+                name = path.parent.name.removesuffix(SUFFIX)
+                self.workspace(name)
+                names.append(name)
+        return sorted(names)
 
     def _inside(self, path: Path, name: str, pattern: str) -> Path:
         if not re.fullmatch(pattern, name):
