@@ -28,8 +28,11 @@ TINY: dict[str, bool | int | float | str] = {
     "passes.raster": "cycles-direct",
     "model.texture_size": 32,
     "model.width": 8,
-    "finetune.step2.epochs": 24,
-    "finetune.step2.perceptual_crop": 0,
+    "raytrace.max_depth": 3,
+    "raytrace.denoise": False,
+    "raytrace.evaluation_denoise": False,
+    "finetune.step2.epochs": 40,
+    "finetune.step2.loss.perceptual": 0.0,
 }
 
 

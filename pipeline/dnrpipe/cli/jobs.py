@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ from ..errors import UserError
 from .options import options as with_options
 
 if TYPE_CHECKING:
+    from ..console import Bar, Console
     from ..service.client import Client
     from ..service.models import Job
 
@@ -209,39 +211,48 @@ def _act(wish: Callable[[Client], Job], server: str | None, token_file: Path | N
         click.echo(f"job {job.id}: {'running, will be cancelled' if wanted else job.state}")
 
 
-def _follow(client: Client, job: Job, console: Any) -> Job:
+def _follow(client: Client, job: Job, console: Console) -> Job:
     """Show a job's progress as a local run would, until it has ended; returns the job as it is then."""
-    bar: Any = None
-    label: str | None = None
+    shown = _Shown(console)
     try:
         for event in client.events(job.id):
             data = event.data
             if event.kind == "progress":
-                if label != data["label"]:
-                    if bar is not None:
-                        bar.__exit__(None, None, None)
-                    label, bar = data["label"], console.bar(data["label"], data["total"], data["done"])
-                    shown = bar.__enter__()
-                shown.advance(max(0, data["done"] - shown.done), data["note"])
-                continue
-            if event.kind == "message" or (event.kind == "state" and "why" in data):
-                if bar is not None:
-                    bar.__exit__(None, None, None)
-                bar = label = None
-                if data.get("level") == "warning":
-                    console.warn(data["text"])
-                else:
-                    console.say(data.get("text") or f"job {job.id}: {data['state']}: {data['why']}")
+                shown.progress(data)
+            elif event.kind == "message":
+                shown.close()
+                (console.warn if data["level"] == "warning" else console.say)(data["text"])
+            elif event.kind == "state" and "why" in data and data["state"] == "queued":
+                shown.close()
+                console.say(f"job {job.id}: queued again: {data['why']}")
     except KeyboardInterrupt:
         console.say(f"job {job.id} goes on; `dnrpipe logs {job.id} -f` shows it, `dnrpipe cancel {job.id}` ends it")
         raise
     finally:
-        if bar is not None:
-            bar.__exit__(None, None, None)
+        shown.close()
     ended = client.job(job.id)
     if ended.state == "done":
         console.say(f"job {job.id}: done")
     return ended
+
+
+class _Shown:
+    """One progress bar at a time."""
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        self.stack = ExitStack()
+        self.bar: Bar | None = None
+
+    def progress(self, data: dict[str, Any]) -> None:
+        if self.bar is None or self.bar.label != data["label"]:
+            self.close()
+            self.bar = self.stack.enter_context(self.console.bar(data["label"], data["total"], data["done"]))
+        self.bar.advance(max(0, data["done"] - self.bar.done), data["note"])
+
+    def close(self) -> None:
+        self.stack.close()
+        self.bar = None
 
 
 def _exit(job: Job) -> None:
