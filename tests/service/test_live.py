@@ -85,7 +85,7 @@ def test_a_reference_gets_better(server: Server, trained: str) -> None:
     url = server.url.replace("http", "ws") + f"/workspaces/{trained}/live"
     with connect(url, max_size=None) as socket:
         viewer = Viewer(socket)
-        viewer.ask("reference")
+        viewer.ask("reference", azimuth=2.5)  # a view that has no samples yet
         frames = [viewer.frame() for _ in range(12)]
         assert [header["spp"] for header, _ in frames] == [4 * (i + 1) for i in range(12)]
         last = frames[-1][1]

@@ -18,6 +18,8 @@ from .root import ServiceRoot
 
 FRAME_SECONDS = 120.0
 """The first frame loads the scene and compiles kernels; one that takes longer than this hangs."""
+TRIES = 3
+"""A process that died is replaced; on a fresh one the first recording of a kernel may fail (Dr.Jit), the second not."""
 TEND = 2.0
 REFERENCE_SPP = 4
 MOST_SPP = 1024
@@ -64,14 +66,13 @@ class LiveSession:
         return answer | {"total_ms": round(total, 1), "nearest": nearest.name if nearest else None, "samples": samples}
 
     def _ask(self, task: dict[str, Any]) -> dict[str, Any]:
-        try:
+        reason = ""
+        for _ in range(TRIES):
             try:
                 return self._worker.ask(task, FRAME_SECONDS)
-            except (TaskFailed, WorkerDied):  # as everywhere: once more, on a new process if it died
-                return self._worker.ask(task, FRAME_SECONDS)
-        except (TaskFailed, WorkerDied, OSError, ValueError) as error:
-            reason = " ".join(str(error).split())
-            raise UserError(f"the frame failed: {reason}; see {self.scene.root.name}/logs/live.log") from None
+            except (TaskFailed, WorkerDied, OSError, ValueError) as error:
+                reason = " ".join(str(error).split())
+        raise UserError(f"the frame failed: {reason}; see {self.scene.root.name}/logs/live.log")
 
     async def close(self) -> None:
         await asyncio.get_running_loop().run_in_executor(self._thread, self._worker.close)

@@ -3,7 +3,7 @@
 (function () {
   const $ = function (id) { return document.getElementById(id); };
   const FINAL = ["done", "failed", "cancelled"];
-  let job = null, watching = null, workspace = null;
+  let job = null, watching = null, workspace = null, sphere = null;
   document.documentElement.classList.add("js");
 
   function clock(seconds) {
@@ -125,7 +125,8 @@
     $("cost").textContent = "Cost so far " + clock(costs.total) + " (" + spent.join(", ") + ")." + (costs.traced_views === null ? "" :
       " Ray-traced " + costs.traced_views + " of " + costs.candidates + " candidates in " + clock(costs.tracing_seconds) + "; all would have cost " + clock(costs.tracing_all_seconds) + ".");
     $("sphere").hidden = !found.sphere;
-    if (found.sphere) {
+    if (found.sphere && found.sphere !== sphere) {  // else it stays as it was turned
+      sphere = found.sphere;
       $("sphere").dataset.eye = found.eye.join(" ");
       $("sphere").innerHTML = found.sphere;  // made by the server from numbers and escaped names
       turnSphere($("sphere").querySelector("svg"));
