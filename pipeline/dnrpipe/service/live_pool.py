@@ -34,6 +34,7 @@ class LiveSession:
         self.viewers = 0
         self.used = time.monotonic()
         self.pace = Pace()
+        self._warm = False
         self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"live-{scene.root.stem}")
         log = scene.root / "logs" / "live.log"
         self._worker = LocalWorker("dnrpipe.service.live_frames", scene.common, log, scene.environment)
@@ -64,6 +65,13 @@ class LiveSession:
         if moving:
             self.pace.took(request.size, total)
         return answer | {"total_ms": round(total, 1), "nearest": nearest.name if nearest else None, "samples": samples}
+
+    async def warm(self, request: LiveRequest) -> None:
+        """Compile the kernels of moving frames before the camera moves; does nothing after the first time."""
+        if not self._warm:
+            self._warm = True
+            with contextlib.suppress(UserError):  # told when the frame is asked for
+                await self.frame(request.model_copy(update={"moving": True, "mode": "neural"}))
 
     def _ask(self, task: dict[str, Any]) -> dict[str, Any]:
         reason = ""

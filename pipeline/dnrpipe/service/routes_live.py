@@ -121,6 +121,7 @@ async def _answer(socket: WebSocket, session: LiveSession, wishes: Wishes) -> No
             unsettled = refining = False
             continue
         await socket.send_bytes(pack(answer, current))
+        await session.warm(current)
         unsettled = current.moving
         refining = current.mode in REFINED and not current.moving and (answer["spp"] or 0) < MOST_SPP
 
