@@ -74,7 +74,7 @@
     $("job").hidden = false;
     $("job-title").textContent = "Job " + entry.id + ": " + entry.request.command + " " + entry.request.workspace;
     $("bar").value = 0; $("note").textContent = entry.state; $("log").textContent = ""; $("curves").replaceChildren();
-    let drawn = 0, due = false;
+    let drawn = 0, due = false, looked = Date.now();
     function draw() {
       due = false; drawn = Date.now();
       const series = Object.keys(losses).map(function (name) { return { name: name, points: losses[name] }; });
@@ -82,6 +82,10 @@
       if (quality.length) $("curves").append(plot("validation, dB", [{ name: "PSNR", points: quality }], false));
     }
     api.events(entry.id, watching.signal, function (kind, data) {
+      if (workspace === entry.request.workspace && kind !== "state" && Date.now() - looked > 5000) {
+        looked = Date.now();  // stages and costs go on meanwhile
+        open(workspace).catch(problem);
+      }
       if (kind === "progress") {
         $("bar").max = data.total; $("bar").value = data.done;
         $("note").textContent = data.label + ": " + data.done + " of " + data.total +
@@ -136,10 +140,11 @@
     }));
     $("pictures").hidden = !found.tests.length;
     if (found.tests.length) {
+      view = view || $("view").value;
       $("view").replaceChildren.apply($("view"), found.tests.map(function (t) {
         return new Option(t.view + (t.psnr === null ? "" : ", " + t.psnr.toFixed(2) + " dB"), t.view);
       }));
-      if (view) $("view").value = view;
+      if (found.tests.some(function (t) { return t.view === view; })) $("view").value = view;
       await pictures();
     }
   }
