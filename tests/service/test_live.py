@@ -172,7 +172,7 @@ def test_dashboard_and_viewer_in_a_browser(server: Server, trained: str) -> None
         )
         tab.wait_for("document.querySelectorAll('#curves svg polyline').length > 0")
         tab.wait_for("document.querySelector('#truth').naturalWidth > 0")
-        assert tab.evaluate("document.querySelector('#note').textContent") == "done"
+        tab.wait_for("document.querySelector('#note').textContent === 'done'")
         assert "Ray-traced 2 of 4 candidates" in tab.evaluate("document.querySelector('#cost').textContent")
         before = tab.evaluate("document.querySelector('#sphere svg').innerHTML")
         x, y = tab.evaluate(
