@@ -176,8 +176,9 @@ def test_dashboard_and_viewer_in_a_browser(server: Server, trained: str) -> None
         assert "Ray-traced 2 of 4 candidates" in tab.evaluate("document.querySelector('#cost').textContent")
         before = tab.evaluate("document.querySelector('#sphere svg').innerHTML")
         x, y = tab.evaluate(
-            "(() => { const n = document.querySelector('#sphere svg'); "
-            " n.scrollIntoView({block: 'center', behavior: 'instant'}); const b = n.getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]; })()"
+            "(() => { const n = document.querySelector('#sphere svg');"
+            " n.scrollIntoView({block: 'center', behavior: 'instant'}); const b = n.getBoundingClientRect();"
+            " return [b.x + b.width / 2, b.y + b.height / 2]; })()"
         )
         tab.drag(x, y, 60, 20)
         assert tab.evaluate("document.querySelector('#sphere svg').innerHTML") != before
