@@ -80,6 +80,21 @@ def test_killed_worker_loses_nothing(tmp_path: Path) -> None:
     assert again is not None and (again.id, again.starts) == (job, 2)
 
 
+def test_a_worker_whose_server_died_while_it_started_does_nothing(tmp_path: Path) -> None:
+    """Linux tells a process of its parent's death only if it asked before; this one asks too late."""
+    queue = Queue(tmp_path / ".service" / "queue.sqlite")
+    job = queue.submit(_request("a")).id
+    done = subprocess.run(
+        [sys.executable, "-m", "dnrpipe.service.worker", "cpu", "1"],
+        input=f'{{"root": "{tmp_path}"}}',
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    found = queue.get(job)
+    assert done.returncode == 1 and found is not None and found.state == "queued"
+
+
 def test_a_job_that_kills_its_worker_is_given_up(tmp_path: Path) -> None:
     queue = Queue(tmp_path / "q.sqlite")
     job = queue.submit(_request("a")).id

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import subprocess
 import sys
 import threading
@@ -72,7 +73,7 @@ class Supervisor:
     def _spawn(self, device: str) -> subprocess.Popen[str]:
         with self.log.open("a") as sink:
             process = subprocess.Popen(
-                [sys.executable, "-m", "dnrpipe.service.worker", device],
+                [sys.executable, "-m", "dnrpipe.service.worker", device, str(os.getpid())],
                 stdin=subprocess.PIPE,
                 stdout=sink,
                 stderr=sink,

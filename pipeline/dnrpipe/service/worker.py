@@ -1,7 +1,7 @@
 """The worker process of one device: takes a job, runs it as a command of its own, watches it, says how it ended.
 
-``python -m dnrpipe.service.worker DEVICE`` with the server's configuration as JSON on standard input. The job's process
-leads a session of its own and dies with the worker, and the worker with the server: after kill -9 nothing goes on
+``python -m dnrpipe.service.worker DEVICE SERVER_PID``, with the server's configuration as JSON on standard input. The
+job's process leads a session of its own and dies with the worker, and the worker with the server: after kill -9 nothing goes on
 unseen, and the next server queues the job again.
 """
 
@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +80,7 @@ class Worker:
                 stderr=subprocess.STDOUT,
                 env=job_environment(self.device, events),
                 start_new_session=True,
-                preexec_fn=die_with_parent,
+                preexec_fn=_die_with(os.getpid()),
             )
         limits = tightest(job.request.limits, self.config.limits)
         ended = self._watch(job, process, workspace, limits, EventReader(events))
@@ -183,6 +184,17 @@ def job_environment(device: str, events: Path) -> dict[str, str]:
     return kept | {VARIABLE: str(events), "PYTHONUNBUFFERED": "1"}
 
 
+def _die_with(parent: int) -> Callable[[], None]:
+    """What a job's process does before it becomes the command; ``parent`` may be dead already, and tell no more."""
+
+    def prepare() -> None:
+        die_with_parent()
+        if os.getppid() != parent:
+            os._exit(1)
+
+    return prepare
+
+
 def _await_lock(workspace: Path) -> None:
     """The processes of a worker that was killed may need a moment to be gone; who else holds the workspace is told
     by the command itself."""
@@ -214,6 +226,8 @@ def _signal_name(number: int) -> str:
 
 def main() -> int:
     die_with_parent()
+    if os.getppid() != int(sys.argv[2]):  # the server was killed while this process started
+        return 1
     config = ServerConfig.model_validate_json(sys.stdin.read())
     worker = Worker(config, sys.argv[1])
     signal.signal(signal.SIGTERM, worker.stop)
