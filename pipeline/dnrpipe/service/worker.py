@@ -1,8 +1,8 @@
 """The worker process of one device: takes a job, runs it as a command of its own, watches it, says how it ended.
 
 ``python -m dnrpipe.service.worker DEVICE SERVER_PID``, with the server's configuration as JSON on standard input. The
-job's process leads a session of its own and dies with the worker, and the worker with the server: after kill -9 nothing goes on
-unseen, and the next server queues the job again.
+job's process leads a session of its own and dies with the worker, and the worker with the server: after kill -9 nothing
+goes on unseen, and the next server queues the job again.
 """
 
 from __future__ import annotations
