@@ -9,7 +9,7 @@ from pathlib import Path
 from dnrpipe.export.browser import find_chromium
 
 __all__ = ["dump_dom", "find_chromium", "screenshot"]
-_FLAGS = (
+FLAGS = (
     "--headless",
     "--no-sandbox",
     "--disable-gpu",
@@ -54,7 +54,7 @@ def _run(flags: list[str], page: Path) -> str:
         raise RuntimeError("no Chromium is installed")
     with tempfile.TemporaryDirectory() as profile:
         result = subprocess.run(
-            [chromium, *_FLAGS, f"--user-data-dir={profile}", *flags, page.as_uri()],
+            [chromium, *FLAGS, f"--user-data-dir={profile}", *flags, page.as_uri()],
             capture_output=True,
             text=True,
             timeout=120,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dnrpipe.executors import Retry, TaskResult, run_tasks
+from dnrpipe.executors import LocalWorker, Retry, TaskFailed, TaskResult, WorkerDied, run_tasks
 
 WORKER = """
 import os, pathlib, signal, sys, tempfile, time
@@ -161,3 +161,19 @@ def test_what_workers_leave_in_the_temporary_folder_goes_with_them(module: str, 
     results, _ = _run(module, tmp_path, ["litter"])
     assert results[0].result is not None
     assert not Path(results[0].result["temporary"]).exists()
+
+
+def test_a_single_worker_outlives_errors_and_is_replaced_when_it_dies(module: str, tmp_path: Path) -> None:
+    worker = LocalWorker(module, {"folder": str(tmp_path)}, tmp_path / "log", {})
+    try:
+        first = worker.ask({"kind": "plain", "n": 1}, 60)
+        with pytest.raises(TaskFailed, match="bad input, said on two lines"):
+            worker.ask({"kind": "refuse"}, 60)
+        assert worker.ask({"kind": "plain", "n": 2}, 60)["pid"] == first["pid"]
+        with pytest.raises(WorkerDied):
+            worker.ask({"kind": "crash"}, 60)
+        with pytest.raises(WorkerDied, match="hung"):
+            worker.ask({"kind": "hang"}, 1)
+        assert worker.ask({"kind": "plain", "n": 3}, 60)["pid"] != first["pid"]
+    finally:
+        worker.close()

@@ -19,7 +19,7 @@ from dnrtrain.contract import NPZ_ERRORS, View
 from .console import Console
 from .costs import CostRecord
 from .effects.plan import EffectPlan
-from .effects.store import resolve_plan, trace_config
+from .effects.store import plan_of, resolve_plan, trace_config
 from .errors import UserError
 from .executors import Retry, run_tasks
 from .raytrace.variants import choose_variant
@@ -124,6 +124,30 @@ def _prepared(
     workspace: Workspace, settings: Settings, console: Console, run_id: str, plan: EffectPlan, stage: Any
 ) -> tuple[dict[str, Any], dict[str, str], str]:
     """(what the workers share, their environment, a hash of all that decides the images but for the view)."""
+    common, environment, task, stamp = renderer_inputs(workspace, settings, plan)
+    if task is not None:
+        _bake(workspace, console, run_id, stage, common, environment, task)
+    return common, environment, stamp
+
+
+def ready_inputs(workspace: Workspace, settings: Settings) -> tuple[dict[str, Any], dict[str, str]]:
+    """(what base image workers share, their environment) of a workspace whose light is baked; writes no results.
+
+    Raises UserError: ``model.base`` is not rendered, or the light is not baked or out of date.
+    """
+    if settings.model.base not in RENDERED:
+        raise UserError(f"base images of kind {settings.model.base} are not rendered")
+    common, environment, task, _ = renderer_inputs(workspace, settings, plan_of(workspace, settings))
+    if task is not None and _light_print(Path(task["output"])) != task["fingerprint"]:
+        raise UserError(f"{workspace.root}: the baked light is out of date; run `dnrpipe raytrace-selected` first")
+    return common, environment
+
+
+def renderer_inputs(
+    workspace: Workspace, settings: Settings, plan: EffectPlan
+) -> tuple[dict[str, Any], dict[str, str], dict[str, Any] | None, str]:
+    """(what the workers share, their environment, the task that bakes the light or None, a hash of all that decides
+    the images but for the view)."""
     chosen, kind = settings.base, settings.model.base
     choice = choose_variant(settings.raytrace.variant)
     if choice.variant.startswith("scalar"):
@@ -150,8 +174,7 @@ def _prepared(
             "seed": settings.raytrace.seed,
         }
         task["fingerprint"] = digest([LIGHT_VERSION, light, {k: v for k, v in task.items() if k != "output"}])
-        _bake(workspace, console, run_id, stage, common, choice.environment, task)
-        return common, choice.environment, digest([task["fingerprint"], chosen.samples, chosen.denoise])
+        return common, choice.environment, task, digest([task["fingerprint"], chosen.samples, chosen.denoise])
     direct = kind == "direct"
     common |= {
         "integrator": "path" if direct else config["integrator"],
@@ -159,7 +182,8 @@ def _prepared(
         "spp": chosen.spp,
         "seed": settings.raytrace.seed,
     }
-    return common, choice.environment, digest([kind, light, chosen.spp, chosen.samples, settings.raytrace.seed])
+    stamp = digest([kind, light, chosen.spp, chosen.samples, settings.raytrace.seed])
+    return common, choice.environment, None, stamp
 
 
 def _bake(

@@ -80,8 +80,11 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
                 "spp": traced.get("spp"),
             }
             rows.append(row)
+            files = {}
             for kind, picture in (("truth", truth), ("prediction", predicted), ("flip", heat)):
                 write_png(workspace.evaluation / f"{view.name}.{kind}.png", picture)
+                files[kind] = f"evaluation/{view.name}.{kind}.png"
+            console.events.send("picture", split="test", view=view.name, files=files, psnr=row["psnr"])
             workspace.ledger.append(_record(run_id, view, seconds, device))
             bar.advance(note=f"{row['psnr']:.2f} dB")
     torch_name = torch.cuda.get_device_name() if device.startswith("cuda") else "cpu"

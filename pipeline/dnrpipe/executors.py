@@ -154,6 +154,42 @@ class WorkerDied(RuntimeError):
     """The worker process ended or hung while a task was under way."""
 
 
+class TaskFailed(RuntimeError):
+    """The worker answered with an error; it lives on."""
+
+
+class LocalWorker:
+    """One worker process that is asked task by task, outside of :func:`run_tasks`. Not for several threads at once.
+
+    Linux kills it when the thread that asked first ends.
+
+    Args: as of :func:`run_tasks`.
+    """
+
+    def __init__(self, module: str, common: dict[str, Any], log: Path, environment: dict[str, str]) -> None:
+        self.module, self.common, self.log, self.environment = module, common, log, environment
+        self._slot = _Slot()
+
+    def ask(self, task: dict[str, Any], timeout: float) -> dict[str, Any]:
+        """The worker's answer; it is started where there is none. Raises WorkerDied, TaskFailed."""
+        if self._slot.process is None or self._slot.process.poll() is not None:
+            self.log.parent.mkdir(parents=True, exist_ok=True)
+            self._slot.process = _spawn(self.module, self.common, self.log, self.environment)
+        try:
+            answer = _ask(self._slot.process, task, timeout)
+        except WorkerDied:
+            self.close()
+            raise
+        if "error" in answer:
+            raise TaskFailed(answer["error"])
+        return answer["result"]
+
+    def close(self) -> None:
+        """End the process."""
+        _close(self._slot.process, force=True)
+        self._slot.process = None
+
+
 @dataclass
 class _Counter:
     """Tasks not answered for yet. Written by the consumer of the answers alone, read by the workers' threads."""

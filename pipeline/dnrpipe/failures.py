@@ -21,6 +21,10 @@ _EXTRAS = {
     "matplotlib": "render",
     "onnx": "export",
     "onnxruntime": "export",
+    "fastapi": "serve",
+    "uvicorn": "serve",
+    "websockets": "serve",
+    "httpx": "serve",
 }
 
 

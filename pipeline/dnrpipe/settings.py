@@ -23,7 +23,10 @@ from .effects.plan import EffectName
 from .errors import UserError
 
 ENVIRONMENT_PREFIX = "DNRPIPE_"
-ENVIRONMENT_OTHER = {"DNRPIPE_WORKSPACE", "DNRPIPE_CACHE", "DNRPIPE_PRESET"}
+ENVIRONMENT_OTHER = {
+    *("DNRPIPE_WORKSPACE", "DNRPIPE_CACHE", "DNRPIPE_PRESET"),
+    *("DNRPIPE_EVENTS", "DNRPIPE_SERVER", "DNRPIPE_TOKEN_FILE"),
+}
 
 
 class CameraSettings(Strict):

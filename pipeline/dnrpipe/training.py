@@ -149,6 +149,15 @@ def follow(
         for event in events:
             if isinstance(event, EpochEnd):
                 _book_epoch(event, stage, workspace, run_id, bar)
+                console.events.send(
+                    "epoch",
+                    stage=stage,
+                    epoch=event.epoch,
+                    epochs=event.epochs,
+                    losses=event.losses,
+                    val=event.val,
+                    seconds=event.seconds,
+                )
                 if event.skipped:
                     console.warn(f"epoch {event.epoch}: skipped {event.skipped} non-finite steps")
             elif isinstance(event, Diverged):

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from conftest import TEST, TRAIN, Scene
 from dnrtrain.contract import ContractError, SceneFrame
 from dnrtrain.correction import filter_by, from_log, to_log
-from dnrtrain.dataset import DIHEDRAL_ORDER, Batch, ViewSet, load_views
+from dnrtrain.dataset import DIHEDRAL_ORDER, Batch, ViewSet, load_views, view_in_memory
 from dnrtrain.display import DisplayTransform
 from dnrtrain.exr import read_exr, write_exr
 from dnrtrain.model import DNR, compose, render_radiance, render_views
@@ -56,6 +56,31 @@ def test_base_files_are_read_straight(scene: Scene, baked: ViewSet) -> None:
     found = channels["chain.mask"] > 0
     assert found.any() and (batch.chain_weight[0, 0].numpy() == np.where(found, np.float32(0.7), 0)).all()
     assert np.allclose(batch.chain_uv[0, 0].numpy(), np.where(found, 2 * channels["chain.U"] - 1, 0), atol=1e-6)
+
+
+@pytest.mark.parametrize("base", ["none", "raster", "baked"])
+def test_a_view_in_memory_is_as_one_from_files(scene: Scene, base: str) -> None:
+    """The same maps from arrays and from files; and the same refusals."""
+    whole, view = load(scene, base), synthetic.dome(TRAIN, 32)[2]
+    channels, _ = read_exr(scene.folder / "passes" / "0002.exr")
+    if base == "baked":
+        channels |= read_exr(scene.folder / "base" / "0002.exr")[0]
+    display = DisplayTransform(synthetic.FRAME, scene.folder)
+    found = view_in_memory(channels, synthetic.FRAME, view, display=display, base=base)  # type: ignore[arg-type]
+    expected = whole.batch([whole.index("0002")])
+    for field in dataclasses.fields(Batch):
+        one, other = getattr(found.tensors, field.name), getattr(expected, field.name)
+        if isinstance(other, torch.Tensor) and field.name != "target":
+            assert torch.equal(one, other), field.name
+        elif field.name != "target":
+            assert (one is None) == (other is None), field.name
+    assert found.names == ("0002",) and found.tensors.target is None
+    with pytest.raises(ContractError, match="missing"):
+        view_in_memory(
+            {k: v for k, v in channels.items() if k != "uv.U"}, synthetic.FRAME, view, display=display, base="none"
+        )
+    with pytest.raises(ContractError, match="32x32, its camera 16x32"):
+        view_in_memory(channels, synthetic.FRAME, view.model_copy(update={"width": 16}), display=display, base="none")
 
 
 def test_the_raster_colour_as_base(scene: Scene) -> None:

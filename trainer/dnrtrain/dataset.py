@@ -212,15 +212,8 @@ def load_views(
         raster = base == "raster" or (target and image_files is None)
         require_channels(pass_file, channels, (*INPUT_CHANNELS, *(RASTER_CHANNELS if raster else ())))
         _check_size(pass_file, channels, size, camera)
-        inputs = _stack(pass_file, channels, INPUT_CHANNELS)
-        mask = (inputs[6:7] > 0.5).float()
-        depth = ((inputs[0:1] - frame.near) / (frame.far - frame.near)).clamp(0.0, 1.0)
-        stacks["depth"].append(depth * mask)
-        stacks["normal"].append(inputs[1:4] * mask)
-        stacks["uv"].append((2.0 * inputs[4:6] - 1.0) * mask)
-        stacks["mask"].append(mask)
-        stacks["coverage"].append(inputs[7:8].clamp(0.0, 1.0))
-        stacks["view_dir"].append(torch.from_numpy(-camera.ray_directions()).permute(2, 0, 1).contiguous())
+        for name, tensor in _input_maps(pass_file, channels, frame, camera).items():
+            stacks[name].append(tensor)
         if base_files is not None:
             for name, tensor in _read_base(base_files[index], size, camera).items():
                 stacks[name].append(tensor)
@@ -242,6 +235,45 @@ def load_views(
     return ViewSet(tuple(c.name for c in cameras), np.stack([c.matrix for c in cameras]), tensors)
 
 
+def view_in_memory(
+    channels: dict[str, np.ndarray], frame: SceneFrame, camera: View, *, display: DisplayTransform, base: Base = "none"
+) -> ViewSet:
+    """One view for inference, from the channels that its pass file (and base file) would hold, float32 [H, W].
+
+    display: of ``frame``; shared between calls. base: as of :func:`load_views`; with a rendered kind ``channels`` hold
+    the base image, too. Raises ContractError: channels missing, of another size than the camera, not finite.
+    """
+    source = Path(f"view {camera.name}")
+    wanted = (*INPUT_CHANNELS, *(RASTER_CHANNELS if base == "raster" else ()))
+    rendered = base in ("baked", "direct", "path")
+    require_channels(source, channels, (*wanted, *(BASE_CHANNELS if rendered else ())))
+    _check_size(source, channels, (camera.height, camera.width), camera)
+    maps = _input_maps(source, channels, frame, camera)
+    if rendered:
+        maps |= _base_maps(_stack(source, channels, BASE_CHANNELS))
+    elif base == "raster":
+        colour = _stack(source, channels, RASTER_CHANNELS)
+        maps["base"] = _straight(colour[:3], colour[3:])
+    tensors = Batch(**{"target": None} | {name: value[None] for name, value in maps.items()})  # type: ignore[arg-type]
+    tensors = replace(tensors, display=None if base == "none" else display)
+    return ViewSet((camera.name,), camera.matrix[None], tensors)
+
+
+def _input_maps(path: Path, channels: dict[str, np.ndarray], frame: SceneFrame, camera: View) -> dict[str, Tensor]:
+    """The maps of :class:`Batch` that every view has, [C, H, W]."""
+    inputs = _stack(path, channels, INPUT_CHANNELS)
+    mask = (inputs[6:7] > 0.5).float()
+    depth = ((inputs[0:1] - frame.near) / (frame.far - frame.near)).clamp(0.0, 1.0)
+    return {
+        "depth": depth * mask,
+        "normal": inputs[1:4] * mask,
+        "uv": (2.0 * inputs[4:6] - 1.0) * mask,
+        "mask": mask,
+        "coverage": inputs[7:8].clamp(0.0, 1.0),
+        "view_dir": torch.from_numpy(-camera.ray_directions()).permute(2, 0, 1).contiguous(),
+    }
+
+
 def _read_base(path: Path, size: tuple[int, int], camera: View) -> dict[str, Tensor]:
     """A base file's maps by their name in :class:`Batch`."""
     from .exr import read_exr
@@ -249,7 +281,11 @@ def _read_base(path: Path, size: tuple[int, int], camera: View) -> dict[str, Ten
     channels, _ = read_exr(path)
     require_channels(path, channels, BASE_CHANNELS, "delete it and run the stage again")
     _check_size(path, channels, size, camera)
-    values = _stack(path, channels, BASE_CHANNELS)
+    return _base_maps(_stack(path, channels, BASE_CHANNELS))
+
+
+def _base_maps(values: Tensor) -> dict[str, Tensor]:
+    """Channels of BASE_CHANNELS [C, H, W] as maps."""
     alpha, mask = values[3:4], (values[12:13] > 0.5).float()
     return {
         "base": _straight(values[0:3], alpha),

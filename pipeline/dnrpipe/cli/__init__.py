@@ -16,6 +16,8 @@ from . import information, pictures, scene, stages
 from .ablate import ablate
 from .bench_select import bench_select
 from .export import export_gltf, export_nerf, export_onnx, export_web
+from .jobs import cancel, jobs, logs, retry, submit
+from .serve import bench_live, serve
 from .train_selector import train_selector
 from .verify import verify
 
@@ -64,6 +66,7 @@ for _command in (
     ablate,
     bench_select,
     train_selector,
+    *(serve, submit, jobs, logs, cancel, retry, bench_live),
     information.status,
     verify,
     information.costs,

@@ -50,11 +50,11 @@ class Worker:
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
         view = View.model_validate(task["view"])
         if not self.warm:
-            self._channels(view)  # compiles the kernel, which is no cost of a frame
+            self.channels(view)  # compiles the kernel, which is no cost of a frame
             self.warm = True
         self.masked = 0
         started, cpu = time.monotonic(), time.process_time()
-        channels = self._channels(view)
+        channels = self.channels(view)
         numbers = {
             "seconds": time.monotonic() - started,
             "cpu_seconds": time.process_time() - cpu,
@@ -70,8 +70,9 @@ class Worker:
         )
         return numbers
 
-    def _channels(self, view: View) -> dict[str, np.ndarray]:
-        channels = self.renderer.frame(scaled_view(view, self.engine.unit_scale))
+    def channels(self, view: View, renderer: BaseRenderer | None = None) -> dict[str, np.ndarray]:
+        """Base image and G-buffer of a view in scene units, float32 [H, W] each. renderer: one of other samples."""
+        channels = (renderer or self.renderer).frame(scaled_view(view, self.engine.unit_scale))
         channels["depth.Z"] = channels["depth.Z"] / self.engine.unit_scale
         channels["coverage"] = self._frames(view).coverage(view, channels["mask"] > 0.5)
         if self.common["kind"] != "baked":

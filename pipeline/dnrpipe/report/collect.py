@@ -79,6 +79,34 @@ class _Checkpoint(BaseModel):
     history: list[_Epoch] = Field(default_factory=list)
 
 
+class Outline(BaseModel):
+    """What a workspace holds, without pictures: quick enough to ask for while a stage runs.
+
+    psnr: dB by test view, in the order of the evaluation. costs: see :func:`dnrpipe.costs.summarise`.
+    """
+
+    sphere: Sphere | None
+    training: list[Training]
+    psnr: dict[str, float | None]
+    costs: dict[str, Any]
+
+
+def outline(root: Path) -> Outline:
+    """Read a workspace's figures. Raises UserError: a file is damaged."""
+    views = {split: _read_views(root, split) for split in ("train", "test")}
+    metrics = _read_model(root / "evaluation" / "metrics.json", Metrics, "evaluate")
+    chosen = _read_model(root / "selection.json", _Selection, "select")
+    selected = {f"train/{name}" for name in chosen.views} if chosen else None
+    return Outline(
+        sphere=_sphere(root, views, chosen, metrics),
+        training=[t for t in (_training(root, step) for step in (1, 2)) if t],
+        psnr={view.name: view.psnr for view in metrics.views} if metrics else {},
+        costs=costs.summarise(
+            costs.Ledger(root / "costs.jsonl").read(), n_candidates=len(views["train"]) or None, only=selected
+        ),
+    )
+
+
 def collect(root: Path, *, made_at: datetime | None = None) -> ReportData:
     """Read a workspace. Parts whose stage has not run are None and listed in ``missing``.
 

@@ -44,7 +44,7 @@ def render_html(data: ReportData) -> str:
         lstrip_blocks=True,
     )
     environment.filters.update(duration=words.duration, count=words.count, several=words.several)
-    script = (files / "report.js").read_text(encoding="utf-8")
+    script = "".join((files / name).read_text(encoding="utf-8") for name in ("sphere.js", "report.js"))
     script_hash = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     quality, selection = data.quality, data.selection
     return environment.get_template(TEMPLATE).render(

@@ -1,0 +1,280 @@
+"""Commands that talk to a server: submit, jobs, logs, cancel, retry."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ..errors import UserError
+from .options import options as with_options
+
+if TYPE_CHECKING:
+    from ..console import Bar, Console
+    from ..service.client import Client
+    from ..service.models import Job
+
+SERVER = [
+    click.option("--server", metavar="URL", help="Default: DNRPIPE_SERVER, else http://127.0.0.1:8420."),
+    click.option(
+        "--token-file", type=click.Path(path_type=Path), metavar="FILE", help="Default: DNRPIPE_TOKEN_FILE, if any."
+    ),
+    click.option("--json", "as_json", is_flag=True, help="Print one JSON value; messages to stderr."),
+]
+COMMANDS = ["run", "prepare", "select", "raytrace-selected", "finetune", "evaluate", "render", "report"]
+STATES = ["queued", "running", "done", "failed", "cancelled"]
+LOG_PAUSE = 0.5
+
+
+def _client(server: str | None, token_file: Path | None) -> Client:
+    import os
+
+    from ..service.client import DEFAULT_SERVER, Client
+    from ..service.tokens import read_token
+
+    named = token_file or os.environ.get("DNRPIPE_TOKEN_FILE")
+    token = read_token(Path(named)) if named else None
+    return Client(server or os.environ.get("DNRPIPE_SERVER") or DEFAULT_SERVER, token)
+
+
+@click.command()
+@click.argument("scene")
+@click.option("--stage", "command", type=click.Choice(COMMANDS), default="run", show_default=True)
+@click.option("-w", "--workspace", metavar="NAME", help="Name on the server (default: the scene's).")
+@click.option("--preset", metavar="NAME", help="draft (default), standard, paper or vanilla.")
+@click.option("--set", "assignments", multiple=True, metavar="KEY=VALUE", help="Any setting, e.g. select.budget=10.")
+@click.option("--force", is_flag=True, help="Do it again, reusing nothing.")
+@click.option("--priority", type=click.IntRange(-100, 100), default=0, show_default=True, help="Larger goes first.")
+@click.option("--hours", type=float, metavar="H", help="Stop the job after this time.")
+@click.option("--memory-mb", type=click.IntRange(64), metavar="N", help="Stop it above this memory.")
+@click.option("--disk-mb", type=click.IntRange(1), metavar="N", help="Stop it when its workspace is larger.")
+@click.option("--detach", is_flag=True, help="Do not wait for the job.")
+@with_options(SERVER)
+def submit(
+    scene: str,
+    command: str,
+    workspace: str | None,
+    preset: str | None,
+    assignments: tuple[str, ...],
+    force: bool,
+    priority: int,
+    hours: float | None,
+    memory_mb: int | None,
+    disk_mb: int | None,
+    detach: bool,
+    server: str | None,
+    token_file: Path | None,
+    as_json: bool,
+) -> None:
+    """Send a job to a server, and show its progress.
+
+    SCENE is a scene file, which is uploaded (textures must be packed into it), or a workspace's name on the server.
+    Ctrl-C stops watching; the job goes on.
+
+    \b
+    Examples:
+      dnrpipe submit scene.blend --set select.budget=25
+      dnrpipe submit scene --stage evaluate --force
+      dnrpipe submit scene.blend --server http://box:8420 --token-file token.txt --detach
+    """
+    import pydantic
+
+    from ..console import Console
+    from ..service.models import JobRequest, Limits
+
+    console = Console(json_mode=as_json)
+    path = Path(scene)
+    is_file = path.is_file()
+    if not is_file and (path.suffix or "/" in scene):
+        raise UserError(f"{scene}: no such file; give a scene file or a workspace's name")
+    settings = {}
+    for text in assignments:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise UserError(f"--set {text!r}: expected KEY=VALUE, e.g. --set finetune.step2.epochs=20")
+        settings[key.strip()] = value.strip()
+    name = workspace or _plain(path.stem if is_file else scene)
+    upload = f"{_plain(path.stem)}{path.suffix.lower()}" if is_file else None
+    fields = {"command": command, "workspace": name, "scene": upload, "preset": preset, "settings": settings}
+    try:
+        limits = Limits(seconds=3600 * hours if hours is not None else None, memory_mb=memory_mb, disk_mb=disk_mb)
+        request = JobRequest(**fields, force=force, priority=priority, limits=limits)  # type: ignore[arg-type]
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        raise UserError(f"submit: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+    with _client(server, token_file) as client:
+        if upload is not None:
+            with console.bar(f"uploading {path.name}", path.stat().st_size) as bar:
+                client.upload(path, upload, sent=bar.advance)
+        job = client.submit(request)
+        console.say(f"job {job.id}: {command} of {name}")
+        if not detach:
+            job = _follow(client, job, console)
+    console.result(job.model_dump(mode="json"))
+    _exit(job)
+
+
+@click.command()
+@click.option("--state", "states", type=click.Choice(STATES), multiple=True, help="Only these. Repeatable.")
+@click.option("-n", "--limit", type=click.IntRange(1), default=20, show_default=True, metavar="N")
+@with_options(SERVER)
+def jobs(states: tuple[str, ...], limit: int, server: str | None, token_file: Path | None, as_json: bool) -> None:
+    """List the jobs of a server, newest first.
+
+    \b
+    Examples:
+      dnrpipe jobs
+      dnrpipe jobs --state queued --state running --json
+    """
+    with _client(server, token_file) as client:
+        found = list(client.jobs(list(states), limit))  # type: ignore[arg-type]
+    if as_json:
+        click.echo(json.dumps([job.model_dump(mode="json") for job in found], indent=2))
+        return
+    for job in found:
+        click.echo(f"{job.id:>6}  {job.state:9}  {job.request.command:17}  {job.request.workspace:20}  {_how(job)}")
+    if not found:
+        click.echo("no jobs")
+
+
+@click.command()
+@click.argument("job", type=click.IntRange(1))
+@click.option("-f", "--follow", is_flag=True, help="Go on until the job has ended.")
+@with_options(SERVER)
+def logs(job: int, follow: bool, server: str | None, token_file: Path | None, as_json: bool) -> None:
+    """Print what a job's process printed.
+
+    \b
+    Examples:
+      dnrpipe logs 12
+      dnrpipe logs 12 --follow
+    """
+    from ..service.models import FINAL
+
+    with _client(server, token_file) as client:
+        offset, text = 0, ""
+        while True:
+            ended = client.job(job).state in FINAL
+            page = client.log(job, offset)
+            if as_json:
+                text += page.text
+            else:
+                click.echo(page.text, nl=False)
+            more = page.next < page.size
+            offset = page.next
+            if not more and (ended or not follow):
+                break
+            if not more:
+                time.sleep(LOG_PAUSE)
+    if as_json:
+        click.echo(json.dumps({"job": job, "text": text}))
+
+
+@click.command()
+@click.argument("job", type=click.IntRange(1))
+@with_options(SERVER)
+def cancel(job: int, server: str | None, token_file: Path | None, as_json: bool) -> None:
+    """Cancel a queued or running job; what it made is kept.
+
+    \b
+    Examples:
+      dnrpipe cancel 12
+    """
+    _act(lambda client: client.cancel(job), server, token_file, as_json)
+
+
+@click.command()
+@click.argument("job", type=click.IntRange(1))
+@with_options(SERVER)
+def retry(job: int, server: str | None, token_file: Path | None, as_json: bool) -> None:
+    """Queue a failed or cancelled job again; it goes on where it stopped.
+
+    \b
+    Examples:
+      dnrpipe retry 12
+    """
+    _act(lambda client: client.retry(job), server, token_file, as_json)
+
+
+def _act(wish: Callable[[Client], Job], server: str | None, token_file: Path | None, as_json: bool) -> None:
+    with _client(server, token_file) as client:
+        job = wish(client)
+    if as_json:
+        click.echo(json.dumps(job.model_dump(mode="json"), indent=2))
+    else:
+        wanted = job.state == "running" and job.cancel_requested
+        click.echo(f"job {job.id}: {'running, will be cancelled' if wanted else job.state}")
+
+
+def _follow(client: Client, job: Job, console: Console) -> Job:
+    """Show a job's progress as a local run would, until it has ended; returns the job as it is then."""
+    shown = _Shown(console)
+    try:
+        for event in client.events(job.id):
+            data = event.data
+            if event.kind == "progress":
+                shown.progress(data)
+            elif event.kind == "message":
+                shown.close()
+                (console.warn if data["level"] == "warning" else console.say)(data["text"])
+            elif event.kind == "state" and "why" in data and data["state"] == "queued":
+                shown.close()
+                console.say(f"job {job.id}: queued again: {data['why']}")
+    except KeyboardInterrupt:
+        console.say(f"job {job.id} goes on; `dnrpipe logs {job.id} -f` shows it, `dnrpipe cancel {job.id}` ends it")
+        raise
+    finally:
+        shown.close()
+    ended = client.job(job.id)
+    if ended.state == "done":
+        console.say(f"job {job.id}: done")
+    return ended
+
+
+class _Shown:
+    """One progress bar at a time."""
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        self.stack = ExitStack()
+        self.bar: Bar | None = None
+
+    def progress(self, data: dict[str, Any]) -> None:
+        if self.bar is None or self.bar.label != data["label"]:
+            self.close()
+            self.bar = self.stack.enter_context(self.console.bar(data["label"], data["total"], data["done"]))
+        self.bar.advance(max(0, data["done"] - self.bar.done), data["note"])
+
+    def close(self) -> None:
+        self.stack.close()
+        self.bar = None
+
+
+def _exit(job: Job) -> None:
+    if job.state == "failed":
+        raise UserError(f"job {job.id}: {job.error}")
+    if job.state == "cancelled":
+        raise UserError(f"job {job.id} was cancelled; `dnrpipe retry {job.id}` goes on")
+
+
+def _how(job: Job) -> str:
+    if job.error:
+        return job.error
+    if job.state == "running" and job.progress:
+        return f"{job.progress['label']} {job.progress['done']}/{job.progress['total']} {job.progress['note']}".rstrip()
+    return time.strftime("%F %T", time.localtime(job.finished or job.created))
+
+
+def _plain(name: str) -> str:
+    """A file's name as a name on the server."""
+    import re
+
+    plain = re.sub(r"[^A-Za-z0-9_-]", "-", name).lstrip("-_")[:64]
+    if not plain:
+        raise UserError(f"{name!r}: no name for a workspace; give one with -w")
+    return plain

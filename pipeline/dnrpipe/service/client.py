@@ -1,0 +1,217 @@
+"""A typed client of `dnrpipe serve`.
+
+with Client("http://127.0.0.1:8420") as client:
+    scene = client.upload(Path("scene.blend"))
+    job = client.submit(JobRequest(command="run", workspace="scene", scene=scene.name))
+    for event in client.events(job.id):
+        print(event.kind, event.data)
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import secrets
+import ssl
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import httpx
+from pydantic import BaseModel, TypeAdapter
+
+from ..errors import UserError
+from .models import Health, Job, JobEvent, JobPage, JobRequest, LogPage, Scene, State, WorkspaceDetail, WorkspaceSummary
+
+DEFAULT_SERVER = "http://127.0.0.1:8420"
+PATIENCE = 4.0
+"""Seconds that a server may be away (it is being started again) before that is an error."""
+PAUSE = 0.5
+LONGEST_WAIT = 60.0
+MOST_WAITS = 5
+PIECE = 1 << 20
+Answer = TypeVar("Answer", bound=BaseModel)
+
+
+class Refused(UserError):
+    """The server said no; ``status`` is HTTP's."""
+
+    def __init__(self, status: int, message: str) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+class Client:
+    """Talks to one server. Waits and asks again where it is too busy or cannot be reached for a moment.
+
+    Raises UserError: cannot be reached, or (Refused) says no.
+    """
+
+    def __init__(
+        self,
+        server: str = DEFAULT_SERVER,
+        token: str | None = None,
+        *,
+        timeout: float = 60.0,
+        patience: float = PATIENCE,
+    ) -> None:
+        self.server, self.patience = server, patience
+        headers = {"Authorization": f"Bearer {token}"} if token else {}
+        try:
+            self._http = httpx.Client(base_url=server, headers=headers, timeout=timeout, verify=_trust())
+        except (httpx.InvalidURL, ValueError) as error:
+            raise UserError(f"--server {server}: not an address ({error}); e.g. {DEFAULT_SERVER}") from None
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._http.close()
+
+    def health(self) -> Health:
+        """Whether server and workers live."""
+        return self._get("/healthz", Health)
+
+    def submit(self, request: JobRequest) -> Job:
+        """Queue a job. Sent again after a broken connection it is still one job."""
+        headers = {"Idempotency-Key": secrets.token_urlsafe(24)}
+        return self._read(self._ask("POST", "/jobs", json=request.model_dump(mode="json"), headers=headers), Job)
+
+    def job(self, job: int) -> Job:
+        return self._get(f"/jobs/{job}", Job)
+
+    def jobs(self, states: list[State] | None = None, limit: int | None = None) -> Iterator[Job]:
+        """Jobs, newest first; all of them, or ``limit``."""
+        before: int | None = None
+        given = 0
+        while True:
+            parameters: dict[str, Any] = {"state": states or [], "limit": 500}
+            page = self._get("/jobs", JobPage, parameters | ({"before": before} if before else {}))
+            for job in page.jobs:
+                if limit is not None and given >= limit:
+                    return
+                given += 1
+                yield job
+            if page.next is None:
+                return
+            before = page.next
+
+    def cancel(self, job: int) -> Job:
+        return self._read(self._ask("POST", f"/jobs/{job}/cancel"), Job)
+
+    def retry(self, job: int) -> Job:
+        return self._read(self._ask("POST", f"/jobs/{job}/retry"), Job)
+
+    def log(self, job: int, offset: int = 0) -> LogPage:
+        """At most 256 KiB of the job's log; a negative offset counts from its end."""
+        return self._get(f"/jobs/{job}/logs", LogPage, {"offset": offset})
+
+    def events(self, job: int, after: int = 0) -> Iterator[JobEvent]:
+        """The job's events until it has ended; a stream that breaks is taken up where it broke."""
+        last, deadline = after, time.monotonic() + self.patience
+        while True:
+            try:
+                for event in self._stream(job, last):
+                    if event is None:
+                        return
+                    last = event.id
+                    yield event
+                    deadline = time.monotonic() + self.patience
+            except httpx.TransportError as error:
+                if time.monotonic() > deadline:
+                    raise UserError(f"{self.server}: the event stream broke ({error})") from None
+            time.sleep(PAUSE)
+
+    def upload(self, path: Path, name: str | None = None, *, sent: Callable[[int], None] | None = None) -> Scene:
+        """Store a scene file on the server; ``sent`` is told the bytes of each piece."""
+
+        def pieces() -> Iterator[bytes]:
+            with path.open("rb") as file:
+                while piece := file.read(PIECE):
+                    yield piece
+                    if sent is not None:
+                        sent(len(piece))
+
+        headers = {"Content-Length": str(path.stat().st_size), "Content-Type": "application/octet-stream"}
+        try:
+            answer = self._http.put(f"/scenes/{name or path.name}", content=pieces(), headers=headers)
+        except httpx.TransportError as error:
+            raise UserError(f"{self.server}: the upload of {path} broke ({error}); try again") from None
+        return self._read(_checked(answer), Scene)
+
+    def workspaces(self) -> list[WorkspaceSummary]:
+        return TypeAdapter(list[WorkspaceSummary]).validate_json(self._ask("GET", "/workspaces").content)
+
+    def workspace(self, name: str) -> WorkspaceDetail:
+        return self._get(f"/workspaces/{name}", WorkspaceDetail)
+
+    def _stream(self, job: int, after: int) -> Iterator[JobEvent | None]:
+        """Events; None at the end of the job."""
+        headers = {"Last-Event-ID": str(after), "Accept": "text/event-stream"}
+        with self._http.stream("GET", f"/jobs/{job}/events", headers=headers) as answer:
+            if answer.is_error:
+                answer.read()
+            _checked(answer)
+            fields: dict[str, str] = {}
+            for line in answer.iter_lines():
+                if line:
+                    name, _, value = line.partition(":")
+                    fields[name] = value.removeprefix(" ")
+                    continue
+                if fields.get("event") == "end":
+                    yield None
+                    return
+                if "id" in fields:
+                    data = json.loads(fields["data"])
+                    moment = float(data.pop("time"))
+                    yield JobEvent(id=int(fields["id"]), job=job, time=moment, kind=fields["event"], data=data)
+                fields = {}
+
+    def _get(self, path: str, model: type[Answer], parameters: dict[str, Any] | None = None) -> Answer:
+        return self._read(self._ask("GET", path, params=parameters), model)
+
+    def _ask(self, method: str, path: str, **options: Any) -> httpx.Response:
+        """What can be asked twice: everything but uploads. Submissions carry a key."""
+        deadline, turned_away = time.monotonic() + self.patience, 0
+        while True:
+            try:
+                answer = self._http.request(method, path, **options)
+            except httpx.TransportError as error:
+                if time.monotonic() > deadline:
+                    raise UserError(
+                        f"{self.server}: cannot be reached ({error}); is `dnrpipe serve` running there?"
+                    ) from None
+                time.sleep(PAUSE)
+                continue
+            wait = answer.headers.get("retry-after", "")
+            if answer.status_code == 429 and wait.isdigit() and turned_away < MOST_WAITS:
+                turned_away += 1
+                time.sleep(min(float(wait), LONGEST_WAIT))
+                continue
+            return _checked(answer)
+
+    def _read(self, answer: httpx.Response, model: type[Answer]) -> Answer:
+        try:
+            return model.model_validate_json(answer.content)
+        except ValueError:
+            raise UserError(f"{self.server}: is not a dnrpipe server, or one of another version") from None
+
+
+@functools.cache
+def _trust() -> ssl.SSLContext:
+    """The system's certificates, read once: it takes longer than most requests."""
+    return ssl.create_default_context()
+
+
+def _checked(answer: httpx.Response) -> httpx.Response:
+    if answer.is_success:
+        return answer
+    try:
+        detail = str(answer.json()["detail"])
+    except (ValueError, KeyError, TypeError):
+        detail = f"{answer.request.method} {answer.request.url.path} was answered with {answer.status_code}"
+    raise Refused(answer.status_code, detail)

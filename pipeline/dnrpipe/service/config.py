@@ -1,0 +1,64 @@
+"""What an operator decides about a server."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from .models import Limits
+
+LOOPBACK = ("127.0.0.1", "::1", "localhost")
+
+
+class ServerConfig(BaseModel):
+    """Limits and devices of a server; handed to its worker processes as JSON.
+
+    devices: one worker each, "cpu" or "cuda:<n>". rate, burst: requests per second and at once, per client address.
+    streams: event streams and viewers open at once. viewers: workspaces viewed live at once; idle_seconds: when the
+    frame process of one that nobody looks at ends. limits: of every job, where it asks for no less.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    root: Path
+    host: str = "127.0.0.1"
+    port: int = Field(default=8420, ge=0, le=65535)
+    devices: tuple[str, ...] = ("cpu",)
+    upload_mb: int = Field(default=2048, ge=1)
+    most_scenes: int = Field(default=1000, ge=1)
+    most_workspaces: int = Field(default=1000, ge=1)
+    most_queued: int = Field(default=10_000, ge=1)
+    rate: float = Field(default=50.0, gt=0)
+    burst: int = Field(default=200, ge=1)
+    streams: int = Field(default=500, ge=1)
+    viewers: int = Field(default=2, ge=1)
+    idle_seconds: float = Field(default=300.0, gt=0)
+    free_disk_mb: int = Field(default=1024, ge=0, description="uploads and jobs are refused below this")
+    limits: Limits = Limits(seconds=24 * 3600.0, disk_mb=50 * 1024)
+
+    @property
+    def loopback(self) -> bool:
+        """Whether only this machine can reach the server."""
+        return self.host in LOOPBACK
+
+
+def default_devices() -> tuple[str, ...]:
+    """One per NVIDIA GPU that the driver lists, else the CPU."""
+    gpus = Path("/proc/driver/nvidia/gpus")
+    count = len(list(gpus.iterdir())) if gpus.is_dir() else 0
+    return tuple(f"cuda:{i}" for i in range(count)) or ("cpu",)
+
+
+def default_memory_mb() -> int | None:
+    """Four fifths of the machine's memory, MiB; None where it cannot be told."""
+    if not hasattr(os, "sysconf") or "SC_PHYS_PAGES" not in os.sysconf_names:
+        return None
+    return int(0.8 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**20)
+
+
+def tightest(job: Limits, server: Limits) -> Limits:
+    """Of each limit the smaller one; None is none."""
+    pairs = {name: (getattr(job, name), getattr(server, name)) for name in Limits.model_fields}
+    return Limits(**{name: min((v for v in pair if v is not None), default=None) for name, pair in pairs.items()})

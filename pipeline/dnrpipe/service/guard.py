@@ -1,0 +1,224 @@
+"""Who may ask, how often and how much: checked before any route sees a request.
+
+The token comes in a header (``Authorization: Bearer ...``; for WebSockets, which browsers give no headers, as the
+subprotocol ``dnrpipe.token.<token>``), is compared in constant time and is never logged. A server on the loopback
+interface needs none, but answers only to the names of that interface and to pages of its own origin: web pages that the
+user visits can neither read nor send anything (DNS rebinding, cross-site requests).
+"""
+
+from __future__ import annotations
+
+import hmac
+import json
+import logging
+import math
+import re
+import time
+from collections import OrderedDict
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlsplit
+
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+ACCESS = logging.getLogger("dnrpipe.access")
+SUBPROTOCOL = "dnrpipe.live"
+TOKEN_PREFIX = "dnrpipe.token."
+MAX_BODY = 256 * 1024
+"""Bytes of any request but an upload of a scene."""
+MAX_CLIENTS = 10_000
+REFUSALS_PER_MINUTE = 20
+OPEN_PATHS = ("/", "/healthz", "/favicon.ico")
+OPEN_PREFIX = "/static/"
+HEADERS = {
+    "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:;"
+    " connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "DENY",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "cache-control": "no-store",
+}
+
+
+@dataclass
+class Bucket:
+    """A token bucket: ``rate`` per second, at most ``size`` at once."""
+
+    rate: float
+    size: float
+    level: float
+    updated: float
+
+    def take(self, now: float) -> float:
+        """0 when one was there, else the seconds until there is one."""
+        self.level = min(self.size, self.level + (now - self.updated) * self.rate)
+        self.updated = now
+        if self.level >= 1:
+            self.level -= 1
+            return 0.0
+        return (1 - self.level) / self.rate
+
+
+class Buckets:
+    """One bucket per client; the clients that were longest silent are forgotten."""
+
+    def __init__(self, rate: float, size: float) -> None:
+        self.rate, self.size = rate, size
+        self._buckets: OrderedDict[str, Bucket] = OrderedDict()
+
+    def take(self, client: str) -> float:
+        """As :meth:`Bucket.take`."""
+        return self._bucket(client).take(time.monotonic())
+
+    def empty(self, client: str) -> bool:
+        """Whether nothing is left for ``client``; takes nothing."""
+        bucket = self._bucket(client)
+        return bucket.level + (time.monotonic() - bucket.updated) * bucket.rate < 1
+
+    def _bucket(self, client: str) -> Bucket:
+        bucket = self._buckets.pop(client, None) or Bucket(self.rate, self.size, self.size, time.monotonic())
+        self._buckets[client] = bucket
+        if len(self._buckets) > MAX_CLIENTS:
+            self._buckets.popitem(last=False)
+        return bucket
+
+
+class Guard:
+    """ASGI middleware around the application.
+
+    hosts: names that the Host header may have, without port; empty: any (then there is a token). token: wanted of every
+    request but for the open paths; None: none.
+    """
+
+    def __init__(self, app: ASGIApp, *, hosts: Iterable[str], token: str | None, rate: float, burst: int) -> None:
+        self.app = app
+        self.hosts = frozenset(hosts)
+        self.token = token.encode() if token else None
+        self.rates = Buckets(rate, burst)
+        self.refusals = Buckets(REFUSALS_PER_MINUTE / 60, REFUSALS_PER_MINUTE)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self.app(scope, receive, send)
+            return
+        headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
+        started = time.monotonic()
+        status = 0
+
+        async def sending(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+                own = {name.lower() for name, _ in message["headers"]}
+                message["headers"] = [
+                    *message["headers"],
+                    *((k.encode(), v.encode()) for k, v in HEADERS.items() if k.encode() not in own),
+                ]
+            await send(message)
+
+        refusal = self._refusal(scope, headers)
+        try:
+            if refusal is not None:
+                await _refuse(scope, sending, *refusal)
+            else:
+                await self.app(scope, self._bounded(scope, receive), sending)
+        finally:
+            ACCESS.info(
+                "request",
+                extra={
+                    "facts": {
+                        "client": _client(scope),
+                        "method": scope.get("method", "WEBSOCKET"),
+                        "path": scope["path"],
+                        "status": status,
+                        "ms": round(1000 * (time.monotonic() - started), 1),
+                    }
+                },
+            )
+
+    def _refusal(self, scope: Scope, headers: dict[str, str]) -> tuple[int, str, dict[str, str]] | None:
+        """(status, one line, headers) when the request is refused."""
+        client = _client(scope)
+        host = headers.get("host", "")
+        if self.hosts and _name_of(host) not in self.hosts:
+            return 421, f"this server does not answer to the host name {host[:80]!r}", {}
+        origin = headers.get("origin")
+        if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
+            return 403, "requests of pages from other origins are refused", {}
+        if self.token is not None and not _is_open(scope):
+            if self.refusals.empty(client):
+                return 429, "too many wrong tokens; wait a minute", {"retry-after": "60"}
+            if not hmac.compare_digest(_given_token(scope, headers), self.token):
+                self.refusals.take(client)
+                return (
+                    401,
+                    "wrong or missing token; send it as Authorization: Bearer TOKEN",
+                    {"www-authenticate": "Bearer"},
+                )
+        wait = self.rates.take(client)
+        if wait > 0:
+            return 429, "too many requests; slow down", {"retry-after": str(max(1, math.ceil(wait)))}
+        length = headers.get("content-length", "0")
+        if not _is_upload(scope) and length.isascii() and length.isdigit() and int(length) > MAX_BODY:
+            return 413, f"the request is larger than {MAX_BODY} bytes", {}
+        return None
+
+    def _bounded(self, scope: Scope, receive: Receive) -> Receive:
+        """A body without a stated length is cut off at the same size; the route then sees a broken request."""
+        if _is_upload(scope) or scope["type"] != "http":
+            return receive
+        seen = 0
+
+        async def receiving() -> Message:
+            nonlocal seen
+            message = await receive()
+            seen += len(message.get("body", b""))
+            return message if seen <= MAX_BODY else {"type": "http.disconnect"}
+
+        return receiving
+
+
+async def _refuse(scope: Scope, send: Send, status: int, reason: str, headers: dict[str, str]) -> None:
+    if scope["type"] == "websocket":
+        await send({"type": "websocket.close", "code": 1008, "reason": reason})  # before accept: 403
+        return
+    body = json.dumps({"detail": reason}).encode()
+    fields = {"content-type": "application/json", "content-length": str(len(body)), "connection": "close", **headers}
+    encoded = [(name.encode(), value.encode()) for name, value in fields.items()]
+    await send({"type": "http.response.start", "status": status, "headers": encoded})
+    await send({"type": "http.response.body", "body": body})
+
+
+def _client(scope: Scope) -> str:
+    client: Any = scope.get("client")
+    return client[0] if client else "?"
+
+
+def _name_of(host: str) -> str:
+    """``[::1]:8420`` -> ``::1``; empty where it is no host and port."""
+    found = re.fullmatch(r"(?:\[([0-9a-f:]+)\]|([a-z0-9.-]+))(?::[0-9]{1,5})?", host.lower())
+    return (found[1] or found[2]) if found else ""
+
+
+def _is_open(scope: Scope) -> bool:
+    """The dashboard's own files hold no data; it asks for the token itself."""
+    path = scope["path"]
+    return scope["type"] == "http" and (path in OPEN_PATHS or path.startswith(OPEN_PREFIX))
+
+
+def _is_upload(scope: Scope) -> bool:
+    return scope["type"] == "http" and scope["method"] == "PUT" and scope["path"].startswith("/scenes/")
+
+
+def _given_token(scope: Scope, headers: dict[str, str]) -> bytes:
+    scheme, _, value = headers.get("authorization", "").partition(" ")
+    if scheme.lower() == "bearer":
+        return value.strip().encode("utf-8", "replace")
+    if scope["type"] == "websocket":
+        for name in scope.get("subprotocols", []):
+            if name.startswith(TOKEN_PREFIX):
+                return name.removeprefix(TOKEN_PREFIX).encode("utf-8", "replace")
+    return b""

@@ -1,0 +1,181 @@
+"""The frame process: one view at a time, as a picture, in one process that keeps scene, kernels and network.
+
+A worker of :mod:`dnrpipe.executors`. What is shown (``mode``):
+
+    neural      the neural renderer's picture                 base      what it corrects
+    normal, depth, uv, albedo, coverage                       the G-buffer
+    reference   path-traced; gets better with every request for the same view
+    error       FLIP between neural and reference so far
+    nearest     the ray-traced picture of a training view
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from dnrpipe.errors import UserError
+from dnrpipe.evaluate import flip_error
+from dnrpipe.raytrace.base import BaseRenderer
+from dnrpipe.raytrace.base_worker import Worker as BaseWorker
+from dnrpipe.raytrace.engine import Engine
+from dnrpipe.raytrace.frames import Frames
+from dnrpipe.raytrace.light_worker import read_light
+from dnrpipe.settings import Settings
+from dnrpipe.training import torch_device
+from dnrtrain.checkpoint import load_model
+from dnrtrain.contract import RASTER_CHANNELS, SceneFrame, View, require_channels
+from dnrtrain.dataset import view_in_memory
+from dnrtrain.display import DisplayTransform
+from dnrtrain.exr import read_exr
+
+MODES = ("neural", "base", "reference", "error", "normal", "depth", "uv", "albedo", "coverage", "nearest")
+BASE_ONLY = ("base", "albedo")
+
+
+class Worker:
+    """Renders pictures of one workspace.
+
+    common: {"scene" folder, "frame", "checkpoint", "device" (setting), "kind" of base image, "bundle", "variant",
+    "integrator", "max_depth", "base": common of the base image worker or None}.
+    task: {"view" as JSON, "mode", "samples": rays per pixel of a base image, None for the model's own, "spp": to add to
+    a reference, "fine": best quality, "file": for nearest}; the answer is {"picture": base64, "type", "ms": {stage:
+    milliseconds}, "spp", "width", "height"}.
+    """
+
+    def __init__(self, common: dict[str, Any]) -> None:
+        import torch
+
+        self.torch = torch
+        self.common = common
+        self.kind = common["kind"]
+        self.bundle = Path(common["bundle"])
+        self.frame = SceneFrame.model_validate(common["frame"])
+        self.display = DisplayTransform(self.frame, Path(common["scene"]))
+        self.base = BaseWorker(common["base"]) if common["base"] is not None else None
+        self.engine = self.base.engine if self.base is not None else Engine(common["variant"], 0, [self.bundle])
+        if not self.engine.compiled:
+            raise UserError("the live view needs a jit variant of Mitsuba (LLVM or CUDA; see `dnrpipe doctor`)")
+        self.device = torch_device(Settings(device=common["device"]))
+        self.model = load_model(Path(common["checkpoint"]), self.device)
+        self.kernels: dict[tuple[int, int], Frames] = {}
+        self.renderers: dict[int, BaseRenderer] = {}
+        self.traced: tuple[str, np.ndarray, int] | None = None
+
+    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
+        view, mode = View.model_validate(task["view"]), task["mode"]
+        if mode in BASE_ONLY and self.base is None:
+            raise UserError(f"{mode}: this model corrects no base image")
+        ms: dict[str, float] = {}
+        spp = None
+        if mode == "nearest":
+            picture = self._timed(ms, "file", self._file, Path(task["file"]))
+        elif mode == "reference":
+            picture, spp = self._timed(ms, "path tracing", self._reference, view, int(task["spp"]))
+        else:
+            channels = self._timed(ms, "base image" if self.base else "G-buffer", self._channels, view, task["samples"])
+            if mode in ("neural", "error"):
+                picture = self._timed(ms, "network", self._neural, view, channels)
+            else:
+                picture = self._timed(ms, "colours", self._shown, mode, channels)
+            if mode == "error":
+                truth, spp = self._timed(ms, "path tracing", self._reference, view, int(task["spp"]))
+                picture = self._timed(ms, "FLIP", flip_error, truth, picture)[1]
+        data, kind = self._timed(ms, "encoding", encode, picture, bool(task["fine"]))
+        return {
+            "picture": base64.b64encode(data).decode("ascii"),
+            "type": kind,
+            "ms": {name: round(value, 2) for name, value in ms.items()},
+            "spp": spp,
+            "width": picture.shape[1],
+            "height": picture.shape[0],
+        }
+
+    @staticmethod
+    def _timed(ms: dict[str, float], name: str, function: Any, *arguments: Any) -> Any:
+        started = time.perf_counter()
+        result = function(*arguments)
+        ms[name] = 1000 * (time.perf_counter() - started)
+        return result
+
+    def _channels(self, view: View, samples: int | None) -> dict[str, np.ndarray]:
+        """Base image and G-buffer, or the G-buffer alone."""
+        if self.base is None:
+            return self._frames(view).gbuffer(view)
+        if samples is None or samples >= self.base.renderer.samples or self.kind != "baked":
+            return self.base.channels(view)
+        if samples not in self.renderers:
+            light = read_light(Path(self.common["base"]["light"]))
+            scene = self.engine.scenes[str(self.bundle)]
+            self.renderers[samples] = BaseRenderer(self.engine.mi, scene, light, samples)
+        return self.base.channels(view, self.renderers[samples])
+
+    def _neural(self, view: View, channels: dict[str, np.ndarray]) -> np.ndarray:
+        """Display RGB over white, float32 [H, W, 3] in [0, 1]."""
+        data = view_in_memory(channels, self.frame, view, display=self.display, base=self.kind)
+        with self.torch.inference_mode():
+            output = self.model(data.tensors.to(self.device))
+            return output.rgb[0].float().clamp(0, 1).permute(1, 2, 0).cpu().numpy()
+
+    def _shown(self, mode: str, channels: dict[str, np.ndarray]) -> np.ndarray:
+        """A channel as a picture over white, float32 [H, W, 3] in [0, 1]."""
+        mask = channels["mask"][..., None] > 0.5
+        if mode == "base":
+            return self._over_white(np.stack([channels[f"base.{c}"] for c in "RGBA"], axis=-1))
+        if mode == "albedo":
+            values = np.clip(np.stack([channels[f"albedo.{c}"] for c in "RGB"], axis=-1), 0, 1) ** (1 / 2.2)
+        elif mode == "normal":
+            values = 0.5 + 0.5 * np.stack([channels[f"normal.{c}"] for c in "XYZ"], axis=-1)
+        elif mode == "uv":
+            values = np.stack([channels["uv.U"], channels["uv.V"], np.zeros_like(channels["uv.U"])], axis=-1)
+        elif mode == "depth":
+            near, far = self.frame.near, self.frame.far
+            values = np.repeat(1 - np.clip((channels["depth.Z"] - near) / (far - near), 0, 1)[..., None], 3, axis=-1)
+        else:
+            return np.repeat(channels["coverage"][..., None], 3, axis=-1).astype(np.float32)
+        return np.where(mask, values, 1).astype(np.float32)
+
+    def _reference(self, view: View, spp: int) -> tuple[np.ndarray, int]:
+        """(the mean of all samples that this view has had so far, as a picture; how many those are)."""
+        key = view.model_copy(update={"name": "reference"}).model_dump_json()
+        known = self.traced if self.traced is not None and self.traced[0] == key else None
+        total, count = (known[1], known[2]) if known else (np.zeros((view.height, view.width, 4), np.float64), 0)
+        sample = np.nan_to_num(self._frames(view).path(view, spp, seed=1 + count), posinf=0.0, neginf=0.0)
+        total, count = total + np.asarray(sample, np.float64) * spp, count + spp
+        self.traced = (key, total, count)
+        return self._over_white((total / count).astype(np.float32)), count
+
+    def _frames(self, view: View) -> Frames:
+        size = (view.width, view.height)
+        if size not in self.kernels:
+            self.kernels[size] = Frames(
+                self.engine, self.bundle, self.common["integrator"], int(self.common["max_depth"]), size
+            )
+        return self.kernels[size]
+
+    def _file(self, path: Path) -> np.ndarray:
+        channels, _ = read_exr(path)
+        require_channels(path, channels, RASTER_CHANNELS, "run `dnrpipe raytrace-selected`")
+        return self._over_white(np.stack([channels[c] for c in "RGBA"], axis=-1))
+
+    def _over_white(self, rgba: np.ndarray) -> np.ndarray:
+        """Linear premultiplied RGBA [H, W, 4] -> display RGB over white, float32 [H, W, 3]."""
+        tensor = self.torch.from_numpy(np.ascontiguousarray(rgba, np.float32)).permute(2, 0, 1)[None]
+        return self.display.over_white(tensor[:, :3], tensor[:, 3:])[0].permute(1, 2, 0).numpy()
+
+
+def encode(picture: np.ndarray, fine: bool) -> tuple[bytes, str]:
+    """(bytes, media type) of display RGB [H, W, 3] in [0, 1]: JPEG in a hurry, else WebP of high quality."""
+    image = Image.fromarray((np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8))
+    buffer = io.BytesIO()
+    if fine:
+        image.save(buffer, "WEBP", quality=95, method=1)
+        return buffer.getvalue(), "image/webp"
+    image.save(buffer, "JPEG", quality=85)
+    return buffer.getvalue(), "image/jpeg"

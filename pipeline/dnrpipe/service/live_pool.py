@@ -1,0 +1,144 @@
+"""Frame processes: one per workspace that is being looked at, started when asked for, ended when idle."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+from ..errors import UserError
+from ..executors import LocalWorker, TaskFailed, WorkerDied
+from .config import ServerConfig
+from .live_pace import Pace
+from .live_scene import LiveRequest, LiveScene, open_scene
+from .root import ServiceRoot
+
+FRAME_SECONDS = 120.0
+"""The first frame loads the scene and compiles kernels; one that takes longer than this hangs."""
+TRIES = 3
+"""A process that died is replaced; on a fresh one the first recording of a kernel may fail (Dr.Jit), the second not."""
+TEND = 2.0
+REFERENCE_SPP = 4
+MOST_SPP = 1024
+
+
+class LiveSession:
+    """One workspace's frame process. Frames are made one after the other, on a thread of its own: Linux kills the
+    process when the thread that started it ends."""
+
+    def __init__(self, scene: LiveScene) -> None:
+        self.scene = scene
+        self.viewers = 0
+        self.used = time.monotonic()
+        self.pace = Pace()
+        self._warm = False
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"live-{scene.root.stem}")
+        log = scene.root / "logs" / "live.log"
+        self._worker = LocalWorker("dnrpipe.service.live_frames", scene.common, log, scene.environment)
+
+    async def frame(self, request: LiveRequest) -> dict[str, Any]:
+        """The answer of the frame process (see :mod:`.live_frames`), with ``nearest``: the training view like this.
+
+        Raises UserError: the frame cannot be made; says why.
+        """
+        self.used = time.monotonic()
+        moving = request.moving and request.mode not in ("nearest", "reference", "error")
+        size, samples = self.pace.pick(request.size) if moving else (request.size, None)
+        view = self.scene.view(request.camera, size)
+        nearest = self.scene.nearest(view)
+        if request.mode == "nearest" and nearest is None:
+            raise UserError("there is no training view")
+        task = {
+            "view": view.model_dump(mode="json"),
+            "mode": request.mode,
+            "samples": samples,
+            "spp": REFERENCE_SPP,
+            "fine": not request.moving,
+            "file": str(self.scene.root / "raytraced" / "train" / f"{nearest.name}.exr") if nearest else None,
+        }
+        started = time.perf_counter()
+        answer = await asyncio.get_running_loop().run_in_executor(self._thread, self._ask, task)
+        total = 1000 * (time.perf_counter() - started)
+        if moving:
+            self.pace.took(request.size, total)
+        return answer | {"total_ms": round(total, 1), "nearest": nearest.name if nearest else None, "samples": samples}
+
+    async def warm(self, request: LiveRequest) -> None:
+        """Compile the kernels of moving frames before the camera moves; does nothing after the first time."""
+        if not self._warm:
+            self._warm = True
+            with contextlib.suppress(UserError):  # told when the frame is asked for
+                await self.frame(request.model_copy(update={"moving": True, "mode": "neural"}))
+
+    def _ask(self, task: dict[str, Any]) -> dict[str, Any]:
+        reason = ""
+        for _ in range(TRIES):
+            try:
+                return self._worker.ask(task, FRAME_SECONDS)
+            except (TaskFailed, WorkerDied, OSError, ValueError) as error:
+                reason = " ".join(str(error).split())
+        raise UserError(f"the frame failed: {reason}; see {self.scene.root.name}/logs/live.log")
+
+    async def close(self) -> None:
+        await asyncio.get_running_loop().run_in_executor(self._thread, self._worker.close)
+        self._thread.shutdown(wait=False)
+
+
+class LivePool:
+    """At most ``config.viewers`` sessions; the one that was idle longest makes room for a new one."""
+
+    def __init__(self, config: ServerConfig, root: ServiceRoot) -> None:
+        self.config, self.root = config, root
+        self._sessions: dict[str, LiveSession] = {}
+        self._lock = asyncio.Lock()
+
+    def count(self) -> int:
+        return len(self._sessions)
+
+    @contextlib.asynccontextmanager
+    async def session(self, name: str) -> AsyncIterator[LiveSession]:
+        """The workspace's session, a fresh one where its model has changed. Raises UserError, UnknownName."""
+        path = self.root.workspace(name)
+        scene = await asyncio.to_thread(open_scene, path)
+        async with self._lock:
+            found = self._sessions.get(name)
+            if found is not None and found.scene.stamp != scene.stamp and found.viewers == 0:
+                await self._drop(name)
+                found = None
+            if found is None:
+                await self._make_room()
+                found = self._sessions[name] = LiveSession(scene)
+            found.viewers += 1
+        try:
+            yield found
+        finally:
+            found.viewers -= 1
+            found.used = time.monotonic()
+
+    async def tend(self) -> None:
+        """End sessions that nobody has looked at for a while; runs for as long as the server does."""
+        while True:
+            await asyncio.sleep(TEND)
+            async with self._lock:
+                for name, session in list(self._sessions.items()):
+                    if session.viewers == 0 and time.monotonic() - session.used > self.config.idle_seconds:
+                        await self._drop(name)
+
+    async def close(self) -> None:
+        async with self._lock:
+            for name in list(self._sessions):
+                await self._drop(name)
+
+    async def _make_room(self) -> None:
+        if len(self._sessions) < self.config.viewers:
+            return
+        idle = [(session.used, name) for name, session in self._sessions.items() if session.viewers == 0]
+        if not idle:
+            raise UserError(f"{len(self._sessions)} workspaces are being viewed, which is the limit; close one")
+        await self._drop(min(idle)[1])
+
+    async def _drop(self, name: str) -> None:
+        await self._sessions.pop(name).close()

@@ -1,0 +1,132 @@
+"""What a live view needs to know of a workspace, and cameras from what a mouse does."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from dnrtrain.contract import View, read_cameras
+
+from ..base import RENDERED, ready_inputs
+from ..cameras import framing, look_at_view
+from ..effects.store import plan_of, trace_config, variant_for
+from ..errors import UserError
+from ..scene_files import read_frame, read_summary
+from ..session import resolve_settings
+from ..settings import Settings
+from ..training import read_selection
+from ..workspace import Workspace
+
+SIZES = (64, 1024)
+STEEPEST = math.radians(89.0)
+Mode = Literal["neural", "base", "reference", "error", "normal", "depth", "uv", "albedo", "coverage", "nearest"]
+
+
+class Orbit(BaseModel):
+    """A camera that looks at ``target``, upright. Angles in radians, lengths in scene units, Z up."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    azimuth: float = Field(ge=-1e3, le=1e3)
+    elevation: float = Field(ge=-STEEPEST, le=STEEPEST)
+    distance: float = Field(gt=0, le=1e9)
+    target: tuple[float, float, float]
+
+
+class LiveRequest(BaseModel):
+    """What a viewer asks for. size: pixels of the side at rest; moving: quick is better than fine."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    camera: Orbit
+    size: int = Field(ge=SIZES[0], le=SIZES[1])
+    mode: Mode = "neural"
+    moving: bool = False
+
+
+@dataclass(frozen=True)
+class LiveScene:
+    """common, environment: of the frame process. stamp: changes when the model does. hello: told to the viewer."""
+
+    root: Path
+    stamp: str
+    common: dict[str, Any]
+    environment: dict[str, str]
+    hello: dict[str, Any]
+    settings: Settings
+    focal: float
+    """Focal length in units of the image's side."""
+    training: tuple[View, ...]
+
+    def view(self, camera: Orbit, size: int) -> View:
+        """The view of ``camera``, ``size``² pixels."""
+        ce = math.cos(camera.elevation)
+        towards = np.array(
+            [ce * math.cos(camera.azimuth), ce * math.sin(camera.azimuth), math.sin(camera.elevation)], np.float64
+        )
+        target = np.asarray(camera.target, np.float64)
+        settings = self.settings.cameras.model_copy(update={"width": size, "height": size})
+        return look_at_view("live", target + camera.distance * towards, target, self.focal * size, settings)
+
+    def nearest(self, view: View) -> View | None:
+        """The ray-traced training view that is most like ``view``: by place (in scene radii) and direction."""
+        if not self.training:
+            return None
+        radius = self.hello["radius"]
+
+        def difference(other: View) -> float:
+            place = np.linalg.norm(other.position - view.position) / radius
+            return float(place + 1 - other.matrix[:3, 2] @ view.matrix[:3, 2])
+
+        return min(self.training, key=difference)
+
+
+def open_scene(root: Path) -> LiveScene:
+    """Read a workspace for viewing. Raises UserError naming what has to run first."""
+    workspace = Workspace.open(root)
+    record = workspace.manifest.stages.get("finetune")
+    if record is None:
+        raise UserError(f"{root.name}: has no trained renderer yet; submit a job run or finetune")
+    settings = resolve_settings(workspace, {}, None)
+    kind = settings.model.base
+    if kind == "raster":
+        raise UserError(f"{root.name}: its base images are rasterised by Blender, which is too slow to look around in")
+    plan = plan_of(workspace, settings)
+    choice = variant_for(plan, settings)
+    config = trace_config(workspace, plan, choice.variant)
+    base, environment = ready_inputs(workspace, settings) if kind in RENDERED else (None, choice.environment)
+    frame, summary = read_frame(workspace), read_summary(workspace)
+    radius = float(summary["bounds"]["radius"])
+    pixels, distance = framing(summary, settings.cameras, radius)
+    names = set(read_selection(workspace)["views"])
+    views = [view for view in read_cameras(workspace.cameras("train")) if view.name in names]
+    return LiveScene(
+        root=root,
+        stamp=json.dumps([record.output, base, config], sort_keys=True),
+        common={
+            "scene": str(workspace.scene),
+            "frame": frame.model_dump(mode="json"),
+            "checkpoint": str(workspace.checkpoints("step2")),
+            "device": settings.device,
+            "kind": kind,
+            "base": base,
+            **{key: config[key] for key in ("bundle", "variant", "integrator", "max_depth")},
+        },
+        environment=environment,
+        hello={
+            "center": [float(x) for x in summary["bounds"]["center"]],
+            "radius": radius,
+            "distance": float(distance),
+            "size": min(max(settings.cameras.width, SIZES[0]), SIZES[1]),
+            "modes": [m for m in Mode.__args__ if kind != "none" or m not in ("base", "albedo")],
+        },
+        settings=settings,
+        focal=pixels / min(settings.cameras.width, settings.cameras.height),
+        training=tuple(views),
+    )

@@ -1,0 +1,207 @@
+"""What goes over the wire: jobs, events, workspaces. The OpenAPI description is made from these."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, Field
+
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
+SCENE_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}\.(blend|obj|gltf|glb|fbx|ply|stl)$"
+SETTING_PATTERN = r"^[a-z0-9_]{1,40}(\.[a-z0-9_]{1,40}){0,4}$"
+
+Command = Literal["run", "prepare", "select", "raytrace-selected", "finetune", "evaluate", "render", "report"]
+State = Literal["queued", "running", "done", "failed", "cancelled"]
+STATES: tuple[State, ...] = get_args(State)
+FINAL: tuple[State, ...] = ("done", "failed", "cancelled")
+TAKES_SCENE = ("run", "prepare")
+JobId = Annotated[int, Field(ge=1, le=2**53)]
+Name = Annotated[str, Field(pattern=NAME_PATTERN)]
+SceneName = Annotated[str, Field(pattern=SCENE_PATTERN)]
+
+
+class _Wire(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class Limits(_Wire):
+    """Where a job is stopped; None is the server's own limit.
+
+    seconds: wall time of one attempt. memory_mb: resident memory of the job's processes together, MiB.
+    disk_mb: size of the workspace, MiB.
+    """
+
+    seconds: float | None = Field(default=None, gt=0, le=30 * 86400)
+    memory_mb: int | None = Field(default=None, ge=64, le=2**24)
+    disk_mb: int | None = Field(default=None, ge=1, le=2**28)
+
+
+class JobRequest(_Wire):
+    """A stage, or all of them (``run``), on a workspace of the server.
+
+    workspace: its name; the folder is ``<root>/<name>.dnr``. scene: an uploaded scene file, for ``run`` and ``prepare``
+    of a workspace that is not there yet. settings: as ``--set``, by dotted key. priority: larger goes first.
+    retries: how often a job whose process crashed is put back into the queue by itself.
+    """
+
+    command: Command
+    workspace: Name
+    scene: SceneName | None = None
+    preset: Literal["draft", "standard", "paper", "vanilla"] | None = None
+    settings: dict[Annotated[str, Field(pattern=SETTING_PATTERN)], bool | int | float | str] = Field(
+        default_factory=dict, max_length=64
+    )
+    force: bool = False
+    priority: int = Field(default=0, ge=-100, le=100)
+    retries: int = Field(default=1, ge=0, le=10)
+    limits: Limits = Limits()
+
+
+class Job(_Wire):
+    """A job as the queue keeps it. Times are unix seconds; None: not yet.
+
+    starts: how often a process was started for it; crashes: how many of those ended by a signal, a limit aside.
+    exit_code: of the last process, negative for a signal. error: why it failed, one line. progress: the last one
+    reported.
+    """
+
+    id: JobId
+    state: State
+    request: JobRequest
+    created: float
+    started: float | None = None
+    finished: float | None = None
+    device: str | None = None
+    starts: int = 0
+    crashes: int = 0
+    cancel_requested: bool = False
+    exit_code: int | None = None
+    error: str | None = None
+    progress: dict[str, Any] | None = None
+
+
+class JobPage(_Wire):
+    """Jobs by descending id. next: pass as ``before`` for the page after this one; None: there is none."""
+
+    jobs: list[Job]
+    next: int | None
+
+
+class JobEvent(_Wire):
+    """One event of a job: those of the event stream (dnrpipe.event_stream), and ``state`` with its new state."""
+
+    id: int
+    job: int
+    time: float
+    kind: str
+    data: dict[str, Any]
+
+
+class LogPage(_Wire):
+    """Part of a job's log. offset: of its first byte; next: offset to go on from; size: of the log, bytes."""
+
+    text: str
+    offset: int
+    next: int
+    size: int
+
+
+class Scene(_Wire):
+    """An uploaded scene file. size in bytes."""
+
+    name: str
+    size: int
+    sha256: str | None = None
+
+
+class StageState(_Wire):
+    """One row of ``dnrpipe status``."""
+
+    stage: str
+    command: str
+    state: str
+    present: int
+    wanted: int
+    seconds: float | None
+
+
+class WorkspaceSummary(_Wire):
+    """A workspace under the root. problem: why it cannot be read, if so."""
+
+    name: str
+    modified: float
+    viewable: bool
+    report: bool
+    problem: str | None = None
+
+
+class Curve(_Wire):
+    """History of a training step: points are (epoch, value)."""
+
+    title: str
+    losses: dict[str, list[tuple[int, float]]]
+    psnr: list[tuple[int, float]]
+
+
+class PlacedView(_Wire):
+    """A camera, relative to the scene's centre, divided by the distance of the farthest one."""
+
+    name: str
+    role: Literal["candidate", "chosen", "test"]
+    order: int | None
+    position: tuple[float, float, float]
+    psnr: float | None
+
+
+class TestPicture(_Wire):
+    """A held-out view with pictures of the evaluation."""
+
+    __test__ = False  # not a pytest class
+
+    view: str
+    psnr: float | None
+
+
+class CostState(_Wire):
+    """Wall seconds spent so far by stage, and what tracing all candidates would have cost (None: unknown)."""
+
+    spent: dict[str, float]
+    total: float
+    traced_views: int | None
+    candidates: int | None
+    tracing_seconds: float | None
+    tracing_all_seconds: float | None
+
+
+class WorkspaceDetail(_Wire):
+    """What the dashboard shows of a workspace.
+
+    sphere: the cameras as SVG, seen from ``eye`` (azimuth, elevation in radians); None before there are any.
+    """
+
+    name: str
+    stages: list[StageState]
+    views: list[PlacedView]
+    sphere: str | None
+    eye: tuple[float, float]
+    training: list[Curve]
+    tests: list[TestPicture]
+    costs: CostState
+    viewable: bool
+    report: bool
+
+
+class Health(_Wire):
+    """workers: live worker processes by device. queued, running: jobs."""
+
+    status: Literal["ok", "degraded"]
+    version: str
+    workers: dict[str, bool]
+    queued: int
+    running: int
+
+
+class Problem(_Wire):
+    """Every refusal: what, where and what to do, in one line."""
+
+    detail: str

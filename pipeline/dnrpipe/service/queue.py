@@ -1,0 +1,312 @@
+"""The durable queue: jobs and their events in one SQLite file (write-ahead log), used by server and workers alike.
+
+    queued ──claim──► running ──► done | failed | cancelled
+       ▲                 │
+       └── crash, restart, retry
+
+A change of state is one transaction, on disk before the call returns: what was answered survives kill -9 and power
+cuts. Two jobs of one workspace never run side by side.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from ..errors import UserError
+from .models import FINAL, STATES, Job, JobEvent, JobRequest, State
+
+SCHEMA = 1
+MAX_STARTS = 6
+"""A job whose process or server died this often, without ending by itself, is given up."""
+_TABLES = """
+CREATE TABLE IF NOT EXISTS jobs (
+    id INTEGER PRIMARY KEY AUTOINCREMENT,
+    state TEXT NOT NULL,
+    workspace TEXT NOT NULL,
+    priority INTEGER NOT NULL,
+    request TEXT NOT NULL,
+    created REAL NOT NULL,
+    started REAL,
+    finished REAL,
+    device TEXT,
+    starts INTEGER NOT NULL DEFAULT 0,
+    crashes INTEGER NOT NULL DEFAULT 0,
+    cancel_requested INTEGER NOT NULL DEFAULT 0,
+    exit_code INTEGER,
+    error TEXT,
+    progress TEXT,
+    token TEXT UNIQUE
+);
+CREATE INDEX IF NOT EXISTS jobs_due ON jobs (state, priority DESC, id);
+CREATE TABLE IF NOT EXISTS events (
+    id INTEGER PRIMARY KEY AUTOINCREMENT,
+    job INTEGER NOT NULL REFERENCES jobs (id),
+    time REAL NOT NULL,
+    kind TEXT NOT NULL,
+    data TEXT NOT NULL
+);
+CREATE INDEX IF NOT EXISTS events_of_job ON events (job, id);
+"""
+_COLUMNS = (
+    "id, state, request, created, started, finished, device, starts, crashes, cancel_requested, exit_code, error,"
+    " progress"
+)
+
+
+class QueueFull(UserError):
+    """As many jobs wait as the server takes."""
+
+
+class WrongState(UserError):
+    """The job is in a state that the wish does not fit."""
+
+
+class Queue:
+    """Jobs in ``path``. Safe in threads and processes; every thread has its own connection.
+
+    Raises UserError: the file is of a newer dnrpipe, or not a queue.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._local = threading.local()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with self._writing() as db:
+                version = db.execute("PRAGMA user_version").fetchone()[0]
+                if version > SCHEMA:
+                    raise UserError(f"{path}: queue schema {version} is newer than this dnrpipe ({SCHEMA}); upgrade it")
+                for statement in _TABLES.split(";"):
+                    db.execute(statement)
+                db.execute(f"PRAGMA user_version = {SCHEMA}")
+        except sqlite3.DatabaseError as error:
+            raise UserError(f"{path}: not a job queue ({error}); move it away to start a new one") from None
+
+    def submit(self, request: JobRequest, *, most_queued: int | None = None, token: str | None = None) -> Job:
+        """Add a job; it is on disk when this returns.
+
+        token: names this wish. A second one with the same token is the same wish, sent again by a client that never
+        saw the answer: the job that is there is returned. Raises QueueFull when ``most_queued`` jobs wait.
+        """
+        with self._writing() as db:
+            if token is not None:
+                found = db.execute(f"SELECT {_COLUMNS} FROM jobs WHERE token = ?", (token,)).fetchone()
+                if found is not None:
+                    return _job(found)
+            if most_queued is not None:
+                waiting = db.execute("SELECT count(*) FROM jobs WHERE state = 'queued'").fetchone()[0]
+                if waiting >= most_queued:
+                    raise QueueFull(f"{waiting} jobs wait already, which is the limit; try again when some are done")
+            row = db.execute(
+                "INSERT INTO jobs (state, workspace, priority, request, created, token)"
+                f" VALUES ('queued', ?, ?, ?, ?, ?) RETURNING {_COLUMNS}",
+                (request.workspace, request.priority, request.model_dump_json(), time.time(), token),
+            ).fetchone()
+            _note_state(db, row["id"], "queued")
+            return _job(row)
+
+    def get(self, job: int) -> Job | None:
+        """The job, or None."""
+        row = self._db().execute(f"SELECT {_COLUMNS} FROM jobs WHERE id = ?", (job,)).fetchone()
+        return None if row is None else _job(row)
+
+    def page(
+        self, *, states: Sequence[State] = (), workspace: str | None = None, before: int | None = None, limit: int = 100
+    ) -> list[Job]:
+        """At most ``limit`` jobs by descending id, below ``before``."""
+        where, values = ["1"], []
+        if states:
+            where.append(f"state IN ({', '.join('?' * len(states))})")
+            values += list(states)
+        if workspace is not None:
+            where.append("workspace = ?")
+            values.append(workspace)
+        if before is not None:
+            where.append("id < ?")
+            values.append(before)
+        query = f"SELECT {_COLUMNS} FROM jobs WHERE {' AND '.join(where)} ORDER BY id DESC LIMIT ?"
+        return [_job(row) for row in self._db().execute(query, (*values, limit))]
+
+    def counts(self) -> dict[State, int]:
+        """How many jobs are in each state."""
+        found = dict(self._db().execute("SELECT state, count(*) FROM jobs GROUP BY state").fetchall())
+        return {state: found.get(state, 0) for state in STATES}
+
+    def claim(self, device: str) -> Job | None:
+        """Take the next job: the highest priority, then the oldest, whose workspace no job is working on."""
+        with self._writing() as db:
+            row = db.execute(
+                "UPDATE jobs SET state = 'running', device = ?, started = ?, finished = NULL, exit_code = NULL,"
+                " error = NULL, starts = starts + 1 WHERE id = (SELECT id FROM jobs WHERE state = 'queued' AND"
+                " workspace NOT IN (SELECT workspace FROM jobs WHERE state = 'running')"
+                f" ORDER BY priority DESC, id LIMIT 1) RETURNING {_COLUMNS}",
+                (device, time.time()),
+            ).fetchone()
+            if row is None:
+                return None
+            _note_state(db, row["id"], "running")
+            return _job(row)
+
+    def finish(self, job: int, state: State, *, exit_code: int | None = None, error: str | None = None) -> None:
+        """A running job has ended. Does nothing when it is not running any more."""
+        assert state in FINAL
+        with self._writing() as db:
+            changed = db.execute(
+                "UPDATE jobs SET state = ?, finished = ?, exit_code = ?, error = ? WHERE id = ? AND state = 'running'",
+                (state, time.time(), exit_code, error, job),
+            )
+            if changed.rowcount:
+                _note_state(db, job, state, error)
+
+    def put_back(self, job: int, *, crashed: bool, why: str) -> None:
+        """A running job goes back into the queue; it goes on from its checkpoints when it is claimed again."""
+        with self._writing() as db:
+            changed = db.execute(
+                "UPDATE jobs SET state = 'queued', crashes = crashes + ? WHERE id = ? AND state = 'running'",
+                (int(crashed), job),
+            )
+            if changed.rowcount:
+                _note_state(db, job, "queued", why)
+
+    def recover(self, device: str | None = None) -> list[int]:
+        """After a crash of server or worker: what was running (on ``device``) is queued again, or cancelled if that
+        was asked for. Returns the jobs that were running."""
+        with self._writing() as db:
+            rows = db.execute(
+                "SELECT id, cancel_requested, starts FROM jobs WHERE state = 'running' AND (? IS NULL OR device = ?)",
+                (device, device),
+            ).fetchall()
+            for row in rows:
+                if row["cancel_requested"]:
+                    state, error = "cancelled", None
+                elif row["starts"] >= MAX_STARTS:
+                    state, error = "failed", f"its process was lost {row['starts']} times"
+                else:
+                    state, error = "queued", None
+                finished = None if state == "queued" else time.time()
+                db.execute(
+                    "UPDATE jobs SET state = ?, error = ?, finished = ? WHERE id = ?",
+                    (state, error, finished, row["id"]),
+                )
+                _note_state(db, row["id"], state, error or "its worker was lost")
+            return [row["id"] for row in rows]
+
+    def cancel(self, job: int) -> Job:
+        """A queued job is cancelled at once, a running one when its worker sees the wish. Raises WrongState."""
+        with self._writing() as db:
+            state = _state(db, job)
+            if state in FINAL:
+                raise WrongState(f"job {job} is {state}; only queued and running jobs can be cancelled")
+            if state == "queued":
+                db.execute(
+                    "UPDATE jobs SET state = 'cancelled', finished = ?, cancel_requested = 1 WHERE id = ?",
+                    (time.time(), job),
+                )
+                _note_state(db, job, "cancelled")
+            else:
+                db.execute("UPDATE jobs SET cancel_requested = 1 WHERE id = ?", (job,))
+            return _job(db.execute(f"SELECT {_COLUMNS} FROM jobs WHERE id = ?", (job,)).fetchone())
+
+    def retry(self, job: int) -> Job:
+        """A failed or cancelled job is queued again; what it made is kept and gone on from. Raises WrongState."""
+        with self._writing() as db:
+            state = _state(db, job)
+            if state not in ("failed", "cancelled"):
+                raise WrongState(f"job {job} is {state}; only failed and cancelled jobs can be retried")
+            row = db.execute(
+                "UPDATE jobs SET state = 'queued', cancel_requested = 0, starts = 0, crashes = 0, started = NULL,"
+                f" finished = NULL, exit_code = NULL, error = NULL WHERE id = ? RETURNING {_COLUMNS}",
+                (job,),
+            ).fetchone()
+            _note_state(db, job, "queued", "retried")
+            return _job(row)
+
+    def cancel_wanted(self, job: int) -> bool:
+        """Whether someone asked to cancel the job."""
+        row = self._db().execute("SELECT cancel_requested FROM jobs WHERE id = ?", (job,)).fetchone()
+        return bool(row and row[0])
+
+    def add_events(self, job: int, events: Sequence[dict[str, Any]]) -> None:
+        """Store lines of the event stream. The last progress is kept with the job, too."""
+        if not events:
+            return
+        with self._writing() as db:
+            for event in events:
+                facts = {key: value for key, value in event.items() if key not in ("time", "kind")}
+                db.execute(
+                    "INSERT INTO events (job, time, kind, data) VALUES (?, ?, ?, ?)",
+                    (job, float(event["time"]), str(event["kind"]), json.dumps(facts)),
+                )
+                if event["kind"] == "progress":
+                    db.execute("UPDATE jobs SET progress = ? WHERE id = ?", (json.dumps(facts), job))
+
+    def events(self, job: int, after: int = 0, limit: int = 1000) -> list[JobEvent]:
+        """The job's events with an id above ``after``, oldest first."""
+        rows = self._db().execute(
+            "SELECT id, job, time, kind, data FROM events WHERE job = ? AND id > ? ORDER BY id LIMIT ?",
+            (job, after, limit),
+        )
+        return [
+            JobEvent(id=r["id"], job=r["job"], time=r["time"], kind=r["kind"], data=json.loads(r["data"])) for r in rows
+        ]
+
+    def last_event(self) -> int:
+        """Id of the newest event of any job."""
+        return int(self._db().execute("SELECT coalesce(max(id), 0) FROM events").fetchone()[0])
+
+    def close(self) -> None:
+        """Close this thread's connection."""
+        db = getattr(self._local, "db", None)
+        if db is not None:
+            db.close()
+            self._local.db = None
+
+    def _db(self) -> sqlite3.Connection:
+        db: sqlite3.Connection | None = getattr(self._local, "db", None)
+        if db is None:
+            db = sqlite3.connect(self.path, timeout=60.0, isolation_level=None)
+            db.row_factory = sqlite3.Row
+            db.execute("PRAGMA journal_mode = WAL")
+            db.execute("PRAGMA synchronous = FULL")
+            db.execute("PRAGMA foreign_keys = ON")
+            self._local.db = db
+        return db
+
+    @contextmanager
+    def _writing(self) -> Iterator[sqlite3.Connection]:
+        """One transaction that holds the file for writing."""
+        db = self._db()
+        db.execute("BEGIN IMMEDIATE")
+        try:
+            yield db
+        except BaseException:
+            db.execute("ROLLBACK")
+            raise
+        db.execute("COMMIT")
+
+
+def _state(db: sqlite3.Connection, job: int) -> State:
+    row = db.execute("SELECT state FROM jobs WHERE id = ?", (job,)).fetchone()
+    if row is None:
+        raise LookupError(job)
+    return row["state"]
+
+
+def _note_state(db: sqlite3.Connection, job: int, state: str, why: str | None = None) -> None:
+    data = json.dumps({"state": state} | ({"why": why} if why else {}))
+    db.execute("INSERT INTO events (job, time, kind, data) VALUES (?, ?, 'state', ?)", (job, time.time(), data))
+
+
+def _job(row: sqlite3.Row) -> Job:
+    facts = dict(row)
+    facts["request"] = JobRequest.model_validate_json(facts["request"])
+    facts["cancel_requested"] = bool(facts["cancel_requested"])
+    facts["progress"] = json.loads(facts["progress"]) if facts["progress"] else None
+    return Job(**facts)

@@ -1,0 +1,210 @@
+"""Jobs: submit, list, look at, cancel, retry, logs, events."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import AsyncIterator
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Header, HTTPException, Path, Query
+from fastapi.responses import StreamingResponse
+from starlette.concurrency import run_in_threadpool
+
+from ..errors import UserError
+from ..settings import merge, parse_assignment, resolve
+from .models import FINAL, TAKES_SCENE, Job, JobEvent, JobPage, JobRequest, LogPage, Name, Problem, State
+from .queue import QueueFull, WrongState
+from .root import UnknownName
+from .state import Shared
+from .state import State as Service
+
+KEEP_ALIVE = 15.0
+LOG_PIECE = 256 * 1024
+SERVERS_OWN = ("device", "strict")
+"""Settings that the server decides, or that have an argument of their own."""
+REFUSED: dict[int | str, dict[str, Any]] = {
+    code: {"model": Problem, "description": text}
+    for code, text in (
+        (400, "The request is not what HTTP wants"),
+        (401, "Wrong or missing token"),
+        (403, "A page of another origin"),
+        (413, "Too large"),
+        (421, "Not a name of this server"),
+        (422, "Not a valid request"),
+        (429, "Too many requests, or too many jobs"),
+    )
+}
+NOT_FOUND: dict[int | str, dict[str, Any]] = {404: {"model": Problem, "description": "No such thing"}}
+CONFLICT: dict[int | str, dict[str, Any]] = {409: {"model": Problem, "description": "The job's state forbids it"}}
+FULL: dict[int | str, dict[str, Any]] = {
+    503: {"model": Problem, "description": "Too many streams"},
+    507: {"model": Problem, "description": "No space left"},
+}
+JobPath = Annotated[int, Path(ge=1, le=2**53, description="The job's number")]
+
+router = APIRouter(tags=["jobs"], responses=REFUSED)
+
+
+@router.post("/jobs", status_code=201, responses=NOT_FOUND | FULL)
+def submit(
+    request: JobRequest,
+    service: Shared,
+    idempotency_key: Annotated[str | None, Header(max_length=64, pattern=r"^[A-Za-z0-9_-]{8,64}$")] = None,
+) -> Job:
+    """Put a job into the queue. It is on disk when the answer is sent.
+
+    With an Idempotency-Key, sending it again gives the job that the first time made.
+    """
+    check_request(request, service)
+    if shutil.disk_usage(service.root.folder).free < service.config.free_disk_mb * 2**20:
+        raise HTTPException(507, f"less than {service.config.free_disk_mb} MiB of disk are free; make space")
+    return service.queue.submit(request, most_queued=service.config.most_queued, token=idempotency_key)
+
+
+@router.get("/jobs")
+def list_jobs(
+    service: Shared,
+    state: Annotated[list[State] | None, Query(max_length=5)] = None,
+    workspace: Annotated[Name | None, Query()] = None,
+    before: Annotated[int | None, Query(ge=1, le=2**53)] = None,
+    limit: Annotated[int, Query(ge=1, le=500)] = 100,
+) -> JobPage:
+    """Jobs, newest first."""
+    jobs = service.queue.page(states=state or (), workspace=workspace, before=before, limit=limit + 1)
+    more = len(jobs) > limit
+    return JobPage(jobs=jobs[:limit], next=jobs[limit - 1].id if more else None)
+
+
+@router.get("/jobs/{job}", responses=NOT_FOUND)
+def get_job(job: JobPath, service: Shared) -> Job:
+    """One job."""
+    return known_job(service, job)
+
+
+@router.post("/jobs/{job}/cancel", responses=NOT_FOUND | CONFLICT)
+def cancel(job: JobPath, service: Shared) -> Job:
+    """Cancel a queued or running job. A running one stops within seconds; what it made is kept."""
+    known_job(service, job)
+    return service.queue.cancel(job)
+
+
+@router.post("/jobs/{job}/retry", responses=NOT_FOUND | CONFLICT)
+def retry(job: JobPath, service: Shared) -> Job:
+    """Queue a failed or cancelled job again. It goes on from its checkpoints."""
+    known_job(service, job)
+    return service.queue.retry(job)
+
+
+@router.get("/jobs/{job}/logs", responses=NOT_FOUND)
+def logs(
+    job: JobPath,
+    service: Shared,
+    offset: Annotated[int, Query(ge=-(2**40), le=2**40, description="Bytes; negative: from the end")] = 0,
+) -> LogPage:
+    """What the job's process printed: at most 256 KiB from ``offset``."""
+    known_job(service, job)
+    try:
+        with service.root.log(job).open("rb") as file:
+            size = file.seek(0, 2)
+            start = min(max(0, size + offset) if offset < 0 else offset, size)
+            file.seek(start)
+            data = file.read(LOG_PIECE)
+    except FileNotFoundError:
+        return LogPage(text="", offset=0, next=0, size=0)
+    return LogPage(text=data.decode("utf-8", "replace"), offset=start, next=start + len(data), size=size)
+
+
+@router.get(
+    "/jobs/{job}/events",
+    response_class=StreamingResponse,
+    responses=NOT_FOUND
+    | {
+        200: {
+            "content": {"text/event-stream": {"schema": {"type": "string"}}},
+            "description": "Server-sent events: id, event (its kind), data (JSON). Ends when the job has.",
+        },
+        503: FULL[503],
+    },
+)
+async def events(
+    job: JobPath,
+    service: Shared,
+    after: Annotated[int, Query(ge=0, le=2**53, description="Id of the last event that is known")] = 0,
+    last_event_id: Annotated[str | None, Header(max_length=32)] = None,
+) -> StreamingResponse:
+    """The job's events, those of the past first, then as they come.
+
+    A stream that broke is taken up by Last-Event-ID (which wins over ``after``): nothing is lost or sent twice.
+    """
+    await run_in_threadpool(known_job, service, job)
+    if last_event_id is not None and last_event_id.isascii() and last_event_id.isdigit():
+        after = min(int(last_event_id), 2**53)
+    stream = service.stream()
+    stream.__enter__()  # refused before the answer starts; left by the generator
+
+    async def lines() -> AsyncIterator[str]:
+        service.feed.listeners += 1
+        last = after
+        try:
+            yield "retry: 2000\n\n"
+            while True:
+                # The state first: what was booked before it became final is in the events that are read after it.
+                ended = (await run_in_threadpool(known_job, service, job)).state in FINAL
+                found = await run_in_threadpool(service.queue.events, job, last)
+                for event in found:
+                    last = event.id
+                    yield _line(event)
+                if found:
+                    continue
+                if ended:
+                    yield "event: end\ndata: {}\n\n"
+                    return
+                if not await service.feed.wait(KEEP_ALIVE):
+                    yield ": still here\n\n"
+        finally:
+            service.feed.listeners -= 1
+            stream.__exit__(None, None, None)
+
+    return StreamingResponse(lines(), media_type="text/event-stream")
+
+
+def _line(event: JobEvent) -> str:
+    data = json.dumps({"time": event.time, **event.data})
+    return f"id: {event.id}\nevent: {event.kind}\ndata: {data}\n\n"
+
+
+def known_job(service: Service, job: int) -> Job:
+    """Raises HTTPException 404."""
+    found = service.queue.get(job)
+    if found is None:
+        raise HTTPException(404, f"there is no job {job}")
+    return found
+
+
+def check_request(request: JobRequest, service: Service) -> None:
+    """Refuse at once what its command would refuse: unknown settings, scenes, workspaces.
+
+    Raises HTTPException 422, UnknownName.
+    """
+    if request.scene is not None:
+        if request.command not in TAKES_SCENE:
+            raise HTTPException(422, f"scene: {request.command} takes none; only run and prepare do")
+        service.root.scene(request.scene)
+    path = service.root.workspace(request.workspace, must_exist=request.scene is None)
+    if not path.exists() and len(service.root.workspaces()) >= service.config.most_workspaces:
+        raise HTTPException(429, f"there are {service.config.most_workspaces} workspaces already; remove some")
+    overrides: dict[str, Any] = {}
+    for key, value in request.settings.items():
+        if key.split(".")[0] in SERVERS_OWN:
+            raise HTTPException(422, f"settings: {key} is the server's to decide")
+        text = value if isinstance(value, str) else json.dumps(value)
+        overrides = merge(overrides, parse_assignment(f"{key}={text}"))
+    settings = resolve(request.preset, overrides, environment={})
+    from ..cameras import KEYWORDS
+
+    if settings.cameras.source not in KEYWORDS:
+        raise HTTPException(422, f"settings: cameras.source must be one of {', '.join(KEYWORDS)} on a server")
+
+
+__all__ = ["NOT_FOUND", "REFUSED", "QueueFull", "UnknownName", "UserError", "WrongState", "router"]

@@ -1,0 +1,145 @@
+"""The live viewer's WebSocket: ``/workspaces/<name>/live``.
+
+server  {"kind": "hello", center, radius, distance, size, modes}                  text
+client  a LiveRequest as JSON, as often as it likes; only the newest one counts   text
+server  4 bytes length of the header, little endian; header as JSON; the picture  binary
+        header: type, width, height, mode, moving, samples, spp, ms by stage, total_ms, nearest
+server  {"kind": "problem", "detail": one line}                                   text
+
+After the last request of a moving camera the view is rendered once more at full quality; a reference gets better for as
+long as nothing else is asked for.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import json
+import struct
+from typing import Annotated, Any
+
+from fastapi import APIRouter, HTTPException, Path, WebSocket, WebSocketDisconnect
+from pydantic import ValidationError
+
+from ..errors import UserError
+from .guard import SUBPROTOCOL
+from .live_pool import MOST_SPP, LiveSession
+from .live_scene import LiveRequest
+from .models import NAME_PATTERN
+from .state import get_state
+
+SETTLED = 0.2
+"""Seconds without a request after which a moving camera counts as at rest."""
+REFINED = ("reference", "error")
+REFUSED = 1008
+
+router = APIRouter()
+
+
+class Wishes:
+    """The newest request of a viewer; older ones are forgotten."""
+
+    def __init__(self) -> None:
+        self._newest: LiveRequest | None = None
+        self._news = asyncio.Event()
+        self.closed = False
+
+    def put(self, request: LiveRequest) -> None:
+        self._newest = request
+        self._news.set()
+
+    def close(self) -> None:
+        self.closed = True
+        self._news.set()
+
+    async def take(self, seconds: float | None) -> LiveRequest | None:
+        """The newest request; None when there was none for ``seconds``, or the viewer has gone."""
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(self._news.wait(), seconds)
+        self._news.clear()
+        request, self._newest = self._newest, None
+        return request
+
+
+@router.websocket("/workspaces/{name}/live")
+async def live(socket: WebSocket, name: Annotated[str, Path(pattern=NAME_PATTERN)]) -> None:
+    """Frames of a workspace for a camera that moves."""
+    service = get_state(socket)
+    offered = socket.scope.get("subprotocols", [])
+    await socket.accept(subprotocol=SUBPROTOCOL if SUBPROTOCOL in offered else None)
+    try:
+        with service.stream():
+            async with service.live.session(name) as session:
+                await socket.send_json({"kind": "hello", **session.scene.hello})
+                wishes = Wishes()
+                reading = asyncio.create_task(_read(socket, wishes))
+                try:
+                    await _answer(socket, session, wishes)
+                finally:
+                    reading.cancel()
+                    await asyncio.gather(reading, return_exceptions=True)
+    except WebSocketDisconnect:
+        return
+    except (UserError, HTTPException) as error:
+        detail = str(error.detail) if isinstance(error, HTTPException) else str(error)
+        await _close(socket, {"kind": "problem", "detail": " ".join(detail.split())})
+
+
+async def _read(socket: WebSocket, wishes: Wishes) -> None:
+    try:
+        while True:
+            text = await socket.receive_text()
+            try:
+                wishes.put(LiveRequest.model_validate_json(text))
+            except ValidationError as error:
+                first = error.errors()[0]
+                where = ".".join(str(part) for part in first["loc"])
+                await socket.send_json({"kind": "problem", "detail": f"{where}: {first['msg']}"})
+    except (WebSocketDisconnect, RuntimeError, KeyError):  # gone, or sent bytes where text is wanted
+        wishes.close()
+
+
+async def _answer(socket: WebSocket, session: LiveSession, wishes: Wishes) -> None:
+    current: LiveRequest | None = None
+    unsettled = refining = False
+    while not wishes.closed:
+        wait = 0.0 if refining else SETTLED if unsettled else None
+        request = await wishes.take(wait)
+        if wishes.closed:
+            return
+        if request is not None:
+            current = request
+        elif current is None or not (unsettled or refining):
+            continue
+        elif unsettled:
+            current = current.model_copy(update={"moving": False})
+        try:
+            answer = await session.frame(current)
+        except UserError as error:
+            await socket.send_json({"kind": "problem", "detail": str(error)})
+            unsettled = refining = False
+            continue
+        await socket.send_bytes(pack(answer, current))
+        await session.warm(current)
+        unsettled = current.moving
+        refining = current.mode in REFINED and not current.moving and (answer["spp"] or 0) < MOST_SPP
+
+
+def pack(answer: dict[str, Any], request: LiveRequest) -> bytes:
+    """Header and picture as one message."""
+    facts = {key: value for key, value in answer.items() if key != "picture"}
+    header = json.dumps({**facts, "mode": request.mode, "moving": request.moving}).encode()
+    return struct.pack("<I", len(header)) + header + base64.b64decode(answer["picture"])
+
+
+def unpack(message: bytes) -> tuple[dict[str, Any], bytes]:
+    """The inverse of :func:`pack`: (header, picture)."""
+    (length,) = struct.unpack_from("<I", message)
+    return json.loads(message[4 : 4 + length]), message[4 + length :]
+
+
+async def _close(socket: WebSocket, reason: dict[str, Any]) -> None:
+    with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+        await socket.send_json(reason)
+        await socket.close(REFUSED)

@@ -1,0 +1,198 @@
+"""Workspaces: what is there, how far it is, its pictures and its report. Scene files: upload, list, remove."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import secrets
+from collections.abc import AsyncIterator
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, HTTPException, Path, Request, Response
+from fastapi.responses import FileResponse
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect
+
+from ..errors import UserError
+from ..report.collect import outline
+from ..report.sphere import AZIMUTH, ELEVATION, sphere_svg
+from ..session import resolve_settings
+from ..stages import status
+from ..workspace import Workspace
+from .models import (
+    NAME_PATTERN,
+    SCENE_PATTERN,
+    CostState,
+    Curve,
+    PlacedView,
+    Scene,
+    StageState,
+    TestPicture,
+    WorkspaceDetail,
+    WorkspaceSummary,
+)
+from .routes_jobs import CONFLICT, FULL, NOT_FOUND, REFUSED
+from .state import Shared, State
+
+NamePath = Annotated[str, Path(pattern=NAME_PATTERN)]
+ScenePath = Annotated[str, Path(pattern=SCENE_PATTERN)]
+ViewPath = Annotated[str, Path(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}$")]
+# The page is ours, but its names come from scene files: it may run its own scripts and reach nothing.
+REPORT_POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; base-uri 'none';"
+    " form-action 'none'; frame-ancestors 'none'; sandbox allow-scripts"
+)
+PNG: dict[int | str, dict[str, Any]] = {200: {"content": {"image/png": {}}, "description": "PNG"}}
+HTML: dict[int | str, dict[str, Any]] = {200: {"content": {"text/html": {}}, "description": "One HTML file"}}
+
+router = APIRouter(tags=["workspaces"], responses=REFUSED)
+
+
+@router.get("/workspaces")
+def list_workspaces(service: Shared) -> list[WorkspaceSummary]:
+    """All workspaces of the server, by name."""
+    found = []
+    for name in service.root.workspaces():
+        path = service.root.workspace(name)
+        problem = None
+        try:
+            workspace = Workspace.open(path)
+        except UserError as error:
+            workspace, problem = None, str(error)
+        found.append(
+            WorkspaceSummary(
+                name=name,
+                modified=(path / "manifest.json").stat().st_mtime,
+                viewable=workspace is not None and "finetune" in workspace.manifest.stages,
+                report=(path / "report" / "report.html").is_file(),
+                problem=problem,
+            )
+        )
+    return found
+
+
+@router.get("/workspaces/{name}", responses=NOT_FOUND | CONFLICT)
+def get_workspace(name: NamePath, service: Shared) -> WorkspaceDetail:
+    """Stages, cameras, histories of training, held-out views and costs. 409: a file of it is damaged."""
+    path = service.root.workspace(name)
+    try:
+        workspace = Workspace.open(path)
+        rows = status(workspace, resolve_settings(workspace, {}, None))
+        known = outline(path)
+    except UserError as error:
+        raise HTTPException(409, str(error)) from None
+    tracing = known.costs["tracing_all"]
+    sphere = known.sphere
+    return WorkspaceDetail(
+        name=name,
+        stages=[StageState(**{key: row[key] for key in StageState.model_fields}) for row in rows],
+        views=[PlacedView(**view.model_dump()) for view in sphere.views] if sphere else [],
+        sphere=str(sphere_svg(sphere, "oblique")) if sphere else None,
+        eye=(AZIMUTH, ELEVATION),
+        training=[Curve(title=t.title, losses=t.losses, psnr=t.psnr) for t in known.training],
+        tests=[TestPicture(view=view, psnr=psnr) for view, psnr in known.psnr.items()],
+        costs=CostState(
+            spent={stage: part["wall_seconds"] for stage, part in known.costs["by_stage"].items()},
+            total=known.costs["total"]["wall_seconds"],
+            traced_views=tracing["views"] if tracing else None,
+            candidates=tracing["candidates"] if tracing else None,
+            tracing_seconds=tracing["actual_seconds"] if tracing else None,
+            tracing_all_seconds=tracing["all_seconds"] if tracing else None,
+        ),
+        viewable="finetune" in workspace.manifest.stages,
+        report=(path / "report" / "report.html").is_file(),
+    )
+
+
+@router.get("/workspaces/{name}/pictures/{view}/{kind}", response_class=FileResponse, responses=NOT_FOUND | PNG)
+def picture(
+    name: NamePath, view: ViewPath, kind: Literal["truth", "prediction", "flip"], service: Shared
+) -> FileResponse:
+    """A held-out view of the evaluation: ray-traced, by the neural renderer, or the FLIP error map."""
+    path = service.root.workspace(name) / "evaluation" / f"{view}.{kind}.png"
+    if not path.is_file() or not path.resolve().is_relative_to(service.root.folder):
+        raise HTTPException(404, f"{name} has no picture {kind} of view {view}")
+    return FileResponse(path, media_type="image/png")
+
+
+@router.get("/workspaces/{name}/report", response_class=FileResponse, responses=NOT_FOUND | HTML)
+def report(name: NamePath, service: Shared) -> FileResponse:
+    """The report that the last ``run`` or ``report`` made."""
+    path = service.root.workspace(name) / "report" / "report.html"
+    if not path.is_file() or not path.resolve().is_relative_to(service.root.folder):
+        raise HTTPException(404, f"{name} has no report yet; submit a job report")
+    return FileResponse(path, media_type="text/html", headers={"content-security-policy": REPORT_POLICY})
+
+
+@router.get("/scenes")
+def list_scenes(service: Shared) -> list[Scene]:
+    """Uploaded scene files, by name."""
+    found = sorted(p for p in service.root.scenes.iterdir() if p.is_file() and not p.name.startswith("."))
+    return [Scene(name=path.name, size=path.stat().st_size) for path in found]
+
+
+@router.put(
+    "/scenes/{name}",
+    status_code=201,
+    responses=CONFLICT | {507: FULL[507]},
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+        }
+    },
+)
+async def upload(name: ScenePath, request: Request, service: Shared) -> Scene:
+    """Store a scene file; the body is the file. It appears whole or not at all, and replaces one of the same name.
+
+    Textures must be packed into it. Scripts embedded in it are never run.
+    """
+    target = service.root.scene(name, must_exist=False)
+    limit = service.config.upload_mb * 2**20
+    declared = request.headers.get("content-length", "")
+    if declared.isascii() and declared.isdigit() and int(declared) > limit:
+        raise HTTPException(413, f"the file is larger than {service.config.upload_mb} MiB")
+    await run_in_threadpool(_room, service, name)
+    temporary = target.parent / f".{secrets.token_hex(8)}.part"
+    checksum, size = hashlib.sha256(), 0
+    try:
+        with temporary.open("xb") as file:
+            async for piece in _pieces(request):
+                size += len(piece)
+                if size > limit:
+                    raise HTTPException(413, f"the file is larger than {service.config.upload_mb} MiB")
+                checksum.update(piece)
+                await run_in_threadpool(file.write, piece)
+            file.flush()
+            await run_in_threadpool(os.fsync, file.fileno())
+        if size == 0:
+            raise HTTPException(422, "the body is empty; it must be the scene file")
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return Scene(name=name, size=size, sha256=checksum.hexdigest())
+
+
+@router.delete("/scenes/{name}", status_code=204, responses=NOT_FOUND)
+def remove(name: ScenePath, service: Shared) -> Response:
+    """Remove a scene file. Workspaces made from it stay as they are."""
+    service.root.scene(name).unlink(missing_ok=True)
+    return Response(status_code=204)
+
+
+def _room(service: State, name: str) -> None:
+    """Raises HTTPException 409 or 507."""
+    stored = {path.name for path in service.root.scenes.iterdir()}
+    if name not in stored and len(stored) >= service.config.most_scenes:
+        raise HTTPException(409, f"there are {service.config.most_scenes} scenes already; remove some")
+    stat = os.statvfs(service.root.scenes)
+    if stat.f_bavail * stat.f_frsize < service.config.free_disk_mb * 2**20:
+        raise HTTPException(507, f"less than {service.config.free_disk_mb} MiB of disk are free; make space")
+
+
+async def _pieces(request: Request) -> AsyncIterator[bytes]:
+    try:
+        async for piece in request.stream():
+            yield piece
+    except ClientDisconnect:
+        raise HTTPException(400, "the connection ended before the file did") from None

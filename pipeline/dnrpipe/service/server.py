@@ -1,0 +1,125 @@
+"""`dnrpipe serve`: one server per root, its workers, its log."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import uvicorn
+from filelock import FileLock, Timeout
+
+from ..errors import UserError
+from .app import create_app
+from .config import ServerConfig
+from .live_pool import LivePool
+from .queue import Queue
+from .root import ServiceRoot
+from .state import Feed, State
+from .supervisor import Supervisor
+
+SHUTDOWN_SECONDS = 3
+
+
+def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], None]) -> None:
+    """Serve until SIGTERM or Ctrl-C. ``ready`` is called with the address once requests are answered.
+
+    Raises UserError: a host that others can reach without a token, a root that another server holds, a port in use.
+    """
+    if not config.loopback and token is None:
+        raise UserError(f"--host {config.host}: others can reach it, so a token is needed; give --token-file FILE")
+    if not config.root.parent.is_dir():
+        raise UserError(f"--root {config.root}: {config.root.parent} does not exist")
+    # Jobs and the dashboard see the settings of workspaces, not those of whoever started the server.
+    for name in [n for n in os.environ if n.startswith("DNRPIPE_") and n != "DNRPIPE_CACHE"]:
+        del os.environ[name]
+    root = ServiceRoot(config.root).create()
+    config = config.model_copy(update={"root": root.folder})
+    _log_as_json()
+    with _alone(root):
+        queue = Queue(root.queue)
+        queue.recover()
+        supervisor = Supervisor(config, queue, root.private / "workers.log")
+        live = LivePool(config, root)
+        state = State(config, root, queue, supervisor, live, Feed(queue))
+        settings = uvicorn.Config(
+            create_app(state, token),
+            host=config.host,
+            port=config.port,
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            timeout_graceful_shutdown=SHUTDOWN_SECONDS,
+            ws="websockets-sansio",
+            ws_max_size=64 * 1024,
+            limit_concurrency=config.streams + 1000,
+        )
+        try:
+            socket = settings.bind_socket()
+        except SystemExit:  # uvicorn's way to say so
+            raise UserError(f"--port {config.port}: cannot be listened on at {config.host}; choose another") from None
+        host = f"[{config.host}]" if ":" in config.host else config.host
+        server = _Server(settings, lambda: ready(f"http://{host}:{socket.getsockname()[1]}"))
+        supervisor.start()
+        try:
+            with contextlib.suppress(KeyboardInterrupt):  # the usual end; uvicorn raises it again when it has shut down
+                server.run(sockets=[socket])
+        finally:
+            supervisor.stop()
+            queue.close()
+
+
+class _Server(uvicorn.Server):
+    """Tells when it answers."""
+
+    def __init__(self, config: uvicorn.Config, ready: Callable[[], None]) -> None:
+        super().__init__(config)
+        self.ready = ready
+
+    async def startup(self, sockets: Any = None) -> None:
+        await super().startup(sockets)
+        if self.started:
+            self.ready()
+
+
+@contextlib.contextmanager
+def _alone(root: ServiceRoot) -> Iterator[None]:
+    lock = FileLock(root.lock, timeout=10)  # one that was killed may need a moment to be gone
+    try:
+        lock.acquire()
+    except Timeout:
+        raise UserError(f"{root.folder}: another server works here; stop it or choose another --root") from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+class _JsonLines(logging.Formatter):
+    """One JSON object per line; facts come as ``extra={"facts": {...}}``."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        line = {
+            "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(record.created)),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+            **getattr(record, "facts", {}),
+        }
+        if record.exc_info:
+            line["traceback"] = self.formatException(record.exc_info)
+        return json.dumps(line)
+
+
+def _log_as_json() -> None:
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_JsonLines())
+    for name in ("dnrpipe", "uvicorn"):
+        logger = logging.getLogger(name)
+        logger.handlers, logger.propagate = [handler], False
+        logger.setLevel(logging.INFO if name == "dnrpipe" else logging.WARNING)

@@ -1,0 +1,85 @@
+"""What the routes of one application share."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated
+
+from fastapi import Depends, HTTPException
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import HTTPConnection
+
+from .config import ServerConfig
+from .queue import Queue
+from .root import ServiceRoot
+from .supervisor import Supervisor
+
+if TYPE_CHECKING:
+    from .live_pool import LivePool
+
+POLL = 0.1
+
+
+class Feed:
+    """Tells event streams that there is something new: one look at the queue for all of them."""
+
+    def __init__(self, queue: Queue) -> None:
+        self.queue = queue
+        self._news = asyncio.Event()
+        self._last = 0
+        self.listeners = 0
+
+    async def watch(self) -> None:
+        """Run for as long as the server does."""
+        while True:
+            await asyncio.sleep(POLL)
+            if not self.listeners:
+                continue
+            last = await run_in_threadpool(self.queue.last_event)
+            if last != self._last:
+                self._last = last
+                news, self._news = self._news, asyncio.Event()
+                news.set()
+
+    async def wait(self, seconds: float) -> bool:
+        """Until there is an event of any job; False when the time is up."""
+        try:
+            await asyncio.wait_for(self._news.wait(), seconds)
+        except TimeoutError:
+            return False
+        return True
+
+
+@dataclass
+class State:
+    """Made once per server."""
+
+    config: ServerConfig
+    root: ServiceRoot
+    queue: Queue
+    supervisor: Supervisor
+    live: LivePool
+    feed: Feed
+    streams: int = 0
+    totals: dict[str, int] = field(default_factory=dict)
+
+    @contextlib.contextmanager
+    def stream(self) -> Iterator[None]:
+        """Counts an open event stream or viewer. Raises HTTPException 503 above the limit."""
+        if self.streams >= self.config.streams:
+            raise HTTPException(503, "too many open streams; close some")
+        self.streams += 1
+        try:
+            yield
+        finally:
+            self.streams -= 1
+
+
+def get_state(connection: HTTPConnection) -> State:
+    return connection.app.state.service
+
+
+Shared = Annotated[State, Depends(get_state)]

@@ -1,0 +1,64 @@
+/* Talking to the server. The token is kept for this tab only, and sent in headers only. */
+"use strict";
+const api = (function () {
+  const TOKEN = "dnrpipe.token";
+  function headers(more) {
+    const token = sessionStorage.getItem(TOKEN);
+    return Object.assign(token ? { Authorization: "Bearer " + token } : {}, more);
+  }
+  async function ask(path, options) {
+    const answer = await fetch(path, Object.assign({}, options, { headers: headers(options && options.headers) }));
+    if (answer.status === 401) document.dispatchEvent(new CustomEvent("token-wanted"));
+    if (!answer.ok) {
+      const body = await answer.json().catch(function () { return {}; });
+      throw new Error(body.detail || path + " was answered with " + answer.status);
+    }
+    return answer;
+  }
+  return {
+    setToken: function (token) { sessionStorage.setItem(TOKEN, token); },
+    hasToken: function () { return Boolean(sessionStorage.getItem(TOKEN)); },
+    ask: ask,
+    get: async function (path) { return (await ask(path)).json(); },
+    post: async function (path, value) {
+      const body = value === undefined ? {} : { body: JSON.stringify(value), headers: { "Content-Type": "application/json" } };
+      return (await ask(path, Object.assign({ method: "POST" }, body))).json();
+    },
+    picture: async function (path) { return URL.createObjectURL(await (await ask(path)).blob()); },
+    /* Events of a job from the id `after` on, until it has ended or `signal` is aborted; takes a broken stream up. */
+    events: async function (job, signal, seen) {
+      let last = 0, ended = false;
+      while (!ended && !signal.aborted) {
+        try {
+          const answer = await ask("/jobs/" + job + "/events", { signal: signal, headers: { "Last-Event-ID": String(last) } });
+          const reader = answer.body.pipeThrough(new TextDecoderStream()).getReader();
+          let rest = "";
+          for (;;) {
+            const part = await reader.read();
+            if (part.done) break;
+            const blocks = (rest + part.value).split("\n\n");
+            rest = blocks.pop();
+            blocks.forEach(function (block) {
+              const fields = {};
+              block.split("\n").forEach(function (line) {
+                const at = line.indexOf(":");
+                if (at > 0) fields[line.slice(0, at)] = line.slice(at + 1).trim();
+              });
+              if (fields.id) last = Number(fields.id);
+              if (fields.event === "end") ended = true;
+              else if (fields.event) seen(fields.event, JSON.parse(fields.data));
+            });
+          }
+        } catch (error) {
+          if (signal.aborted) return;
+        }
+        if (!ended) await new Promise(function (done) { setTimeout(done, 1000); });
+      }
+    },
+    socket: function (path) {
+      const token = sessionStorage.getItem(TOKEN);
+      const protocols = ["dnrpipe.live"].concat(token ? ["dnrpipe.token." + token] : []);
+      return new WebSocket(location.origin.replace(/^http/, "ws") + path, protocols);
+    },
+  };
+})();

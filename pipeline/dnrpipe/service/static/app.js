@@ -1,0 +1,190 @@
+/* The dashboard: jobs, one job as it runs, one workspace. */
+"use strict";
+(function () {
+  const $ = function (id) { return document.getElementById(id); };
+  const FINAL = ["done", "failed", "cancelled"];
+  let job = null, watching = null, workspace = null, sphere = null;
+  document.documentElement.classList.add("js");
+
+  function clock(seconds) {
+    const s = Math.round(seconds);
+    return (s >= 3600 ? Math.floor(s / 3600) + ":" + String(Math.floor(s / 60) % 60).padStart(2, "0") : Math.floor(s / 60)) + ":" + String(s % 60).padStart(2, "0");
+  }
+  function problem(error) { $("problem").textContent = error.message; $("problem").hidden = false; }
+  function settled() { $("problem").hidden = true; }
+  function cell(text, tag) { const node = document.createElement(tag || "td"); node.textContent = text; return node; }
+  function button(text, act) {
+    const node = document.createElement("button");
+    node.type = "button"; node.textContent = text;
+    node.addEventListener("click", function (event) { event.stopPropagation(); Promise.resolve(act()).then(settled).then(refresh).catch(problem); });
+    return node;
+  }
+
+  document.addEventListener("token-wanted", function () { $("token-form").hidden = false; });
+  $("token-form").addEventListener("submit", function (event) {
+    event.preventDefault();
+    api.setToken($("token").value.trim());
+    $("token").value = ""; $("token-form").hidden = true;
+    refresh();
+  });
+
+  async function refresh() {
+    try {
+      const health = await api.get("/healthz");
+      $("health").textContent = health.status + " · " + health.running + " running, " + health.queued + " queued · workers: " +
+        Object.keys(health.workers).map(function (d) { return d + (health.workers[d] ? "" : " (down)"); }).join(", ");
+      showJobs((await api.get("/jobs?limit=30")).jobs);
+      showWorkspaces(await api.get("/workspaces"));
+      settled();
+    } catch (error) { problem(error); }
+  }
+  function showJobs(jobs) {
+    const body = $("jobs").tBodies[0];
+    body.replaceChildren.apply(body, jobs.map(function (entry) {
+      const row = document.createElement("tr"), state = cell(entry.state), acts = document.createElement("td");
+      row.dataset.job = entry.id;
+      row.classList.toggle("selected", entry.id === job);
+      state.className = "state-" + entry.state;
+      if (entry.error) state.title = entry.error;
+      if (!FINAL.includes(entry.state)) acts.append(button("cancel", function () { return api.post("/jobs/" + entry.id + "/cancel"); }));
+      else if (entry.state !== "done") acts.append(button("retry", function () { return api.post("/jobs/" + entry.id + "/retry"); }));
+      row.append(cell(entry.id), cell(entry.request.command + " " + entry.request.workspace), state, acts);
+      row.addEventListener("click", function () { select(entry); });
+      return row;
+    }));
+  }
+  function showWorkspaces(found) {
+    $("workspaces").replaceChildren.apply($("workspaces"), found.map(function (entry) {
+      const item = document.createElement("li");
+      item.append(button(entry.name, function () { return open(entry.name); }), entry.problem ? " " + entry.problem : "");
+      return item;
+    }));
+    const names = found.map(function (entry) { return entry.name; }), list = $("workspace"), before = list.value;
+    if (Array.from(list.options, function (o) { return o.value; }).slice(1).join() !== names.join()) {
+      list.replaceChildren.apply(list, [""].concat(names).map(function (name) { return new Option(name || "(the scene's)", name); }));
+      list.value = before;
+    }
+  }
+
+  function select(entry) {
+    if (watching) watching.abort();
+    watching = new AbortController();
+    job = entry.id;
+    const losses = {}, quality = [];
+    $("job").hidden = false;
+    $("job-title").textContent = "Job " + entry.id + ": " + entry.request.command + " " + entry.request.workspace;
+    $("bar").value = 0; $("note").textContent = entry.state; $("log").textContent = ""; $("curves").replaceChildren();
+    let drawn = 0, due = false, looked = Date.now();
+    function draw() {
+      due = false; drawn = Date.now();
+      const series = Object.keys(losses).map(function (name) { return { name: name, points: losses[name] }; });
+      $("curves").replaceChildren(plot("losses", series, true));
+      if (quality.length) $("curves").append(plot("validation, dB", [{ name: "PSNR", points: quality }], false));
+    }
+    api.events(entry.id, watching.signal, function (kind, data) {
+      if (workspace === entry.request.workspace && kind !== "state" && Date.now() - looked > 5000) {
+        looked = Date.now();  // stages and costs go on meanwhile
+        open(workspace).catch(problem);
+      }
+      if (kind === "progress") {
+        $("bar").max = data.total; $("bar").value = data.done;
+        $("note").textContent = data.label + ": " + data.done + " of " + data.total +
+          (data.seconds_left === null ? "" : ", " + clock(data.seconds_left) + " left") + (data.note ? " · " + data.note : "");
+      } else if (kind === "message") {
+        $("log").textContent += data.text + "\n";
+      } else if (kind === "epoch") {
+        Object.keys(data.losses).forEach(function (name) { (losses[name] = losses[name] || []).push([data.epoch, data.losses[name]]); });
+        if (data.val && data.val.psnr) quality.push([data.epoch, data.val.psnr]);
+        if (!due) { due = true; setTimeout(draw, Math.max(0, 300 - (Date.now() - drawn))); }
+      } else if (kind === "picture" && workspace === entry.request.workspace) {
+        open(workspace, data.view).catch(problem);
+      } else if (kind === "state") {
+        if (FINAL.includes(data.state)) {
+          $("note").textContent = data.state + (data.why ? ": " + data.why : "");
+          refresh();
+          if (workspace === entry.request.workspace) open(workspace).catch(problem);
+        }
+      }
+    }).catch(problem);
+    open(entry.request.workspace).catch(function () { $("detail").hidden = true; });
+    refresh();
+  }
+
+  async function open(name, view) {
+    const found = await api.get("/workspaces/" + name);
+    workspace = name;
+    $("detail").hidden = false;
+    $("detail-title").textContent = name;
+    $("open-viewer").hidden = !found.viewable;
+    $("open-viewer").href = "/static/viewer.html?w=" + name;
+    $("open-report").hidden = !found.report;
+    $("open-report").href = "/workspaces/" + name + "/report";
+    const body = $("stages").tBodies[0];
+    body.replaceChildren.apply(body, found.stages.map(function (stage) {
+      const row = document.createElement("tr");
+      row.append(cell(stage.command), cell(stage.state), cell(stage.present + " of " + stage.wanted), cell(stage.seconds === null ? "" : clock(stage.seconds)));
+      return row;
+    }));
+    const costs = found.costs, spent = Object.keys(costs.spent).map(function (k) { return k + " " + clock(costs.spent[k]); });
+    $("cost").textContent = "Cost so far " + clock(costs.total) + " (" + spent.join(", ") + ")." + (costs.traced_views === null ? "" :
+      " Ray-traced " + costs.traced_views + " of " + costs.candidates + " candidates in " + clock(costs.tracing_seconds) + "; all would have cost " + clock(costs.tracing_all_seconds) + ".");
+    $("sphere").hidden = !found.sphere;
+    if (found.sphere && found.sphere !== sphere) {  // else it stays as it was turned
+      sphere = found.sphere;
+      $("sphere").dataset.eye = found.eye.join(" ");
+      $("sphere").innerHTML = found.sphere;  // made by the server from numbers and escaped names
+      turnSphere($("sphere").querySelector("svg"));
+    }
+    $("history").replaceChildren.apply($("history"), found.training.map(function (step) {
+      return plot(step.title, Object.keys(step.losses).map(function (name) { return { name: name, points: step.losses[name] }; }), true);
+    }));
+    $("pictures").hidden = !found.tests.length;
+    if (found.tests.length) {
+      view = view || $("view").value;
+      $("view").replaceChildren.apply($("view"), found.tests.map(function (t) {
+        return new Option(t.view + (t.psnr === null ? "" : ", " + t.psnr.toFixed(2) + " dB"), t.view);
+      }));
+      if (found.tests.some(function (t) { return t.view === view; })) $("view").value = view;
+      await pictures();
+    }
+  }
+  async function pictures() {
+    const path = "/workspaces/" + workspace + "/pictures/" + $("view").value + "/";
+    for (const kind of ["truth", "prediction"]) {
+      URL.revokeObjectURL($(kind).src);
+      $(kind).src = await api.picture(path + kind);
+    }
+    $("psnr").textContent = "Held-out view " + $("view").selectedOptions[0].text;
+  }
+  $("view").addEventListener("change", function () { pictures().catch(problem); });
+  $("split").addEventListener("input", function () { $("split").parentElement.style.setProperty("--split", $("split").value + "%"); });
+  $("open-report").addEventListener("click", async function (event) {
+    if (!api.hasToken()) return;  // a link carries no token: fetched, and saved as a file
+    event.preventDefault();
+    const link = document.createElement("a");
+    link.href = await api.picture("/workspaces/" + workspace + "/report");
+    link.download = workspace + ".html";
+    link.click();
+  });
+
+  $("submit").addEventListener("submit", async function (event) {
+    event.preventDefault();
+    try {
+      const file = $("file").files[0], budget = $("budget").value, request = { command: $("command").value, workspace: $("workspace").value, settings: {} };
+      if (file) {
+        const dot = file.name.lastIndexOf("."), stem = file.name.slice(0, dot).replace(/[^A-Za-z0-9_-]/g, "-").replace(/^[-_]+/, "").slice(0, 64);
+        request.scene = stem + file.name.slice(dot).toLowerCase();
+        request.workspace = request.workspace || stem;
+        $("upload").textContent = "uploading " + file.name;
+        await api.ask("/scenes/" + request.scene, { method: "PUT", body: file, headers: { "Content-Type": "application/octet-stream" } });
+      }
+      if (budget) request.settings["select.budget"] = Number(budget);
+      const made = await api.post("/jobs", request);
+      $("upload").textContent = "job " + made.id;
+      select(made);
+    } catch (error) { $("upload").textContent = ""; problem(error); }
+  });
+
+  refresh();
+  setInterval(function () { if (!document.hidden) refresh(); }, 3000);
+})();

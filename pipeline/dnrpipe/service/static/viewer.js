@@ -1,0 +1,128 @@
+/* The live viewer: a camera that the mouse moves; the server sends pictures. One request is under way at a time. */
+"use strict";
+(function () {
+  const $ = function (id) { return document.getElementById(id); };
+  const NAMES = { neural: "neural", base: "base image", reference: "path-traced (gets better)", error: "error (FLIP)", nearest: "nearest training view" };
+  const STEEPEST = 89 * Math.PI / 180, SETTLED = 150;
+  const name = new URLSearchParams(location.search).get("w") || "";
+  const canvas = $("picture"), pen = canvas.getContext("2d");
+  let socket = null, hello = null, camera = null, waiting = false, wanted = false, moving = false, timer = null, mode = "neural", frames = [];
+  $("title").textContent = name;
+
+  function problem(text) { $("problem").textContent = text; $("problem").hidden = !text; }
+  function home() {
+    camera = { azimuth: -Math.PI / 3, elevation: 0.44, distance: hello.distance, target: hello.center.slice() };
+    ask(false);
+  }
+  function ask(inMotion) {
+    moving = inMotion;
+    if (!hello || socket.readyState !== WebSocket.OPEN) return;
+    if (waiting) { wanted = true; return; }
+    waiting = true; wanted = false;
+    socket.send(JSON.stringify({ camera: camera, size: Number($("size").value), mode: mode, moving: moving }));
+  }
+  function moved() {
+    camera.elevation = Math.max(-STEEPEST, Math.min(STEEPEST, camera.elevation));
+    clearTimeout(timer);
+    timer = setTimeout(function () { ask(false); }, SETTLED);
+    ask(true);
+  }
+
+  function connect() {
+    socket = api.socket("/workspaces/" + encodeURIComponent(name) + "/live");
+    socket.binaryType = "arraybuffer";
+    socket.onmessage = function (event) {
+      if (typeof event.data === "string") {
+        const told = JSON.parse(event.data);
+        if (told.kind === "hello") {
+          hello = told; problem(""); $("status").textContent = "loading the scene";
+          choices();
+          if (camera) ask(false); else home();
+        } else { waiting = false; problem(told.detail); $("status").textContent = ""; }
+        return;
+      }
+      waiting = false;
+      problem("");
+      show(event.data);
+      if (wanted) ask(moving);
+    };
+    socket.onclose = function () {
+      waiting = false; $("status").textContent = "not connected; trying again";
+      setTimeout(connect, 2000);
+    };
+  }
+  async function show(message) {
+    const length = new DataView(message).getUint32(0, true);
+    const header = JSON.parse(new TextDecoder().decode(new Uint8Array(message, 4, length)));
+    const picture = await createImageBitmap(new Blob([new Uint8Array(message, 4 + length)], { type: header.type }));
+    if (canvas.width !== picture.width) { canvas.width = picture.width; canvas.height = picture.height; }
+    pen.drawImage(picture, 0, 0);
+    picture.close();
+    canvas.dataset.frames = Number(canvas.dataset.frames || 0) + 1;
+    canvas.dataset.fine = header.moving ? "" : "yes";
+    canvas.dataset.mode = header.mode;
+    const now = performance.now();
+    frames = frames.filter(function (t) { return now - t < 2000; }).concat(now);
+    const pace = frames.length > 1 ? (frames.length - 1) / (now - frames[0]) * 1000 : 0;
+    $("status").textContent = header.width + "²" + (header.samples ? ", " + header.samples + " rays" : "") + (header.spp ? ", " + header.spp + " spp" : "") +
+      (header.moving ? ", " + pace.toFixed(1) + " frames/s" : ", full quality") + (header.nearest ? " · nearest training view " + header.nearest : "");
+    const rows = Object.entries(header.ms).concat([["altogether", header.total_ms]]).map(function (entry) {
+      const row = document.createElement("tr"), head = document.createElement("th"), value = document.createElement("td");
+      head.textContent = entry[0]; value.textContent = entry[1].toFixed(1) + " ms";
+      row.append(head, value);
+      return row;
+    });
+    $("times").tBodies[0].replaceChildren.apply($("times").tBodies[0], rows);
+  }
+  function choices() {
+    if ($("modes").querySelector("input")) return;
+    hello.modes.forEach(function (key) {
+      const label = document.createElement("label"), input = document.createElement("input");
+      input.type = "radio"; input.name = "mode"; input.value = key; input.checked = key === mode;
+      input.addEventListener("change", function () { mode = key; ask(false); });
+      label.append(input, " " + (NAMES[key] || key));
+      $("modes").append(label);
+    });
+    if ([128, 256, 384, 512].includes(hello.size)) $("size").value = String(hello.size);
+  }
+
+  function pan(dx, dy) {
+    const a = camera.azimuth, e = camera.elevation, step = camera.distance / canvas.clientHeight;
+    const right = [-Math.sin(a), Math.cos(a), 0], up = [-Math.sin(e) * Math.cos(a), -Math.sin(e) * Math.sin(a), Math.cos(e)];
+    camera.target = camera.target.map(function (t, i) { return t + step * (up[i] * dy - right[i] * dx); });
+  }
+  let drag = null;
+  canvas.addEventListener("contextmenu", function (event) { event.preventDefault(); });
+  canvas.addEventListener("pointerdown", function (event) {
+    if (!camera) return;
+    drag = { x: event.clientX, y: event.clientY, pan: event.button !== 0 || event.shiftKey };
+    canvas.setPointerCapture(event.pointerId);
+  });
+  canvas.addEventListener("pointermove", function (event) {
+    if (!drag) return;
+    const dx = event.clientX - drag.x, dy = event.clientY - drag.y;
+    drag.x = event.clientX; drag.y = event.clientY;
+    if (drag.pan) pan(dx, dy);
+    else { camera.azimuth -= dx * 0.008; camera.elevation += dy * 0.008; }
+    moved();
+  });
+  ["pointerup", "pointercancel"].forEach(function (kind) { canvas.addEventListener(kind, function () { drag = null; }); });
+  canvas.addEventListener("wheel", function (event) {
+    event.preventDefault();
+    if (!camera) return;
+    camera.distance = Math.max(0.05 * hello.radius, Math.min(50 * hello.radius, camera.distance * Math.exp(event.deltaY * 0.001)));
+    moved();
+  }, { passive: false });
+  canvas.addEventListener("keydown", function (event) {
+    if (!camera) return;
+    const keys = { ArrowLeft: [0.06, 0, 1], ArrowRight: [-0.06, 0, 1], ArrowUp: [0, 0.06, 1], ArrowDown: [0, -0.06, 1], "+": [0, 0, 0.95], "-": [0, 0, 1.05] };
+    const found = keys[event.key];
+    if (!found) return;
+    event.preventDefault();
+    camera.azimuth += found[0]; camera.elevation += found[1]; camera.distance *= found[2];
+    moved();
+  });
+  $("home").addEventListener("click", home);
+  $("size").addEventListener("change", function () { ask(false); });
+  connect();
+})();

@@ -1,0 +1,240 @@
+"""The worker process of one device: takes a job, runs it as a command of its own, watches it, says how it ended.
+
+``python -m dnrpipe.service.worker DEVICE SERVER_PID``, with the server's configuration as JSON on standard input. The
+job's process leads a session of its own and dies with the worker, and the worker with the server: after kill -9 nothing
+goes on unseen, and the next server queues the job again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from ..errors import UserError
+from ..event_stream import VARIABLE
+from ..executors import die_with_parent
+from ..workspace import LOCK_FILES
+from .config import ServerConfig, tightest
+from .models import Job, Limits
+from .processes import end_group, folder_mb, session_memory_mb
+from .queue import MAX_STARTS, Queue
+from .root import ServiceRoot
+
+IDLE = 0.3
+WATCH = 0.2
+DISK_INTERVAL = 5.0
+UNLOCK_SECONDS = 10.0
+"""How long a workspace may still be held by the processes of a worker that was killed."""
+INTERRUPTED = 130
+
+
+class Worker:
+    """One device's share of the queue."""
+
+    def __init__(self, config: ServerConfig, device: str) -> None:
+        self.config, self.device = config, device
+        self.root = ServiceRoot(config.root)
+        self.queue = Queue(self.root.queue)
+        self.stopping = False
+
+    def run(self) -> None:
+        """Work until SIGTERM; then the running job is put back into the queue."""
+        self.queue.recover(self.device)
+        while not self.stopping:
+            job = self.queue.claim(self.device)
+            if job is None:
+                time.sleep(IDLE)
+                continue
+            try:
+                self._carry_out(job)
+            except (UserError, OSError) as error:  # cannot be started: the job's failure, not the worker's end
+                self.queue.finish(job.id, "failed", error=" ".join(str(error).split()))
+
+    def stop(self, *_: Any) -> None:
+        self.stopping = True
+
+    def _carry_out(self, job: Job) -> None:
+        workspace = self.root.workspace(job.request.workspace, must_exist=False)
+        command = job_command(job, self.root)
+        _await_lock(workspace)
+        events = self.root.events(job.id)
+        events.write_bytes(b"")  # what an earlier attempt told is in the queue already
+        with self.root.log(job.id).open("ab") as log:
+            log.write(f"--- {time.strftime('%F %T')} start {job.starts} on {self.device}\n".encode())
+            log.flush()
+            process = subprocess.Popen(
+                command,
+                cwd=self.root.folder,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=job_environment(self.device, events),
+                start_new_session=True,
+                preexec_fn=_die_with(os.getpid()),
+            )
+        limits = tightest(job.request.limits, self.config.limits)
+        ended = self._watch(job, process, workspace, limits, EventReader(events))
+        self._settle(job, process.returncode, ended)
+
+    def _watch(
+        self, job: Job, process: subprocess.Popen[bytes], workspace: Path, limits: Limits, events: EventReader
+    ) -> str | None:
+        """Wait for the end. Returns why the job was ended: None by itself, "cancelled", "stopping", or a limit."""
+        started, disk_due = time.monotonic(), 0.0
+        ended = None
+        while process.poll() is None:
+            self.queue.add_events(job.id, events.read())
+            now = time.monotonic()
+            if self.queue.cancel_wanted(job.id):
+                ended = "cancelled"
+            elif self.stopping:
+                ended = "stopping"
+            elif limits.seconds is not None and now - started > limits.seconds:
+                ended = f"took longer than its limit of {limits.seconds:g} s"
+            elif limits.memory_mb is not None and session_memory_mb(process.pid) > limits.memory_mb:
+                ended = f"used more than its limit of {limits.memory_mb} MiB of memory"
+            elif limits.disk_mb is not None and now >= disk_due:
+                disk_due = now + DISK_INTERVAL
+                if folder_mb(workspace) > limits.disk_mb:
+                    ended = f"its workspace is larger than its limit of {limits.disk_mb} MiB"
+            if ended is not None:
+                end_group(process)
+                break
+            time.sleep(WATCH)
+        end_group(process, grace=0)  # helpers that outlived their command
+        self.queue.add_events(job.id, events.read())
+        return ended
+
+    def _settle(self, job: Job, code: int, ended: str | None) -> None:
+        queue = self.queue
+        if code == 0 and ended in (None, "cancelled", "stopping"):  # it was quicker than the wish
+            queue.finish(job.id, "done", exit_code=0)
+        elif ended == "cancelled":
+            queue.finish(job.id, "cancelled", exit_code=code)
+        elif ended == "stopping":
+            queue.put_back(job.id, crashed=False, why="the server was stopped")
+        elif ended is not None:
+            queue.finish(job.id, "failed", exit_code=code, error=f"{ended}; raise it and retry to go on")
+        elif code < 0 and job.crashes < job.request.retries and job.starts < MAX_STARTS:
+            queue.put_back(job.id, crashed=True, why=f"its process was killed by {_signal_name(-code)}")
+        else:
+            queue.finish(job.id, "failed", exit_code=code, error=_reason(self.root.log(job.id), code))
+
+
+class EventReader:
+    """New whole lines of a job's event stream. Of several progress reports in a row only the last one is kept."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.offset = path, 0
+
+    def read(self) -> list[dict[str, Any]]:
+        with self.path.open("rb") as file:
+            file.seek(self.offset)
+            data = file.read(4 << 20)
+        whole = data.rfind(b"\n") + 1
+        self.offset += whole
+        found: list[dict[str, Any]] = []
+        for line in data[:whole].splitlines():
+            try:
+                event = json.loads(line)
+                event["time"], event["kind"] = float(event["time"]), str(event["kind"])
+            except (ValueError, KeyError, TypeError):
+                continue
+            before = found[-1] if found else {}
+            if event["kind"] == before.get("kind") == "progress" and before.get("label") == event.get("label"):
+                found.pop()
+            found.append(event)
+        return found
+
+
+def job_command(job: Job, root: ServiceRoot) -> list[str]:
+    """The command line of a job. ``--force`` is given at its first start only: later ones go on."""
+    request = job.request
+    workspace = root.workspace(request.workspace, must_exist=False)
+    command = [sys.executable, "-m", "dnrpipe.cli", request.command]
+    if request.scene is not None:
+        command.append(str(root.scene(request.scene)))
+    command += ["-w", str(workspace), "--json"]
+    if request.preset is not None:
+        command += ["--preset", request.preset]
+    for key, value in request.settings.items():
+        command += ["--set", f"{key}={value if isinstance(value, str) else json.dumps(value)}"]
+    if request.force and job.starts == 1:
+        command.append("--force")
+    return command
+
+
+def job_environment(device: str, events: Path) -> dict[str, str]:
+    """The worker's environment without settings of whoever started the server, on the worker's device."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("DNRPIPE_") or k == "DNRPIPE_CACHE"}
+    if device.startswith("cuda:"):
+        kept |= {"CUDA_VISIBLE_DEVICES": device.removeprefix("cuda:"), "DNRPIPE_DEVICE": "cuda"}
+    else:
+        kept |= {"DNRPIPE_DEVICE": "cpu"}
+    return kept | {VARIABLE: str(events), "PYTHONUNBUFFERED": "1"}
+
+
+def _die_with(parent: int) -> Callable[[], None]:
+    """What a job's process does before it becomes the command; ``parent`` may be dead already, and tell no more."""
+
+    def prepare() -> None:
+        die_with_parent()
+        if os.getppid() != parent:
+            os._exit(1)
+
+    return prepare
+
+
+def _await_lock(workspace: Path) -> None:
+    """The processes of a worker that was killed may need a moment to be gone; who else holds the workspace is told
+    by the command itself."""
+    if workspace.is_dir():
+        with contextlib.suppress(Timeout), FileLock(workspace / LOCK_FILES[0], timeout=UNLOCK_SECONDS):
+            pass
+
+
+def _reason(log: Path, code: int) -> str:
+    """The command's own error line, or its exit code."""
+    with log.open("rb") as file:
+        file.seek(max(0, log.stat().st_size - 20_000))
+        lines = file.read().decode("utf-8", "replace").splitlines()
+    errors = [line for line in lines if line.startswith("dnrpipe: error:")]
+    if errors:
+        return errors[-1].removeprefix("dnrpipe: error: ")
+    if code == INTERRUPTED:
+        return "interrupted from outside; retry to go on where it stopped"
+    how = f"was killed by {_signal_name(-code)}" if code < 0 else f"ended with exit code {code}"
+    return f"the command {how}; see its log"
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+def main() -> int:
+    die_with_parent()
+    if os.getppid() != int(sys.argv[2]):  # the server was killed while this process started
+        return 1
+    config = ServerConfig.model_validate_json(sys.stdin.read())
+    worker = Worker(config, sys.argv[1])
+    signal.signal(signal.SIGTERM, worker.stop)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the server's to handle
+    worker.run()
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

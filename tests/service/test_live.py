@@ -1,0 +1,235 @@
+"""The live viewer, by its WebSocket and by a real browser; and the dashboard."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from tests.browser import find_chromium
+from tests.service.devtools import page
+from tests.service.harness import Server, empty_workspace
+from websockets.sync.client import connect
+
+from dnrpipe.service.live_pace import BUDGET, LEVELS, PATIENCE, START, Pace
+from dnrpipe.service.routes_live import unpack
+
+needs_chromium = pytest.mark.skipif(find_chromium() is None, reason="no Chromium")
+
+
+class Viewer:
+    """The client's side of the WebSocket."""
+
+    def __init__(self, socket: Any) -> None:
+        self.socket = socket
+        self.hello = json.loads(socket.recv(timeout=60))
+        assert self.hello["kind"] == "hello", self.hello
+
+    def ask(self, mode: str = "neural", *, azimuth: float = 0.0, size: int = 64, moving: bool = False) -> None:
+        camera = {
+            "azimuth": azimuth,
+            "elevation": 0.5,
+            "distance": self.hello["distance"],
+            "target": self.hello["center"],
+        }
+        self.socket.send(json.dumps({"camera": camera, "size": size, "mode": mode, "moving": moving}))
+
+    def frame(self) -> tuple[dict[str, Any], np.ndarray]:
+        """(header, picture [H, W, 3] in [0, 1])."""
+        message = self.socket.recv(timeout=120)
+        assert isinstance(message, bytes), message
+        header, data = unpack(message)
+        picture = Image.open(io.BytesIO(data))
+        assert picture.get_format_mimetype() == header["type"]
+        return header, np.asarray(picture.convert("RGB"), np.float32) / 255
+
+
+def test_frames(server: Server, trained: str) -> None:
+    """A view at rest is what `dnrpipe render` makes; all modes answer; a moving camera is quick, then fine."""
+    url = server.url.replace("http", "ws") + f"/workspaces/{trained}/live"
+    with connect(url, max_size=None) as socket:
+        viewer = Viewer(socket)
+        viewer.ask()
+        header, neural = viewer.frame()
+        assert header["type"] == "image/webp" and neural.shape == (64, 64, 3)
+        assert {"base image", "network", "encoding"} <= set(header["ms"]) and header["nearest"]
+        assert neural.std() > 0.02
+        viewer.ask(azimuth=1.5)
+        _, turned = viewer.frame()
+        assert np.abs(neural - turned).max() > 0.1
+        pictures = {}
+        for mode in viewer.hello["modes"]:
+            viewer.ask(mode)
+            header, pictures[mode] = viewer.frame()
+            assert header["mode"] == mode and header["moving"] is False
+            viewer.ask(azimuth=0.1)  # ends the refinement of a reference
+            while viewer.frame()[0]["mode"] != "neural":
+                pass
+        assert np.abs(pictures["neural"] - neural).max() < 0.02
+        assert np.abs(pictures["base"] - pictures["neural"]).mean() < 0.1  # the network corrects it
+        assert np.abs(pictures["normal"] - pictures["neural"]).mean() > 0.05
+        viewer.ask(moving=True)
+        header, _ = viewer.frame()
+        assert header["moving"] and header["type"] == "image/jpeg"
+        header, picture = viewer.frame()  # of the server's own accord, when nothing more comes
+        assert header["moving"] is False and np.abs(picture - neural).max() < 0.02
+
+
+def test_a_reference_gets_better(server: Server, trained: str) -> None:
+    url = server.url.replace("http", "ws") + f"/workspaces/{trained}/live"
+    with connect(url, max_size=None) as socket:
+        viewer = Viewer(socket)
+        viewer.ask("reference", azimuth=2.5)  # a view that has no samples yet
+        frames = [viewer.frame() for _ in range(12)]
+        assert [header["spp"] for header, _ in frames] == [4 * (i + 1) for i in range(12)]
+        last = frames[-1][1]
+        errors = [float(np.square(picture - last).mean()) for _, picture in frames]
+        assert errors[0] > 2 * errors[5] > 0
+
+
+def test_bad_requests_do_no_harm(server: Server, trained: str) -> None:
+    url = server.url.replace("http", "ws") + f"/workspaces/{trained}/live"
+    good = {"azimuth": 0, "elevation": 0, "distance": 1, "target": [0, 0, 0]}
+    with connect(url, max_size=None) as socket:
+        viewer = Viewer(socket)
+        for text in (
+            "no json",
+            "{}",
+            json.dumps({"camera": good | {"elevation": 2}, "size": 64}),
+            json.dumps({"camera": good, "size": 100_000}),
+            json.dumps({"camera": good | {"distance": float("nan")}, "size": 64}),
+            json.dumps({"camera": good, "size": 64, "mode": "../../etc/passwd"}),
+        ):
+            socket.send(text)
+            answer = json.loads(socket.recv(timeout=60))
+            assert answer["kind"] == "problem" and answer["detail"]
+        viewer.ask()
+        assert viewer.frame()[0]["mode"] == "neural"
+
+
+def test_untrained_workspace_says_so(server: Server) -> None:
+    empty_workspace(server.root, "untrained")
+    with connect(server.url.replace("http", "ws") + "/workspaces/untrained/live") as socket:
+        assert "no trained renderer" in json.loads(socket.recv(timeout=60))["detail"]
+
+
+def test_frame_process_is_replaced_when_it_dies(server: Server, trained: str) -> None:
+    url = server.url.replace("http", "ws") + f"/workspaces/{trained}/live"
+    with connect(url, max_size=None) as socket:
+        viewer = Viewer(socket)
+        viewer.ask()
+        viewer.frame()
+        killed = [p for p in _children(server.process.pid) if b"dnrpipe.service.live_frames" in p[1]]
+        assert len(killed) == 1
+        os.kill(killed[0][0], 9)
+        viewer.ask(azimuth=0.2)
+        assert viewer.frame()[0]["mode"] == "neural"
+
+
+def _children(parent: int) -> list[tuple[int, bytes]]:
+    found = []
+    for entry in Path("/proc").glob("[0-9]*"):
+        try:
+            if int((entry / "stat").read_text().rpartition(")")[2].split()[1]) == parent:
+                found.append((int(entry.name), (entry / "cmdline").read_bytes()))
+        except OSError:
+            continue
+    return found
+
+
+def test_pace() -> None:
+    """Slow frames make it coarser, quick ones finer, and it settles where frames fit into the budget."""
+    pace = Pace()
+    cost = {0: 400.0, 1: 150.0, 2: 80.0, 3: 40.0, 4: 25.0}
+    for _ in range(10 * PATIENCE):
+        pace.took(256, cost[pace.level])
+    assert pace.level == 2
+    for _ in range(20 * PATIENCE):
+        pace.took(256, 20 * cost[pace.level])
+    assert pace.level == len(LEVELS) - 1 and pace.pick(256) == (128, 1)
+    for _ in range(20 * PATIENCE):
+        pace.took(256, 0.01 * cost[pace.level])
+    assert pace.level == 0 and pace.pick(256) == (256, None)
+    first = Pace()
+    first.took(256, 100 * BUDGET)  # compiles the kernels
+    assert first.level == START and first._mean is None
+
+
+@needs_chromium
+def test_dashboard_and_viewer_in_a_browser(server: Server, trained: str) -> None:
+    """Jobs and a workspace are shown, the slider slides, the sphere turns, and a drag changes the picture."""
+    with page() as tab:
+        tab.open(server.url)
+        tab.wait_for(f"[...document.querySelectorAll('#jobs td')].some(td => td.textContent === 'run {trained}')")
+        tab.evaluate(
+            f"[...document.querySelectorAll('#jobs tr')].find(r => r.textContent.includes('run {trained}')).click()"
+        )
+        tab.wait_for("document.querySelectorAll('#curves svg polyline').length > 0")
+        tab.wait_for("document.querySelector('#truth').naturalWidth > 0")
+        tab.wait_for("document.querySelector('#note').textContent === 'done'")
+        assert "Ray-traced 2 of 4 candidates" in tab.evaluate("document.querySelector('#cost').textContent")
+        before = tab.evaluate("document.querySelector('#sphere svg').innerHTML")
+        x, y = tab.evaluate(
+            "(() => { const n = document.querySelector('#sphere svg');"
+            " n.scrollIntoView({block: 'center', behavior: 'instant'}); const b = n.getBoundingClientRect();"
+            " return [b.x + b.width / 2, b.y + b.height / 2]; })()"
+        )
+        tab.drag(x, y, 60, 20)
+        assert tab.evaluate("document.querySelector('#sphere svg').innerHTML") != before
+        tab.evaluate(
+            "(() => { const s = document.querySelector('#split'); s.value = 20;"
+            " s.dispatchEvent(new Event('input')); })()"
+        )
+        assert tab.evaluate("document.querySelector('.compare').style.getPropertyValue('--split')") == "20%"
+        assert tab.errors == []
+
+        tab.open(f"{server.url}/static/viewer.html?w={trained}")
+        tab.wait_for("document.querySelector('#picture')?.dataset.fine === 'yes'", 120)
+        first = tab.evaluate("document.querySelector('#picture').toDataURL()")
+        shown = int(tab.evaluate("document.querySelector('#picture').dataset.frames"))
+        x, y = tab.evaluate(
+            "(() => { const b = document.querySelector('#picture').getBoundingClientRect();"
+            " return [b.x + b.width / 2, b.y + b.height / 2]; })()"
+        )
+        tab.mouse("mousePressed", x, y)
+        for step in range(1, 12):
+            tab.mouse("mouseMoved", x + 12 * step, y + 3 * step)
+            time.sleep(0.03)
+        tab.wait_for(f"Number(document.querySelector('#picture').dataset.frames) > {shown}")
+        tab.mouse("mouseReleased", x + 132, y + 33)
+        tab.wait_for("document.querySelector('#picture').dataset.fine === 'yes'")
+        assert tab.evaluate("document.querySelector('#picture').toDataURL()") != first
+        assert "base image" in tab.evaluate("document.querySelector('#times').textContent")
+        tab.evaluate("document.querySelector('input[value=depth]').click()")
+        tab.wait_for("document.querySelector('#picture').dataset.mode === 'depth'")
+        assert tab.errors == []
+
+
+@needs_chromium
+def test_a_page_without_the_token_asks_for_it(tmp_path: Path) -> None:
+    token = "a-token-for-the-browser"
+    file = tmp_path / "token"
+    file.write_text(token)
+    file.chmod(0o600)
+    server = Server(tmp_path / "root", "--token-file", str(file))
+    try:
+        empty_workspace(server.root, "hidden")
+        with page() as tab:
+            tab.open(server.url)
+            tab.wait_for("document.querySelector('#token-form')?.hidden === false")
+            assert "hidden" not in tab.evaluate("document.querySelector('#workspaces').textContent")
+            tab.evaluate(
+                f"document.querySelector('#token').value = '{token}';"
+                " document.querySelector('#token-form button').click()"
+            )
+            tab.wait_for("document.querySelector('#workspaces').textContent.includes('hidden')")
+            assert token not in tab.evaluate("location.href + document.body.innerHTML")
+        assert token not in server.log.read_text()
+    finally:
+        server.stop()
