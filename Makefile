@@ -23,7 +23,7 @@ system:
 $(STAMP): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check torch==2.13.0
-	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[render,train,dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[render,train,serve,export,dev]'
 	@touch $@
 
 demo: setup  ## the demo scene from .blend to report; prints the report's path
