@@ -112,6 +112,19 @@ def _prepared(
     workspace: Workspace, settings: Settings, console: Console, run_id: str, plan: EffectPlan, stage: Any
 ) -> tuple[dict[str, Any], dict[str, str], str]:
     """(what the workers share, their environment, a hash of all that decides the images but for the view)."""
+    common, light, environment, stamp = base_jobs(workspace, settings, plan)
+    if light is not None:
+        _bake(workspace, console, run_id, stage, common, environment, light)
+    return common, environment, stamp
+
+
+def base_jobs(
+    workspace: Workspace, settings: Settings, plan: EffectPlan
+) -> tuple[dict[str, Any], dict[str, Any] | None, dict[str, str], str]:
+    """(what base workers share, the task of the baked light or None, environment, hash of all but the view).
+
+    Raises UserError where this machine has no jit variant of Mitsuba.
+    """
     chosen, kind = settings.base, settings.model.base
     choice = choose_variant(settings.raytrace.variant)
     if choice.variant.startswith("scalar"):
@@ -138,8 +151,7 @@ def _prepared(
             "seed": settings.raytrace.seed,
         }
         task["fingerprint"] = digest([LIGHT_VERSION, light, {k: v for k, v in task.items() if k != "output"}])
-        _bake(workspace, console, run_id, stage, common, choice.environment, task)
-        return common, choice.environment, digest([task["fingerprint"], chosen.samples, chosen.denoise])
+        return common, task, choice.environment, digest([task["fingerprint"], chosen.samples, chosen.denoise])
     direct = kind == "direct"
     common |= {
         "integrator": "path" if direct else config["integrator"],
@@ -147,7 +159,12 @@ def _prepared(
         "spp": chosen.spp,
         "seed": settings.raytrace.seed,
     }
-    return common, choice.environment, digest([kind, light, chosen.spp, chosen.samples, settings.raytrace.seed])
+    return common, None, choice.environment, digest([kind, light, chosen.spp, chosen.samples, settings.raytrace.seed])
+
+
+def light_is_baked(task: dict[str, Any]) -> bool:
+    """Whether the light of :func:`base_jobs` is on disk."""
+    return _light_print(Path(task["output"])) == task["fingerprint"]
 
 
 def _bake(
@@ -160,8 +177,7 @@ def _bake(
     task: dict[str, Any],
 ) -> None:
     """Bake the light where it is missing or of other inputs."""
-    path = Path(task["output"])
-    if _light_print(path) == task["fingerprint"]:
+    if light_is_baked(task):
         return
     shared = {"bundle": common["bundle"], "variant": common["variant"]}
     with console.bar("baking light", 1) as bar:

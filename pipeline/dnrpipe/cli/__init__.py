@@ -15,6 +15,7 @@ from .. import __version__
 from . import information, pictures, scene, stages
 from .ablate import ablate
 from .bench_select import bench_select
+from .plan import plan
 
 
 class _Group(click.Group):
@@ -54,6 +55,7 @@ for _command in (
     pictures.render,
     pictures.report,
     stages.run,
+    plan,
     ablate,
     bench_select,
     information.status,

@@ -127,11 +127,15 @@ def pilot_views(workspace: Workspace, settings: Settings, plan: EffectPlan) -> l
     count = min(PILOT_VIEWS, len(views))
     chosen = [views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)]
     known = lenses(workspace, settings) if plan.on("depth-of-field") else {}
-    return [{"view": _small(view).model_dump(mode="json"), "lens": known.get(view.name)} for view in chosen]
+    return [
+        {"view": small_view(view, PILOT_RESOLUTION).model_dump(mode="json"), "lens": known.get(view.name)}
+        for view in chosen
+    ]
 
 
-def _small(view: View) -> View:
-    scale = min(1.0, PILOT_RESOLUTION / max(view.width, view.height))
+def small_view(view: View, resolution: int) -> View:
+    """The view with at most ``resolution`` pixels on its longer side."""
+    scale = min(1.0, resolution / max(view.width, view.height))
     width, height = max(8, round(view.width * scale)), max(8, round(view.height * scale))
     return view.model_copy(
         update={
