@@ -15,6 +15,7 @@ from .. import __version__
 from . import information, pictures, scene, stages
 from .ablate import ablate
 from .bench_select import bench_select
+from .frontier import frontier
 from .plan import plan
 
 
@@ -56,6 +57,7 @@ for _command in (
     pictures.report,
     stages.run,
     plan,
+    frontier,
     ablate,
     bench_select,
     information.status,

@@ -48,6 +48,8 @@ STEPS = 150
 WARM_RESOLUTION = 32
 LIGHT_SHARE, LIGHT_SPP = 2, 32
 """The pilot's light has a side of 1/LIGHT_SHARE of the real one's, and at most so many paths a texel."""
+TIMEOUT = 600.0
+"""Seconds after which a part counts as hung: ten times what the whole pilot should take."""
 FOLDER, FILE = "plan", "pilot.json"
 
 
@@ -202,7 +204,9 @@ class Piloting:
         log = self.workspace.log("plan")
         found = []
         with self.console.bar(label, len(tasks)) as bar:
-            outcomes = run_tasks(module, common, tasks, workers=workers, log=log, environment=environment)
+            outcomes = run_tasks(
+                module, common, tasks, workers=workers, log=log, timeout=TIMEOUT, environment=environment
+            )
             try:
                 for outcome in outcomes:
                     if isinstance(outcome, Retry):
