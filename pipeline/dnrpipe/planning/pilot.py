@@ -43,9 +43,8 @@ from .records import BasePart, FramePart, LightPart, LightPoint, Pilot, Record, 
 VERSION = 1
 RESOLUTION = 128
 VIEWS, SPP = 6, 16
-HELD_OUT, REFERENCE_SPP = 3, 128
+HELD_OUT, REFERENCE_SPP = 6, 64
 STEPS = 150
-WARM_RESOLUTION = 32
 LIGHT_SHARE, LIGHT_SPP = 2, 32
 """The pilot's light has a side of 1/LIGHT_SHARE of the real one's, and at most so many paths a texel."""
 TIMEOUT = 600.0
@@ -73,15 +72,13 @@ class Piloting:
         self.train, self.held_out = _views(self.workspace)
 
     def trace(self) -> TracePart:
-        """Views at two numbers of samples and two sizes; the first view of each worker warms it up."""
+        """Views at two numbers of samples. Each worker's first view compiles its kernels, which are of one size."""
         choice = variant_for(self.plan, self.settings)
         config = trace_config(self.workspace, self.plan, choice.variant)
         workers = 1 if choice.variant.startswith("cuda") else worker_count(self.settings.raytrace.workers)
-        warm = [self._task(small_view(self.train[0], WARM_RESOLUTION), f"warm{i}", 1, config) for i in range(workers)]
+        warm = [self._task(self.train[0], f"warm{i}", 1, config) for i in range(workers)]
         tasks = [self._task(view, f"train-{view.name}", SPP, config) for view in self.train]
         tasks += [self._task(view, f"held-{view.name}", REFERENCE_SPP, config) for view in self.held_out]
-        half = max(self.train[0].width, self.train[0].height) // 2
-        tasks += [self._task(small_view(view, half), f"half-{view.name}", SPP, config) for view in self.train[:2]]
         common = {"bundle": config["bundle"], "variant": choice.variant, "threads": 1}
         started = time.monotonic()
         answers = self._run(

@@ -1,6 +1,6 @@
 """Seconds of every stage from the pilot: straight lines, each with its slope and its start.
 
-    view      t = a + b * spp * pixels + c * pixels        (c: denoiser and its guides, where views are denoised)
+    view      t = pixels * (b * spp + c)        (c: denoiser and its guides, where views are denoised)
     stage     start of the workers + views * t / workers
     light     start + slope * texels^2 * paths + slope' * texels^2
     base      start + views * t * (pixels / pilot's pixels)
@@ -27,31 +27,25 @@ TIME_SPREAD = 1.25
 class ViewLine:
     """Seconds of one view on one worker."""
 
-    start: float
     per_sample: float
     per_pixel: float
 
     def at(self, spp: int, pixels: int) -> float:
         """Seconds of a view of ``pixels`` at ``spp`` samples a pixel."""
-        return self.start + self.per_sample * spp * pixels + self.per_pixel * pixels
+        return pixels * (self.per_sample * spp + self.per_pixel)
 
 
 def view_line(part: TracePart, clock: Clock) -> ViewLine:
-    """Least squares in relative error, no coefficient below zero (those that would be are left out)."""
-    rows = [(1.0, float(p.spp * p.pixels), float(p.pixels)) for p in part.points]
+    """Least squares in relative error; where one coefficient would be below zero, the other alone."""
     times = np.array([max(getattr(p, clock), 1e-6) for p in part.points])
-    scaled = np.array(rows) / times[:, None]
-    kept = [0, 1, 2]
-    while True:
-        chosen = scaled[:, kept]
-        scale = np.linalg.norm(chosen, axis=0)
-        solved, *_ = np.linalg.lstsq(chosen / scale, np.ones(len(times)), rcond=None)
-        found = solved / scale
-        if (found >= 0).all() or len(kept) == 1:
-            break
-        del kept[int(np.argmin(solved))]
-    values = dict.fromkeys(range(3), 0.0) | dict(zip(kept, (max(0.0, float(v)) for v in found), strict=True))
-    return ViewLine(values[0], values[1], values[2])
+    rows = np.array([(p.spp * p.pixels, p.pixels) for p in part.points], float) / times[:, None]
+    scale = np.linalg.norm(rows, axis=0)
+    both = np.linalg.lstsq(rows / scale, np.ones(len(times)), rcond=None)[0] / scale
+    if (both >= 0).all():
+        return ViewLine(float(both[0]), float(both[1]))
+    alone = rows.sum(axis=0) / scale**2  # each coefficient by itself
+    errors = ((rows * alone - 1) ** 2).sum(axis=0)
+    return ViewLine(float(alone[0]), 0.0) if errors[0] <= errors[1] else ViewLine(0.0, float(alone[1]))
 
 
 def noise_at(part: TracePart, spp: int) -> float:
