@@ -139,7 +139,7 @@ def shared(cells: list[dict[str, Any]]) -> dict[str, float]:
         return total
 
     optimiser.step(loss)
-    return dict(zip(START, map(float, logs.exp()), strict=True))
+    return dict(zip(START, logs.detach().exp().tolist(), strict=True))
 
 
 def fit(path: Path, out: Path) -> None:
