@@ -49,11 +49,11 @@ imports: $(STAMP)
 
 docs: $(STAMP)  ## regenerate the CLI reference from --help, the ablation's tables from its results
 	$(BIN)/python tools/cli_reference.py docs/cli.md
-	$(BIN)/python -m tools.result_tables docs/ablation.md docs/frames.md
+	$(BIN)/python -m tools.result_tables docs/ablation.md docs/frames.md docs/cost.md
 
 docs-check: $(STAMP)
 	$(BIN)/python tools/cli_reference.py --check docs/cli.md
-	$(BIN)/python -m tools.result_tables --check docs/ablation.md docs/frames.md
+	$(BIN)/python -m tools.result_tables --check docs/ablation.md docs/frames.md docs/cost.md
 
 bench-effects: setup  ## the effect plan against "everything on", on the benchmark scenes
 	$(BIN)/python tools/bench_effects.py

@@ -25,7 +25,7 @@ from dnrpipe.ablation.rows import Row
 from dnrpipe.ablation.run import Ablation, Request
 from dnrpipe.ablation.scenes import BENCHMARK, find_scenes
 from dnrpipe.console import Console
-from dnrpipe.planning.quality import LEAST_SHARE, Prior, predict, scene_gain, share
+from dnrpipe.planning.quality import LEAST_SHARE, Prior, load_prior, predict, scene_gain, share
 from dnrpipe.settings import resolve
 from dnrtrain.atomic import write_json
 from dnrtrain.exr import read_metadata
@@ -144,7 +144,7 @@ def shared(cells: list[dict[str, Any]]) -> dict[str, float]:
 
 def fit(path: Path, out: Path) -> None:
     """Fit, leave every scene out that has the pilot's corner, print, write ``out``."""
-    cells = _read(path)["cells"]
+    cells = read_cells(path)
     scenes = sorted({cell["scene"] for cell in cells})
     errors: list[float] = []
     print(f"{'scene left out':<16}{'predicted from its pilot corner, minus measured, dB':>60}")
@@ -182,6 +182,17 @@ def _prior(cells: list[dict[str, Any]], scenes: list[str], source: str) -> Prior
     means = [float(np.mean(values)) for values in gains.values()]
     spread = float(np.std(means, ddof=1)) if len(means) > 1 else 2.0
     return bare.model_copy(update={"gain_mean": round(float(np.mean(means)), 3), "gain_sd": round(spread, 3)})
+
+
+def read_cells(path: Path) -> list[dict[str, Any]]:
+    """Cells that ``collect`` wrote."""
+    return _read(path)["cells"]
+
+
+def without(cells: list[dict[str, Any]], scene: str, source: str) -> Prior:
+    """The prior of all scenes but one, as sure of itself as the one that comes with the package."""
+    others = [cell for cell in cells if cell["scene"] != scene]
+    return _prior(others, sorted({cell["scene"] for cell in others}), source).model_copy(update={"sd": load_prior().sd})
 
 
 def _read(path: Path) -> dict[str, Any]:

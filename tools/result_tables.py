@@ -1,9 +1,10 @@
-"""Write the generated parts of docs/ablation.md and docs/frames.md: rows from the code, tables from committed results.
+"""Write the generated parts of docs: rows from the code, tables from committed results.
 
-A part stands between ``<!-- rows -->``, ``<!-- results FILE -->`` (of `dnrpipe ablate`) or ``<!-- frames FILE -->``
-(of tools.bench_frames), FILE beside docs/, and ``<!-- end -->``.
+A part stands between ``<!-- rows -->`` or ``<!-- KIND FILE -->``, FILE in docs/, and ``<!-- end -->``.
+Kinds: results (of `dnrpipe ablate`), frames (of tools.bench_frames), frontier (of `dnrpipe frontier`), plan-check (of
+tools.plan_check).
 
-python -m tools.result_tables [--check] docs/ablation.md docs/frames.md
+python -m tools.result_tables [--check] docs/ablation.md docs/frames.md docs/cost.md
 """
 
 from __future__ import annotations
@@ -12,15 +13,17 @@ import json
 import re
 import sys
 from pathlib import Path
-from typing import Any
 
 from tools.bench_frames.document import markdown as frames_markdown
+from tools.plan_check import markdown as check_markdown
 
 from dnrpipe.ablation.results import read_results
 from dnrpipe.ablation.rows import GROUPS, ROWS
 from dnrpipe.ablation.tables import markdown
+from dnrpipe.frontier.command import read_frontier
+from dnrpipe.frontier.words import markdown as frontier_markdown
 
-PART = re.compile(r"(<!-- (rows|results|frames)(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
+PART = re.compile(r"(<!-- (rows|results|frames|frontier|plan-check)(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def rows_table() -> str:
@@ -40,16 +43,20 @@ def generate(text: str, folder: Path) -> str:
             body = rows_table()
         elif match[2] == "results":
             body = markdown(read_results(folder / match[3])).rstrip()
+        elif match[2] == "frontier":
+            body = lowered(frontier_markdown(read_frontier(folder / match[3])))
+        elif match[2] == "plan-check":
+            body = check_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
         else:
-            body = frames_tables(json.loads((folder / match[3]).read_text(encoding="utf-8")))
+            body = lowered(frames_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8"))))
         return f"{match[1]}{body}\n{match[4]}"
 
     return PART.sub(part, text)
 
 
-def frames_tables(record: dict[str, Any]) -> str:
-    """The benchmark's own tables, one heading lower and without its title."""
-    _, _, body = frames_markdown(record).partition("\n")
+def lowered(text: str) -> str:
+    """A page's own tables, one heading lower and without its title."""
+    _, _, body = text.partition("\n")
     return body.strip().replace("\n## ", "\n### ")
 
 

@@ -107,6 +107,7 @@ def run_frontier(
         "cores": cores,
         "test_views": len(run.scene.test),
         "evaluation_spp": settings.raytrace.evaluation_spp,
+        "threads": run.threads,
         "rival_threads": rivals["threads"],
         "points": points,
         "rungs": rivals["rungs"],
