@@ -48,7 +48,7 @@ def plan(
         raise UserError("--apply: what shall be carried out? give --time or --target-psnr")
     from ..planning.command import Wanted, apply, make_plan, parse_duration
     from ..planning.pilot import pilot_path
-    from ..planning.words import lines
+    from ..planning.words import actual_lines, lines
     from ..tasks import worker_count
 
     wanted = Wanted(parse_duration(duration) if duration else None, target_psnr, frames)
@@ -67,6 +67,6 @@ def plan(
             if record["chosen"] is None:
                 raise UserError(f"--apply: nothing is expected to reach {target_psnr:g} dB; see the routes above")
             record = apply(session, record)
-            for line in lines(record, worker_count(0))[-7:]:
+            for line in actual_lines(record):
                 session.console.say(line)
         session.console.result({"workspace": str(session.workspace.root), **record})

@@ -82,7 +82,7 @@ def make_plan(workspace: Workspace, settings: Settings, console: Console, wanted
     if wanted.frames is not None:
         found, at = whether_to_train(predictor, grid, settings, wanted, chosen)
         record |= {"routes": [r.model_dump(mode="json") for r in found], "routes_psnr": at}
-        record |= {"break_even": break_even(found), "train": found[0].name == "neural renderer"}
+        record |= {"break_even": break_even(found), "train": found[0].reaches and found[0].name == "neural renderer"}
     write_json(workspace.root / FOLDER / "plan.json", record)
     return record
 

@@ -29,7 +29,7 @@ from ..base import RENDERED, base_jobs, light_is_baked
 from ..console import Console
 from ..costs import CostRecord
 from ..effects.plan import EffectPlan
-from ..effects.store import resolve_plan, small_view, trace_config, variant_for
+from ..effects.store import lenses, resolve_plan, small_view, trace_config, variant_for
 from ..errors import UserError
 from ..executors import Retry, run_tasks
 from ..prepare import split_views
@@ -258,6 +258,8 @@ def run_pilot(workspace: Workspace, settings: Settings, console: Console) -> Pil
         )
     run_id = f"plan-{int(time.time()):x}"
     plan = resolve_plan(workspace, settings, console, run_id, "plan")
+    if plan.on("depth-of-field") and lenses(workspace, settings):
+        raise UserError(f"plan: the cameras of {workspace.root} have depth of field, whose frames cannot be timed yet")
     piloting = Piloting(workspace, settings, console, run_id, plan)
     stamp = _stamp(workspace, settings, plan)
     found = read_pilot(workspace)
@@ -265,7 +267,9 @@ def run_pilot(workspace: Workspace, settings: Settings, console: Console) -> Pil
     if found is None or found.fingerprint != stamp:
         shutil.rmtree(piloting.folder, ignore_errors=True)
         found = Pilot(fingerprint=stamp, size=(first.width, first.height), load=_load())
-    if found.frames is not None:
+    _, light, _, _ = base_jobs(workspace, settings, plan)
+    bake = found.light is None and light is not None and not light_is_baked(light)  # removed since, perhaps
+    if found.frames is not None and not bake:
         return found
     piloting.folder.mkdir(parents=True, exist_ok=True)
     parts: list[tuple[str, Callable[[], Record | None]]] = [
