@@ -60,9 +60,8 @@ def pilot() -> Pilot:
         trace=trace_part(5e-7, 5e-6),
         light=LightPart(
             points=[
-                LightPoint(size=64, spp=8, seconds=2.0, cpu_seconds=4.0),
-                LightPoint(size=256, spp=8, seconds=0.6, cpu_seconds=1.2),
-                LightPoint(size=256, spp=32, seconds=1.8, cpu_seconds=3.6),
+                LightPoint(size=16, spp=1, seconds=1.0, cpu_seconds=2.0),
+                LightPoint(size=256, spp=32, seconds=2.5, cpu_seconds=4.5),
             ],
             startup=4.0,
         ),
@@ -113,10 +112,10 @@ def test_noise_falls_with_the_power_that_was_measured(power: float) -> None:
     assert noise_at(trace_part(1e-7, 0, 0.3, power), 512) == pytest.approx(0.3 * 512**-power, rel=1e-6)
 
 
-def test_light_is_extrapolated_by_paths_and_by_texels() -> None:
+def test_light_is_extrapolated_by_texels_and_paths() -> None:
     costs = predictor().wall
-    per_path, per_texel = 1.2 / (256**2 * 24), 0.2 / 256**2  # of the bakes above: 0.6 s at 8 paths, 1.8 s at 32
-    assert costs.light() == pytest.approx(4.0 + 512**2 * (128 * per_path + per_texel))
+    slope = 1.5 / (256**2 * 32)  # of the bakes above: 1 s of start, 1.5 s of paths
+    assert costs.light() == pytest.approx(4.0 + 1.0 + 512**2 * 128 * slope)
     done = Costs(costs.pilot, Work(1, 1, None, 0.0, 0, 1), "seconds")
     assert done.light() == 0.0
 
@@ -248,7 +247,7 @@ def test_a_scene_is_planned_and_the_plan_carried_out(
     tmp_path: Path, demo_blend: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from dnrpipe.cli import _main
-    from dnrpipe.planning import choose, pilot, worker
+    from dnrpipe.planning import choose, pilot
 
     monkeypatch.chdir(tmp_path)
     for module, name, value in (
@@ -257,12 +256,13 @@ def test_a_scene_is_planned_and_the_plan_carried_out(
         (pilot, "REFERENCE_SPP", 16),
         (pilot, "SPP", 4),
         (pilot, "STEPS", 12),
+        (pilot, "RUNGS", (1, 4)),
+        (pilot, "METHODS", ("raw", "clean16-fast")),
         (choose, "STEPS", (12, 24)),
         (choose, "SAMPLES", (4, 8)),
         (choose, "VIEWS", (3, 4)),
     ):
         monkeypatch.setattr(module, name, value)
-    assert worker.RUNGS  # the workers are processes of their own: their constants stay
     (tmp_path / "dnrpipe.toml").write_text(_toml(SMALL))
     assert _main(["plan", str(demo_blend), "--frames", "3", "--json"]) == 0
     record = json.loads(capsys.readouterr().out)

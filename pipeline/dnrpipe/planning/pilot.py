@@ -45,6 +45,9 @@ RESOLUTION = 128
 VIEWS, SPP = 6, 16
 HELD_OUT, REFERENCE_SPP = 6, 64
 STEPS = 150
+RUNGS = (1, 4, 16, 64)
+METHODS = ("raw", "clean16-fast", "clean16")
+"""Path tracing's samples, and what the denoiser is given (:mod:`..frames.rival`)."""
 LIGHT_SHARE, LIGHT_SPP = 2, 32
 """The pilot's light has a side of 1/LIGHT_SHARE of the real one's, and at most so many paths a texel."""
 TIMEOUT = 600.0
@@ -109,8 +112,7 @@ class Piloting:
             return None
         size, spp = max(16, task["size"] // LIGHT_SHARE), min(LIGHT_SPP, task["spp"])
         tasks = [
-            task | {"size": max(16, size // 4), "spp": max(1, spp // 4), "output": str(self.folder / "warm.npz")},
-            task | {"size": size, "spp": max(1, spp // 4), "output": str(self.folder / "light.npz")},
+            task | {"size": 16, "spp": 1, "output": str(self.folder / "warm.npz")},
             task | {"size": size, "spp": spp, "output": str(self.folder / "light.npz")},
         ]
         shared = {"bundle": common["bundle"], "variant": common["variant"]}
@@ -121,7 +123,7 @@ class Piloting:
             LightPoint(size=task["size"], spp=task["spp"], seconds=result["seconds"], cpu_seconds=result["cpu_seconds"])
             for task, result in answers
         ]
-        return LightPart(points=points, startup=max(0.0, took - points[-1].seconds - points[-2].seconds))
+        return LightPart(points=points, startup=max(0.0, took - sum(point.seconds for point in points)))
 
     def base(self) -> BasePart:
         """Base images of all views of the pilot."""
@@ -182,6 +184,8 @@ class Piloting:
             "images": [str(self._image(f"held-{view.name}")) for view in self.held_out],
             "folder": str(self.folder / "model"),
             "light": str(self._light(light)) if light is not None else None,
+            "samples": list(RUNGS),
+            "methods": list(METHODS),
         }
         ((_, result),) = self._run("pilot: frames", "dnrpipe.planning.worker", self._common(), [task], 1, environment)
         return FramePart.model_validate(result | {"views": len(self.held_out)})

@@ -46,7 +46,7 @@ class LightPoint(Record):
 
 
 class LightPart(Record):
-    """points: smallest first; the first one compiles the kernels. startup: until then, with that bake."""
+    """points: one bake so small that it is all start, and a larger one. startup: of the worker."""
 
     points: list[LightPoint]
     startup: float

@@ -2,7 +2,7 @@
 
     view      t = pixels * (b * spp + c)        (c: denoiser and its guides, where views are denoised)
     stage     start of the workers + views * t / workers
-    light     start + slope * texels^2 * paths + slope' * texels^2
+    light     start of the worker + start of the bake + slope * texels^2 * paths
     base      start + views * t * (pixels / pilot's pixels)
     training  start + steps * t * (trained pixels / pilot's)
 
@@ -116,11 +116,10 @@ class Costs:
         if part is None or self.work.light is None:
             return 0.0
         size, spp = self.work.light
-        fewer, more = part.points[-2:]  # of one size
-        texels, low, high = more.size**2, getattr(fewer, self.clock), getattr(more, self.clock)
-        per_path = max(0.0, high - low) / (texels * max(1, more.spp - fewer.spp))
-        per_texel = max(0.0, high / texels - per_path * more.spp)
-        return self._start(part.startup) + size**2 * (per_path * spp + per_texel)
+        first, last = part.points  # the first is so small that it is all start
+        start, whole = getattr(first, self.clock), getattr(last, self.clock)
+        slope = max(0.0, whole - start) / (last.size**2 * last.spp)
+        return self._start(part.startup) + start + slope * size**2 * spp
 
     def _traced(self, views: int, spp: int) -> float:
         part = self.pilot.trace

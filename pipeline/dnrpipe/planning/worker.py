@@ -18,8 +18,6 @@ from ..workspace import Workspace
 if TYPE_CHECKING:
     from dnrtrain.dataset import ViewSet
 
-RUNGS = (1, 4, 16, 64)
-METHODS = ("raw", "clean16-fast", "clean16")
 WARM = 2
 
 
@@ -29,7 +27,7 @@ class Worker:
     common: {"workspace", "settings", "threads"}
     task "train": {"views", "base_files", "images", "folder", "fingerprint", "epochs"}
         -> {"seconds", "cpu_seconds": of a step, "startup", "steps", "threads"}
-    task "frames": {"views", "images", "folder": of the model, "light"}
+    task "frames": {"views", "images", "folder": of the model, "light", "samples", "methods": the ladder}
         -> {"base", "neural", "rival": rows {"name", "ms", "psnr"}, "noise_rmse"}
     """
 
@@ -116,11 +114,11 @@ class Worker:
         ours = Ours(scene, (), Path(task["folder"]), light)
         truth = [scene.shown(_picture(Path(path))) for path in task["images"]]
         noises = [(read_metadata(Path(path)) or {}).get("noise_rmse") or 0.0 for path in task["images"]]
-        clock = Clock("cpu", self.threads)
+        clock, samples, methods = Clock("cpu", self.threads), tuple(task["samples"]), tuple(task["methods"])
         for _ in range(WARM):
-            climb(scene, views[0], 1, clock, make_rungs(RUNGS, METHODS))
+            climb(scene, views[0], 1, clock, make_rungs(samples, methods))
             ours.frame(views[0], clock)
-        rungs = make_rungs(RUNGS, METHODS)
+        rungs = make_rungs(samples, methods)
         rows: dict[str, _Row] = {}
         for number, view in enumerate(views):
             climb(scene, view, 10_007 * (number + 1), clock, rungs)
