@@ -69,9 +69,9 @@ def why(record: dict[str, Any]) -> list[str]:
         f"The base image alone gives {record['base_psnr']:.1f} dB; the network is expected to add"
         f" {psnr - record['base_psnr']:.1f}, of at most {record['gain'][0]:.1f} with many views and steps."
     ]
-    larger = "training" if seconds["finetune"] > seconds["raytrace"] else "ray tracing and the baked light"
+    most = "training" if seconds["finetune"] > seconds["raytrace"] else "ray tracing and the baked light"
     share = max(seconds["finetune"], seconds["raytrace"]) / seconds["total"]["expected"]
-    found.append(f"{larger.capitalize()} takes {100 * share:.0f} % of the time.")
+    found.append(f"{100 * share:.0f} % of the time goes to {most}.")
     if what != default["choice"]:
         other, took = default["choice"], duration(default["seconds"]["total"]["expected"])
         found.append(
