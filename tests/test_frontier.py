@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dnrpipe.errors import UserError
-from dnrpipe.frontier.account import break_evens, pareto, total_seconds
+from dnrpipe.frontier.account import break_evens, pareto, settle_frames, total_seconds
 from dnrpipe.frontier.command import numbers
 from dnrpipe.frontier.run import Sweep
 from dnrpipe.frontier.words import markdown, verdict
@@ -75,6 +75,20 @@ def test_from_the_break_even_on_training_is_cheaper_at_equal_quality(upfront: fl
     assert total_seconds(one, even) <= even * rival / 1000 + 1e-6
     if even > 1:
         assert total_seconds(one, even - 1) > (even - 1) * rival / 1000 - 1e-6
+
+
+def test_points_of_one_model_share_its_least_disturbed_frame() -> None:
+    points = [
+        {"kind": kind, "network_ms": network, "base_ms": base}
+        for kind, network, base in (
+            ("ours", 14.0, 50.0),
+            ("all", 90.0, 50.0),
+            ("paper", 20.0, 0.0),
+            ("base", 0.0, 50.0),
+        )
+    ]
+    settle_frames(points)
+    assert [point["frame_ms"] for point in points] == [64.0, 64.0, 20.0, 50.0]
 
 
 def test_a_point_beyond_the_ladder_has_no_break_even() -> None:

@@ -20,7 +20,7 @@ from ..prepare import split_views
 from ..settings import Settings
 from ..tasks import worker_count
 from ..workspace import digest
-from .account import break_evens, pareto, point_of
+from .account import break_evens, pareto, point_of, settle_frames
 from .plot import plot
 from .run import RIVALS, Frontier, Sweep, make_frontier
 from .words import markdown
@@ -95,6 +95,7 @@ def run_frontier(
     ]
     for point in points:
         point["name"] += f", seed {point['seed']}" if seeds > 1 and point["kind"] != "base" else ""
+    settle_frames(points)
     break_evens(points, rivals["rungs"])
     results: dict[str, Any] = {
         "schema": SCHEMA,

@@ -8,7 +8,7 @@ from typing import Any
 
 from dnrtrain.atomic import atomic_path
 
-from .account import HIGHER_IS_BETTER, pareto, total_seconds
+from .account import pareto, total_seconds
 
 # Okabe and Ito's palette; filled and hollow shapes differ in grey as well.
 LOOKS: dict[str, dict[str, Any]] = {
@@ -77,10 +77,7 @@ def _panel(axis: Any, results: Mapping[str, Any], everything: list[dict[str, Any
 
 
 def _best(rungs: list[dict[str, Any]], frames: int, metric: str) -> list[tuple[float, float]]:
-    """Of each number of samples, the method that is best; by seconds."""
-    chosen: dict[int, dict[str, Any]] = {}
-    for rung in rungs:
-        other = chosen.get(rung["spp"])
-        if other is None or (rung[metric] > other[metric]) == HIGHER_IS_BETTER[metric]:
-            chosen[rung["spp"]] = rung
-    return sorted((total_seconds(rung, frames), rung[metric]) for rung in chosen.values())
+    """The rungs that no other of them beats, by seconds."""
+    by_name = {rung["name"]: rung for rung in rungs}
+    names = pareto({"points": [], "rungs": rungs}, frames, metric)
+    return [(total_seconds(by_name[name], frames), by_name[name][metric]) for name in names]
