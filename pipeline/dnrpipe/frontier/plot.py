@@ -55,6 +55,8 @@ def plot(results: Mapping[str, Any], frames: int, path: Path) -> None:
 
 
 def _panel(axis: Any, results: Mapping[str, Any], everything: list[dict[str, Any]], frames: int, metric: str) -> None:
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
     names = pareto(results, frames, metric)
     by_name = {one["name"]: one for one in everything}
     front = [(total_seconds(by_name[name], frames), by_name[name][metric]) for name in names]
@@ -70,6 +72,9 @@ def _panel(axis: Any, results: Mapping[str, Any], everything: list[dict[str, Any
         if best:
             axis.plot(*zip(*best, strict=True), markersize=5, linewidth=1.2, zorder=2, **look)
     axis.set_xscale("log")
+    axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.xaxis.set_minor_formatter(NullFormatter())
     axis.set_xlabel(f"seconds of processor time for {frames} frames")
     axis.set_title(TITLES[metric], fontsize=10)
     axis.grid(color="0.9", which="both")
