@@ -65,10 +65,9 @@ def _following(plan: dict[str, Any] | None) -> str:
         return "Unknown; `dnrpipe plan` predicts it."
     line = [(row["seconds"]["total"]["expected"], row["psnr"]["expected"]) for row in plan["table"]]
     chosen = plan["chosen"] or plan["settings_default"]
-    now = chosen["seconds"]["total"]["expected"]
+    now = max(chosen["seconds"]["total"]["expected"], line[0][0])  # nothing is known below the smallest choice
     here, later = quality_at(line, now), quality_at(line, now + NEXT)
-    if here is None or later is None:
-        return f"The smallest choice is expected to take {duration(line[0][0])}."
+    assert here is not None and later is not None  # both lie on the line
     gain = later - here
     return (
         f"About {gain:.1f} dB, on top of the {duration(now)} that are planned."
