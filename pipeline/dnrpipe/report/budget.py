@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -120,7 +121,7 @@ def _routes(plan: dict[str, Any] | None) -> list[str]:
         return []
     from ..planning.words import route_lines
 
-    return route_lines(plan)
+    return [re.sub(r" {2,}", " · ", line.strip()) for line in route_lines(plan)]  # columns are the terminal's
 
 
 def _frontier(root: Path) -> FrontierSummary | None:
