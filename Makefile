@@ -49,11 +49,11 @@ imports: $(STAMP)
 
 docs: $(STAMP)  ## regenerate the CLI reference from --help, the ablation's tables from its results
 	$(BIN)/python tools/cli_reference.py docs/cli.md
-	$(BIN)/python -m tools.result_tables docs/ablation.md docs/frames.md docs/noise.md
+	$(BIN)/python -m tools.result_tables docs/ablation.md docs/frames.md docs/noise.md docs/cost.md
 
 docs-check: $(STAMP)
 	$(BIN)/python tools/cli_reference.py --check docs/cli.md
-	$(BIN)/python -m tools.result_tables --check docs/ablation.md docs/frames.md docs/noise.md
+	$(BIN)/python -m tools.result_tables --check docs/ablation.md docs/frames.md docs/noise.md docs/cost.md
 	$(BIN)/python -m tools.robustness_table --check docs/robustness.md
 
 robustness: setup  ## every case of docs/robustness.md, 2,000 damaged files of each format, 50 kills; an hour or more

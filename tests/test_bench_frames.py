@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tools.bench_frames.ladder import classes, crossover, frontier, quality_at, standing
 from tools.bench_frames.motion import Surface, changes, flicker, project, reproject
 
 from dnrpipe.cameras import orbit_views
+from dnrpipe.frames.ladder import classes, crossover, frontier, quality_at, standing
 from dnrpipe.settings import CameraSettings
 from dnrtrain.contract import View
 

@@ -1,9 +1,10 @@
-"""Write the generated parts of the pages of results: rows from the code, tables from committed results.
+"""Write the generated parts of docs: rows from the code, tables from committed results.
 
-A part stands between ``<!-- rows -->``, ``<!-- results FILE -->`` (of `dnrpipe ablate`), ``<!-- frames FILE -->``
-(of tools.bench_frames) or ``<!-- noise FILE -->`` (of tools.bench_noise), FILE beside docs/, and ``<!-- end -->``.
+A part stands between ``<!-- rows -->`` or ``<!-- KIND FILE -->``, FILE in docs/, and ``<!-- end -->``.
+Kinds: results (of `dnrpipe ablate`), frames (of tools.bench_frames), noise (of tools.bench_noise),
+frontier (of `dnrpipe frontier`), plan-check (of tools.plan_check).
 
-python -m tools.result_tables [--check] docs/ablation.md docs/frames.md docs/noise.md
+python -m tools.result_tables [--check] docs/ablation.md docs/frames.md docs/noise.md docs/cost.md
 """
 
 from __future__ import annotations
@@ -12,16 +13,19 @@ import json
 import re
 import sys
 from pathlib import Path
-from typing import Any
 
 from tools.bench_frames.document import markdown as frames_markdown
 from tools.bench_noise.document import markdown as noise_markdown
+from tools.plan_check import markdown as check_markdown
 
 from dnrpipe.ablation.results import read_results
 from dnrpipe.ablation.rows import GROUPS, ROWS
 from dnrpipe.ablation.tables import markdown
+from dnrpipe.frontier.command import read_frontier
+from dnrpipe.frontier.words import markdown as frontier_markdown
 
-PART = re.compile(r"(<!-- (rows|results|frames|noise)(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
+KINDS = "rows|results|frames|noise|frontier|plan-check"
+PART = re.compile(rf"(<!-- ({KINDS})(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def rows_table() -> str:
@@ -43,16 +47,20 @@ def generate(text: str, folder: Path) -> str:
             body = markdown(read_results(folder / match[3])).rstrip()
         elif match[2] == "noise":
             body = noise_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
+        elif match[2] == "frontier":
+            body = lowered(frontier_markdown(read_frontier(folder / match[3])))
+        elif match[2] == "plan-check":
+            body = check_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
         else:
-            body = frames_tables(json.loads((folder / match[3]).read_text(encoding="utf-8")))
+            body = lowered(frames_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8"))))
         return f"{match[1]}{body}\n{match[4]}"
 
     return PART.sub(part, text)
 
 
-def frames_tables(record: dict[str, Any]) -> str:
-    """The benchmark's own tables, one heading lower and without its title."""
-    _, _, body = frames_markdown(record).partition("\n")
+def lowered(text: str) -> str:
+    """A page's own tables, one heading lower and without its title."""
+    _, _, body = text.partition("\n")
     return body.strip().replace("\n## ", "\n### ")
 
 

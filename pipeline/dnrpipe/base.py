@@ -138,7 +138,7 @@ def ready_inputs(workspace: Workspace, settings: Settings) -> tuple[dict[str, An
     if settings.model.base not in RENDERED:
         raise UserError(f"base images of kind {settings.model.base} are not rendered")
     common, environment, task, _ = renderer_inputs(workspace, settings, plan_of(workspace, settings))
-    if task is not None and _light_print(Path(task["output"])) != task["fingerprint"]:
+    if task is not None and not light_is_baked(task):
         raise UserError(f"{workspace.root}: the baked light is out of date; run `dnrpipe raytrace-selected` first")
     return common, environment
 
@@ -186,6 +186,11 @@ def renderer_inputs(
     return common, choice.environment, None, stamp
 
 
+def light_is_baked(task: dict[str, Any]) -> bool:
+    """Whether the light of :func:`renderer_inputs` is on disk."""
+    return _light_print(Path(task["output"])) == task["fingerprint"]
+
+
 def _bake(
     workspace: Workspace,
     console: Console,
@@ -196,8 +201,7 @@ def _bake(
     task: dict[str, Any],
 ) -> None:
     """Bake the light where it is missing or of other inputs."""
-    path = Path(task["output"])
-    if _light_print(path) == task["fingerprint"]:
+    if light_is_baked(task):
         return
     shared = {"bundle": common["bundle"], "variant": common["variant"]}
     with console.bar("baking light", 1) as bar:

@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from .errors import UserError
 
-StageName = Literal["prepare", "select", "raytrace", "finetune", "evaluate", "render"]
+StageName = Literal["prepare", "plan", "select", "raytrace", "finetune", "evaluate", "render"]
 Purpose = Literal["training", "evaluation", "inference"]
 Unit = Literal["scene", "view", "epoch"]
 

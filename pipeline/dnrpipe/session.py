@@ -105,8 +105,16 @@ class Session:
                 if name == "prepare":
                     self._take_back()
                 raise
-        if "report" not in self.command and self.command != "run":
+        if self.command not in ("run", "plan", "frontier"):  # these have an answer of their own
             self.console.result({"workspace": str(self.workspace.root), **self.answers})
+
+    def adopt(self, overrides: dict[str, Any]) -> None:
+        """Settings found by the command itself, remembered as flags are."""
+        from .settings import merge
+
+        manifest = self.workspace.manifest
+        manifest.overrides = merge(manifest.overrides, overrides)
+        self.settings = resolve_settings(self.workspace, {}, manifest.preset)
 
     def render(
         self,

@@ -12,9 +12,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from dnrpipe.frames.ours import BASE, NEURAL
 from dnrtrain.atomic import atomic_path, write_json
-
-from .ours import BASE, NEURAL
 
 PACKAGES = ("mitsuba", "drjit", "mitsuba-oidn", "torch", "numpy")
 

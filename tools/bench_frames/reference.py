@@ -14,13 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from dnrpipe.frames.scene import BenchScene
 from dnrpipe.raytrace.denoise import denoise
 from dnrpipe.trace import view_seed
 from dnrpipe.workspace import digest
 from dnrtrain.contract import View
 from dnrtrain.exr import read_exr, read_metadata, write_exr
-
-from .scene import BenchScene
 
 AUXILIARY_RAYS = 64
 LEAST_CEILING = 40.0

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import torch
 
+from dnrpipe.frames.ladder import classes, frontier, standing
+from dnrpipe.frames.ours import Ours
+from dnrpipe.frames.rival import METHODS, SAMPLES, climb, make_rungs
+from dnrpipe.frames.scene import BenchScene, Clock, open_scene
 from dnrtrain.metrics import image_metrics
 from dnrtrain.perceptual import build_lpips
 from dnrtrain.weights import WeightsMissing, load_weights
 
-from .ladder import classes, frontier, standing
-from .ours import Ours
 from .reference import Reference, make_references
-from .rival import METHODS, SAMPLES, climb, make_rungs
-from .scene import BenchScene, Clock, open_scene
 from .stability import measure
 
 CLASSES = (0.03, 0.07, 0.3)

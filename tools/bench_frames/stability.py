@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from dnrpipe.cameras import orbit_views
+from dnrpipe.frames.ours import Ours
+from dnrpipe.frames.rival import climb, make_rungs
+from dnrpipe.frames.scene import BenchScene, Clock
 from dnrtrain.contract import View
 
 from .motion import Surface, flicker
-from .ours import Ours
 from .reference import make_references
-from .rival import climb, make_rungs
-from .scene import BenchScene, Clock
 
 STEPS = 360
 """Frames of a full turn: one degree each, a quarter of a minute at 24 frames per second."""

@@ -39,7 +39,8 @@ class Worker:
     """Runs tasks of two kinds; the answer is what the task's ``output`` file holds.
 
     step1   workspace, settings, policy, seed, seconds (at most; or None) -> {"selected", "epochs", its cost}
-    cell    ... views, coarse (folder of step 1 or None), seconds (both steps; or None) -> see ``_cell``
+    cell    ... views, targets (folder under raytraced/ of their pictures; default train), coarse (folder of step 1
+            or None), seconds (both steps; or None) -> see ``_cell``
     """
 
     def __init__(self, common: dict[str, Any]) -> None:
@@ -181,7 +182,14 @@ class Worker:
         from dnrtrain.step2 import run_step2
 
         return run_step2(
-            self._views(workspace, "train", task["views"], raytraced=True, base=settings.model.base),
+            self._views(
+                workspace,
+                "train",
+                task["views"],
+                raytraced=True,
+                base=settings.model.base,
+                targets=task.get("targets"),
+            ),
             None,
             Path(task["coarse"] or folder),  # not read by a fresh start
             settings.model,
@@ -199,12 +207,22 @@ class Worker:
     # -- data ------------------------------------------------------------------------------------------
 
     def _views(
-        self, workspace: Workspace, split: str, names: list[str] | None, *, raytraced: bool, base: str
+        self,
+        workspace: Workspace,
+        split: str,
+        names: list[str] | None,
+        *,
+        raytraced: bool,
+        base: str,
+        targets: str | None = None,
     ) -> ViewSet:
-        """Views of the split (None: all), with ray-traced or rasterised targets; from memory if they are there."""
-        key = repr((workspace.root, split, names, raytraced, base))
+        """Views of the split (None: all), with ray-traced or rasterised targets; from memory if they are there.
+
+        targets: folder of the ray-traced pictures, where it is not the split's.
+        """
+        key = repr((workspace.root, split, names, raytraced, base, targets))
         if key not in self.memory:
-            self.memory[key] = load_cell_views(workspace, split, names, raytraced=raytraced, base=base)
+            self.memory[key] = load_cell_views(workspace, split, names, raytraced=raytraced, base=base, targets=targets)
         self.memory.move_to_end(key)
         while len(self.memory) > KEPT_SETS:
             self.memory.popitem(last=False)
@@ -212,9 +230,18 @@ class Worker:
 
 
 def load_cell_views(
-    workspace: Workspace, split: str, names: list[str] | None, *, raytraced: bool, base: str
+    workspace: Workspace,
+    split: str,
+    names: list[str] | None,
+    *,
+    raytraced: bool,
+    base: str,
+    targets: str | None = None,
 ) -> ViewSet:
-    """Views of the split (None: all) with ray-traced or rasterised targets and their base images."""
+    """Views of the split (None: all) with ray-traced or rasterised targets and their base images.
+
+    targets: folder of the ray-traced pictures, where it is not the split's.
+    """
     from dnrtrain.dataset import load_views
 
     views = {view.name: view for view in split_views(workspace)[split]}
@@ -227,7 +254,7 @@ def load_cell_views(
             passes = [raster_file(workspace, view.name) for view in chosen]
     elif base != "none":
         extra = {"base": base, "base_files": [base_file(workspace, base, split, view.name) for view in chosen]}
-    images = [workspace.raytraced(split, view.name) for view in chosen] if raytraced else None
+    images = [workspace.raytraced(targets or split, view.name) for view in chosen] if raytraced else None
     frame = read_frame(workspace)
     return load_views(passes, images, frame, cameras=chosen, folder=workspace.scene, **extra)
 

@@ -52,7 +52,7 @@ class Row:
     name: as on the command line and in tables. what: for people. changes: nested settings. views: how the
     training views are chosen. network: False measures the base image alone. against: the row that differs
     in this one thing. full_step1: step 1 runs the preset's epochs even where all rows train equally long, because
-    it is what the row is about.
+    it is what the row is about. budget, spp: views and samples of their ray tracing, None = the run's.
     """
 
     name: str
@@ -63,6 +63,8 @@ class Row:
     network: bool = True
     against: str | None = None
     full_step1: bool = False
+    budget: int | None = None
+    spp: int | None = None
 
 
 def _model(**changes: Any) -> dict[str, Any]:

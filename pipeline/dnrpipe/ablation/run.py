@@ -29,7 +29,7 @@ from .cells import STEP1_SHARE
 from .crew import Crew, make_crew
 from .results import code_state
 from .rows import Row, needs_base, needs_coarse, settings_of, step1_policy
-from .scenes import Scene, make_bases, prepare_scene, trace_references, trace_train
+from .scenes import Scene, make_bases, prepare_scene, trace_references, trace_train, traced_split
 
 CELL_VERSION = 1  # raise when training or measuring changes what a cell holds
 
@@ -76,13 +76,16 @@ class Ablation:
         self.perceptual = perceptual_weights(self.console) is not None
         with self.console.bar("scenes", len(request.scenes)) as bar:
             for source in request.scenes:
-                scene = prepare_scene(source, request.out, request.base, self.console)
+                scene = self._open(source)
                 self.references[scene.name] = trace_references(scene, request.base, self.console)
                 self.scenes.append(scene)
                 bar.advance(note=scene.name)
         for seed in range(request.seeds):
             step1 = self._step1(seed)
             self._cells(seed, step1)
+
+    def _open(self, source: Path) -> Scene:
+        return prepare_scene(source, self.request.out, self.request.base, self.console)
 
     # -- step 1 ----------------------------------------------------------------------------------------
 
@@ -129,7 +132,12 @@ class Ablation:
         for scene in self.scenes:
             chosen = {row.name: self._views(scene, row, seed, step1) for row in self.request.rows}
             everything = sorted({name for names in chosen.values() for name in names})
-            traced = trace_train(scene, self.request.base, self.console, everything)
+            by_spp: dict[int | None, set[str]] = {}
+            for row in self.request.rows:
+                by_spp.setdefault(row.spp, set()).update(chosen[row.name])
+            traced = {
+                spp: trace_train(scene, self.request.base, self.console, names, spp) for spp, names in by_spp.items()
+            }
             bases: dict[str, dict[str, str]] = {}
             for row in self.request.rows:
                 settings = self._settings(row, scene)
@@ -138,7 +146,7 @@ class Ablation:
                     bases[kind] = make_bases(scene, settings, self.console, everything)
                 coarse = step1.get((scene.name, row.name)) if settings.finetune.step2.start == "coarse" else None
                 base = bases[kind] if needs_base(row, settings) else {}
-                task = self._cell(scene, row, seed, settings, chosen[row.name], traced, coarse, base)
+                task = self._cell(scene, row, seed, settings, chosen[row.name], traced[row.spp], coarse, base)
                 self.cells[scene.name, row.name, seed] = task["key"]
                 tasks.setdefault(task["key"], task)
         self._work(f"cells, seed {seed}", list(tasks.values()))
@@ -175,6 +183,7 @@ class Ablation:
             "settings": settings.model_dump(mode="json"),
             "network": row.network,
             "views": views if row.network else [],
+            "targets": traced_split(self.request.base, row.spp),
             "coarse": coarse and coarse["folder"],
             "coarse_cost": coarse and coarse["result"],
             "seconds": self.request.seconds if row.network else None,
@@ -193,7 +202,7 @@ class Ablation:
         return self.request.out / "pace" / scene.name / f"{digest([*parts, self.device, self.threads])}.json"
 
     def _views(self, scene: Scene, row: Row, seed: int, step1: dict[tuple[str, str], dict[str, Any]]) -> list[str]:
-        budget = self.request.base.select.budget
+        budget = row.budget or self.request.base.select.budget
         if row.views == "rl":
             return step1[scene.name, row.name]["result"]["selected"]
         if row.views == "all":

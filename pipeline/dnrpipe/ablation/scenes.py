@@ -107,10 +107,21 @@ def prepared(name: str, workspace: Workspace, settings: Settings, console: Conso
     )
 
 
-def trace_train(scene: Scene, settings: Settings, console: Console, names: Iterable[str]) -> dict[str, str]:
-    """Path-trace the named candidates that are not there yet -> fingerprint of each view's file."""
-    wanted = [view for name, view in scene.train.items() if name in set(names)]
-    return _trace(scene, settings, console, wanted, "train")
+def trace_train(
+    scene: Scene, settings: Settings, console: Console, names: Iterable[str], spp: int | None = None
+) -> dict[str, str]:
+    """Path-trace the named candidates that are not there yet -> fingerprint of each view's file.
+
+    spp: instead of the settings'; the pictures then lie in a split of their own (:func:`traced_split`).
+    """
+    chosen = set(names)
+    wanted = [view for name, view in scene.train.items() if name in chosen]
+    return _trace(scene, settings, console, wanted, traced_split(settings, spp), spp)
+
+
+def traced_split(settings: Settings, spp: int | None) -> str:
+    """Folder under ``raytraced/`` of training views at ``spp`` samples; the settings' samples lie in ``train``."""
+    return "train" if spp in (None, settings.raytrace.spp) else f"train-{spp}spp"
 
 
 def trace_references(scene: Scene, settings: Settings, console: Console) -> dict[str, str]:
@@ -203,7 +214,9 @@ def _raster_test_views(scene: Scene, settings: Settings, console: Console) -> di
     return {name: task["fingerprint"] for name, task in zip(scene.test, tasks, strict=True)}
 
 
-def _trace(scene: Scene, settings: Settings, console: Console, views: list[View], split: str) -> dict[str, str]:
+def _trace(
+    scene: Scene, settings: Settings, console: Console, views: list[View], split: str, spp: int | None = None
+) -> dict[str, str]:
     test = split == "test"
     tasks = trace_views(
         scene.workspace,
@@ -212,7 +225,7 @@ def _trace(scene: Scene, settings: Settings, console: Console, views: list[View]
         scene.run_id,
         views=views,
         split=split,
-        spp=settings.raytrace.evaluation_spp if test else settings.raytrace.spp,
+        spp=settings.raytrace.evaluation_spp if test else spp or settings.raytrace.spp,
         stage="evaluate" if test else "raytrace",
         purpose="evaluation" if test else "training",
     )

@@ -16,7 +16,9 @@ from . import information, pictures, scene, stages
 from .ablate import ablate
 from .bench_select import bench_select
 from .export import export_gltf, export_nerf, export_onnx, export_web
+from .frontier import frontier
 from .jobs import cancel, jobs, logs, retry, submit
+from .plan import plan
 from .serve import bench_live, serve
 from .train_selector import train_selector
 from .verify import verify
@@ -63,6 +65,8 @@ for _command in (
     export_gltf,
     export_web,
     stages.run,
+    plan,
+    frontier,
     ablate,
     bench_select,
     train_selector,

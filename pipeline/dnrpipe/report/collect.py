@@ -17,6 +17,7 @@ from dnrtrain.contract import ContractError, SceneFrame, View, read_cameras
 from .. import costs
 from ..errors import UserError
 from .advice import missing, notes
+from .budget import build_budget
 from .coverage import coverage_maps
 from .data import (
     ChosenView,
@@ -151,6 +152,7 @@ def collect(root: Path, *, made_at: datetime | None = None) -> ReportData:
         sphere=_sphere(root, cameras, chosen, metrics),
         training=training,
         costs=summary if records else None,
+        budget=build_budget(root, quality, upfront),
         break_even=break_even,
         upfront_seconds=upfront,
         findings=_findings(root),

@@ -193,6 +193,32 @@ class Missing(_Frozen):
     command: str
 
 
+class PlannedRow(_Frozen):
+    """One line of predicted against actual."""
+
+    what: str
+    predicted: str
+    actual: str
+
+
+class FrontierSummary(_Frozen):
+    """pictures: (what it says, data URI) of each number of frames."""
+
+    pictures: list[tuple[str, str]] = Field(repr=False)
+
+
+class Budget(_Frozen):
+    """What a producer wants to know, in sentences. following: what the next minute would buy."""
+
+    cost: str
+    bought: str
+    following: str
+    rows: list[PlannedRow]
+    why: list[str]
+    routes: list[str]
+    frontier: FrontierSummary | None
+
+
 class ReportData(BaseModel):
     """Everything on the page."""
 
@@ -213,6 +239,7 @@ class ReportData(BaseModel):
     sphere: Sphere | None
     training: list[Training]
     costs: dict[str, Any] | None
+    budget: Budget | None = None
     break_even: int | None
     upfront_seconds: float | None
     findings: list[FindingGroup]
@@ -227,7 +254,7 @@ class ReportData(BaseModel):
 
 def _without_uris(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _without_uris(item) for key, item in value.items() if key != "uri"}
+        return {key: _without_uris(item) for key, item in value.items() if key not in ("uri", "pictures")}
     if isinstance(value, list):
         return [_without_uris(item) for item in value]
     return value

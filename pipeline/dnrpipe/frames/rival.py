@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from dnrpipe.raytrace.denoise import Quality, denoise
 from dnrtrain.contract import View
 
+from ..raytrace.denoise import Quality, denoise
 from .scene import BenchScene, Clock
 
 SAMPLES = (1, 2, 4, 8, 16, 64)

@@ -13,18 +13,18 @@ from typing import Any, Literal
 
 import numpy as np
 
-from dnrpipe.base import light_path
-from dnrpipe.errors import UserError
-from dnrpipe.raytrace.base import BaseRenderer
-from dnrpipe.raytrace.base_worker import denoised
-from dnrpipe.raytrace.light_worker import read_light
-from dnrpipe.raytrace.units import scaled_view
 from dnrtrain.checkpoint import load_model, read_record
 from dnrtrain.contract import View
 from dnrtrain.dataset import load_views
 from dnrtrain.exr import write_exr
 from dnrtrain.model import render_views
 
+from ..base import light_path
+from ..errors import UserError
+from ..raytrace.base import BaseRenderer
+from ..raytrace.base_worker import denoised
+from ..raytrace.light_worker import read_light
+from ..raytrace.units import scaled_view
 from .scene import BenchScene, Clock
 
 TIMED = ("none", "baked")
@@ -37,12 +37,18 @@ class Ours:
 
     model is None, and frames have nothing neural, where the workspace has none: the base image alone is measured then.
     samples: rays per pixel of base images, each a renderer of its own with the same model, whatever it was trained
-    with; none: the workspace's.
+    with; none: the workspace's. folder, light: another model and baked light than the workspace's.
     Raises UserError: the model has a base image that is not timed here, or its light is not baked.
     """
 
-    def __init__(self, scene: BenchScene, samples: tuple[int, ...] = ()) -> None:
-        folder = scene.workspace.checkpoints("step2")
+    def __init__(
+        self,
+        scene: BenchScene,
+        samples: tuple[int, ...] = (),
+        folder: Path | None = None,
+        light: Path | None = None,
+    ) -> None:
+        folder = folder or scene.workspace.checkpoints("step2")
         self.scene = scene
         self.model = load_model(folder) if read_record(folder) is not None else None
         self.base: Literal["none", "raster", "baked", "direct", "path"] = (
@@ -52,7 +58,7 @@ class Ours:
             raise UserError(f"{folder}: base image '{self.base}' cannot be timed here, only {', '.join(TIMED)}")
         self.renderers: dict[int, BaseRenderer] = {}
         if self.base == "baked":
-            light = light_path(scene.workspace)
+            light = light or light_path(scene.workspace)
             if not light.exists():
                 raise UserError(f"{light}: the light is not baked; run `dnrpipe finetune` with model.base=baked first")
             mitsuba_scene = scene.engine.scenes[str(scene.bundle)]

@@ -11,16 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from dnrpipe.console import Console
-from dnrpipe.effects.store import lenses, resolve_plan, trace_config, variant_for
-from dnrpipe.errors import UserError
-from dnrpipe.prepare import split_views
-from dnrpipe.scene_files import read_frame, read_summary, scene_fingerprint
-from dnrpipe.session import resolve_settings
-from dnrpipe.settings import Settings
-from dnrpipe.workspace import Workspace, digest
 from dnrtrain.contract import SceneFrame, View
 from dnrtrain.display import DisplayTransform
+
+from ..console import Console
+from ..effects.store import lenses, resolve_plan, trace_config, variant_for
+from ..errors import UserError
+from ..prepare import split_views
+from ..scene_files import read_frame, read_summary, scene_fingerprint
+from ..session import resolve_settings
+from ..settings import Settings
+from ..workspace import Workspace, digest
 
 
 @dataclass
@@ -72,20 +73,21 @@ class BenchScene:
         return self.display.over_white(planes[:, :3], planes[:, 3:])
 
 
-def open_scene(root: Path, views: int, threads: int) -> BenchScene:
-    """Open a workspace that was prepared; its first ``views`` test views. Mitsuba must not be imported yet.
+def open_scene(root: Path, views: int | list[View], threads: int, settings: Settings | None = None) -> BenchScene:
+    """Open a workspace that was prepared. Mitsuba must not be imported yet.
 
+    views: so many of its test views, or views of one size. settings: instead of those that the workspace remembers.
     Raises UserError: no test views, or cameras with depth of field (their frames are not timed here).
     """
-    from dnrpipe.raytrace.engine import Engine
-    from dnrpipe.raytrace.frames import Frames
+    from ..raytrace.engine import Engine
+    from ..raytrace.frames import Frames
 
     workspace = Workspace.open(root)
-    settings = resolve_settings(workspace, {}, None)
+    settings = settings or resolve_settings(workspace, {}, None)
     plan = resolve_plan(workspace, settings, Console(quiet=True), "bench", "evaluate")
     if plan.on("depth-of-field") and lenses(workspace, settings):
         raise UserError(f"{root}: its cameras have depth of field, which the frame benchmark cannot time")
-    chosen = split_views(workspace)["test"][:views]
+    chosen = split_views(workspace)["test"][:views] if isinstance(views, int) else views
     if not chosen:
         raise UserError(f"{root}: has no test views; prepare again with cameras.test > 0")
     choice = variant_for(plan, settings)

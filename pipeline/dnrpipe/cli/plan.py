@@ -1,0 +1,72 @@
+"""`dnrpipe plan`: what a budget of time buys, or what an error costs, before it is spent."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ..errors import UserError
+from .options import CAMERA_OPTIONS, STRICT, camera_overrides, common, open_session, options, strict_override
+
+
+@click.command()
+@click.argument("scene", type=click.Path(path_type=Path), required=False)
+@click.option("--time", "duration", metavar="T", help="Time to spend from here on, e.g. 90s, 15m, 2h.")
+@click.option("--target-psnr", type=float, metavar="DB", help="PSNR wanted on new views.")
+@click.option("--frames", type=int, metavar="N", help="Frames to be rendered: says whether to train at all.")
+@click.option("--apply", "carry_out", is_flag=True, help="Carry the plan out, then compare it with what happened.")
+@STRICT
+@options(CAMERA_OPTIONS)
+@common
+def plan(
+    scene: Path | None,
+    duration: str | None,
+    target_psnr: float | None,
+    frames: int | None,
+    carry_out: bool,
+    strict: bool,
+    **options: Any,
+) -> None:
+    """Predict what time buys and choose views, samples and steps.
+
+    SCENE is a scene file or a workspace (scene.dnr); without it, the workspace is found as usual. The scene is
+    prepared where it is not. A pilot of about a minute measures each kind of work once and is kept in the workspace.
+    Without --time and --target-psnr, a table of budgets is printed.
+
+    \b
+    Examples:
+      dnrpipe plan scene.blend                       # what each budget buys
+      dnrpipe plan --time 15m                        # the best that fifteen minutes buy, and why
+      dnrpipe plan --target-psnr 30 --frames 200     # is training worth it for 200 frames?
+      dnrpipe plan --time 15m --apply                # do it; predicted against actual goes to the report
+    """
+    if frames is not None and frames < 1:
+        raise UserError(f"--frames {frames}: at least 1")
+    if carry_out and duration is None and target_psnr is None:
+        raise UserError("--apply: what shall be carried out? give --time or --target-psnr")
+    from ..planning.command import Wanted, apply, make_plan, parse_duration
+    from ..planning.pilot import pilot_path
+    from ..planning.words import actual_lines, lines
+    from ..tasks import worker_count
+
+    wanted = Wanted(parse_duration(duration) if duration else None, target_psnr, frames)
+    if scene is not None and (scene / "manifest.json").exists():
+        options["workspace"], scene = str(scene), None
+    overrides = {**camera_overrides(options), **strict_override(strict)}
+    force, options["force"] = options["force"], False
+    with open_session("plan", options, scene=scene, overrides=overrides) as session:
+        session.stages("prepare")
+        if force:
+            pilot_path(session.workspace).unlink(missing_ok=True)
+        record = make_plan(session.workspace, session.settings, session.console, wanted)
+        for line in lines(record, worker_count(0)):
+            session.console.say(line)
+        if carry_out:
+            if record["chosen"] is None:
+                raise UserError(f"--apply: nothing is expected to reach {target_psnr:g} dB; see the routes above")
+            record = apply(session, record)
+            for line in actual_lines(record):
+                session.console.say(line)
+        session.console.result({"workspace": str(session.workspace.root), **record})

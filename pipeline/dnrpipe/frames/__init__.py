@@ -1,0 +1,7 @@
+"""What a frame costs and how good it is: ours, and path tracing with a denoiser, timed in one process.
+
+scene      a workspace opened for timing: Mitsuba, plan, views, display
+rival      the ladder: samples x what the denoiser is given
+ours       G-buffer, base image, network
+ladder     best picture by milliseconds, lead at equal time, crossover (numpy only)
+"""

@@ -1,0 +1,166 @@
+"""`dnrpipe frontier` behind its options: the sweep, the rivals, and what it writes into ``frontier/``.
+
+results.json  results.csv  frontier-<N>.png (one per number of frames)  report.md
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING, Any
+
+from dnrtrain.atomic import atomic_path, write_json, write_text
+
+from ..ablation.crew import Crew, check_amounts
+from ..ablation.results import made_by, read_made
+from ..errors import UserError
+from ..prepare import split_views
+from ..settings import Settings
+from ..tasks import worker_count
+from ..workspace import digest
+from .account import break_evens, pareto, point_of, settle_frames
+from .plot import plot
+from .run import RIVALS, Frontier, Sweep, make_frontier
+from .words import markdown
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ..session import Session
+
+SCHEMA, RIVAL_VERSION = 1, 1
+LADDER = (1, 2, 4, 8, 16, 64)
+COLUMNS = (
+    "name", "kind", "seed", "views", "spp", "steps", "upfront", "frame_ms", "psnr", "ssim", "lpips_vgg", "flip",
+    "rival_ms", "break_even",
+)  # fmt: skip
+
+
+def numbers(text: str | None, option: str, default: Sequence[int], most: int | None = None) -> tuple[int, ...]:
+    """``"6,12,25"`` in rising order; the default where not given. Raises UserError: not positive whole numbers, or
+    more than ``most``."""
+    if text is None:
+        return tuple(sorted({n if most is None else min(n, most) for n in default}))
+    found = set()
+    for part in text.split(","):
+        if not part.strip().isdecimal() or int(part) < 1 or (most is not None and int(part) > most):
+            limit = "" if most is None else f" from 1 to {most}"
+            raise UserError(f"{option} {text}: expected whole numbers{limit}, e.g. {','.join(map(str, default))}")
+        found.add(int(part))
+    return tuple(sorted(found))
+
+
+def run_frontier(
+    session: Session,
+    *,
+    budgets: str | None,
+    spp: str | None,
+    iterations: str | None,
+    frames: str | None,
+    also: str,
+    ladder: str | None,
+    seeds: int,
+    jobs: int,
+) -> dict[str, Any]:
+    """Measure what is due and write it -> the results.
+
+    Raises:
+        UserError: unknown names, numbers that do not fit. TasksFailed: some cells failed; the others are written.
+    """
+    workspace, settings, console = session.workspace, session.settings, session.console
+    check_amounts(None, seeds, jobs)
+    candidates = len(split_views(workspace)["train"])
+    counts = numbers(frames, "--frames", (200, 2000))
+    sweep = Sweep(
+        budgets=numbers(budgets, "--budgets", (6, 12, settings.select.budget), candidates),
+        samples=numbers(spp, "--spp", (16, settings.raytrace.spp)),
+        steps=numbers(iterations, "--iterations", (150, 600)),
+        also=_rivals(also),
+    )
+    rungs = numbers(ladder, "--ladder", LADDER)
+    rows = sweep.rows(settings)
+    out = workspace.root / "frontier"
+    run = make_frontier(workspace, settings, rows, out, jobs, seeds, console)
+    run.check()
+    run.run()
+    cores = worker_count(0)
+    rivals = _rival(run, settings, rungs, cores)
+    points = [
+        point
+        for seed in range(seeds)
+        for row in rows
+        if (row.network or seed == 0) and (point := point_of(run, row, seed, rivals, cores))
+    ]
+    for point in points:
+        point["name"] += f", seed {point['seed']}" if seeds > 1 and point["kind"] != "base" else ""
+    settle_frames(points)
+    break_evens(points, rivals["rungs"])
+    results: dict[str, Any] = {
+        "schema": SCHEMA,
+        **made_by(),
+        "scene": workspace.root.name.removesuffix(".dnr"),
+        "preset": settings.preset,
+        "resolution": f"{settings.cameras.width}x{settings.cameras.height}",
+        "sweep": asdict(sweep),
+        "frames": list(counts),
+        "cores": cores,
+        "test_views": len(run.scene.test),
+        "evaluation_spp": settings.raytrace.evaluation_spp,
+        "threads": run.threads,
+        "rival_threads": rivals["threads"],
+        "points": points,
+        "rungs": rivals["rungs"],
+    }
+    results["pareto"] = {str(count): pareto(results, count) for count in counts}
+    _write(results, out)
+    return results
+
+
+def read_frontier(path: Path) -> dict[str, Any]:
+    """``frontier/results.json``. Raises UserError: missing, damaged or of another schema."""
+    return read_made(path, "frontier", SCHEMA, "points")
+
+
+def _rivals(text: str) -> tuple[str, ...]:
+    names = tuple(filter(None, (part.strip() for part in text.split(","))))
+    if text.strip() == "none":
+        return ()
+    if unknown := set(names) - set(RIVALS):
+        raise UserError(f"--also {', '.join(sorted(unknown))}: choose of {', '.join(RIVALS)}, or none")
+    return names
+
+
+def _rival(run: Frontier, settings: Settings, samples: tuple[int, ...], cores: int) -> dict[str, Any]:
+    """Path tracing of the test views, rendered where it is not on disk."""
+    references = sorted(run.references[run.scene.name].values())
+    base = settings.model_copy(update={"model": run._settings(run.request.rows[0], run.scene).model})
+    key = digest([RIVAL_VERSION, references, samples, base.model.base, base.base.model_dump(), cores, run.perceptual])
+    output = run.request.out / "rivals" / f"{key}.json"
+    task = {
+        "key": key,
+        "workspace": str(run.scene.workspace.root),
+        "settings": base.model_dump(mode="json"),
+        "samples": list(samples),
+        "output": str(output),
+        "label": "path tracing",
+    }
+    crew: Crew = replace(run.crew, threads=cores, workers=1)
+    crew.work("path tracing of the test views", "dnrpipe.frontier.rivals", [task])
+    return json.loads(output.read_text(encoding="utf-8"))
+
+
+def _write(results: dict[str, Any], out: Path) -> None:
+    write_json(out / "results.json", results)
+    with atomic_path(out / "results.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, COLUMNS, extrasaction="ignore", restval="")
+        writer.writeheader()
+        for one in results["points"]:
+            writer.writerow(one)
+        for rung in results["rungs"]:
+            kind = "path tracing + denoiser" if rung["denoised"] else "path tracing"
+            writer.writerow({**rung, "kind": kind, "frame_ms": rung["ms"], "upfront": 0.0})
+    for count in results["frames"]:
+        plot(results, count, out / f"frontier-{count}.png")
+    write_text(out / "report.md", markdown(results))

@@ -1,0 +1,88 @@
+"""Metrics against total seconds (log axis): shapes and line styles tell the kinds apart without colour, too."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from dnrtrain.atomic import atomic_path
+
+from .account import pareto, total_seconds
+
+# Okabe and Ito's palette; filled and hollow shapes differ in grey as well.
+LOOKS: dict[str, dict[str, Any]] = {
+    "ours": {"label": "ours: views x spp x steps", "marker": "o", "color": "#0072B2"},
+    "random": {"label": "random views", "marker": "s", "color": "#56B4E9", "fillstyle": "none"},
+    "all": {"label": "all candidates", "marker": "D", "color": "#009E73"},
+    "paper": {"label": "the paper's model", "marker": "P", "color": "#CC79A7"},
+    "base": {"label": "base image alone", "marker": "X", "color": "#000000"},
+}
+LADDERS = {
+    False: {"label": "path tracing", "marker": "v", "color": "#D55E00", "linestyle": ":", "fillstyle": "none"},
+    True: {"label": "path tracing + denoiser", "marker": "^", "color": "#D55E00", "linestyle": "--"},
+}
+TITLES = {
+    "psnr": "PSNR, dB (higher is better)",
+    "ssim": "SSIM (higher is better)",
+    "lpips_vgg": "LPIPS VGG (lower is better)",
+    "flip": "FLIP (lower is better)",
+}
+
+
+def plot(results: Mapping[str, Any], frames: int, path: Path) -> None:
+    """Write a PNG: a panel per metric; x: seconds until ``frames`` frames are there. The front is a grey line."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    everything = [*results["points"], *results["rungs"]]
+    metrics = [name for name in TITLES if any(one[name] is not None for one in everything)]
+    figure = Figure(figsize=(11, 8), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(2, 2).ravel()
+    for axis, metric in zip(axes, metrics, strict=False):
+        _panel(axis, results, everything, frames, metric)
+    for axis in axes[len(metrics) :]:
+        axis.set_visible(False)
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9)
+    figure.suptitle(
+        f"{results['scene']}, {results['resolution']}: {frames} frames, everything before the first one included",
+        fontsize=11,
+    )
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=110)
+
+
+def _panel(axis: Any, results: Mapping[str, Any], everything: list[dict[str, Any]], frames: int, metric: str) -> None:
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    names = pareto(results, frames, metric)
+    by_name = {one["name"]: one for one in everything}
+    front = [(total_seconds(by_name[name], frames), by_name[name][metric]) for name in names]
+    axis.plot(*zip(*front, strict=True), color="0.75", linewidth=6, solid_capstyle="round", zorder=0, label="front")
+    for kind, look in LOOKS.items():
+        found = [(total_seconds(p, frames), p[metric]) for p in results["points"] if p["kind"] == kind]
+        found = [(x, y) for x, y in found if y is not None]
+        if found:
+            axis.plot(*zip(*found, strict=True), linestyle="none", markersize=6, zorder=3, **look)
+    for denoised, look in LADDERS.items():
+        rungs = [rung for rung in results["rungs"] if rung["denoised"] == denoised and rung[metric] is not None]
+        best = _best(rungs, frames, metric)
+        if best:
+            axis.plot(*zip(*best, strict=True), markersize=5, linewidth=1.2, zorder=2, **look)
+    axis.set_xscale("log")
+    axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.xaxis.set_minor_formatter(NullFormatter())
+    axis.set_xlabel(f"seconds of processor time for {frames} frames")
+    axis.set_title(TITLES[metric], fontsize=10)
+    axis.grid(color="0.9", which="both")
+    axis.set_axisbelow(True)
+
+
+def _best(rungs: list[dict[str, Any]], frames: int, metric: str) -> list[tuple[float, float]]:
+    """The rungs that no other of them beats, by seconds."""
+    by_name = {rung["name"]: rung for rung in rungs}
+    names = pareto({"points": [], "rungs": rungs}, frames, metric)
+    return [(total_seconds(by_name[name], frames), by_name[name][metric]) for name in names]

@@ -1,0 +1,121 @@
+"""The rival in the same run: path tracing of the test views, raw and denoised, and our frames beside it, by one clock.
+
+A worker (``python -m dnrpipe.executors``) renders them; their pictures are measured against the references that the
+cells are measured against.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dnrtrain.atomic import write_json
+from dnrtrain.exr import read_exr
+
+from ..settings import Settings
+from ..workspace import Workspace
+
+METHODS = ("raw", "colour-fast", "clean16-fast", "clean16")
+WARM = 2
+
+
+class Worker:
+    """common: {"threads"}; task: {"workspace", "settings", "samples", "output", "key"} -> what its output file holds:
+
+    {"key", "threads", "rungs": [{"name", "spp", "denoised", "ms", metrics}], "base_ms"}; metrics as in cells, means
+    over the test views; base_ms: of a base image with its G-buffer, by the same clock, None where none is rendered.
+    """
+
+    def __init__(self, common: dict[str, Any]) -> None:
+        import torch
+
+        if common["threads"]:
+            torch.set_num_threads(int(common["threads"]))
+        self.threads = torch.get_num_threads()
+
+    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
+        from ..frames.ours import BASE, TIMED, Ours
+        from ..frames.rival import METHODS as ALL
+        from ..frames.rival import climb, make_rungs
+        from ..frames.scene import Clock, open_scene
+        from ..prepare import split_views
+
+        workspace = Workspace.open(Path(task["workspace"]))
+        settings = Settings.model_validate(task["settings"])
+        views = split_views(workspace)["test"]
+        scene = open_scene(workspace.root, views, self.threads, settings)
+        clock = Clock("cpu", self.threads)
+        samples = tuple(int(n) for n in task["samples"])
+        for turn in range(WARM):
+            climb(scene, views[0], turn, clock, make_rungs(samples, METHODS))
+        rungs = make_rungs(samples, METHODS)
+        for number, view in enumerate(views):
+            climb(scene, view, 10_007 * (number + 1), clock, rungs)
+        truth, masks = self._references(scene, workspace, [view.name for view in views])
+        lpips = _lpips()
+        found = [
+            {
+                "name": rung.name,
+                "spp": rung.spp,
+                "denoised": ALL[rung.method].denoise,
+                "ms": rung.ms(),
+                **_quality([picture.float() for picture in rung.pictures], truth, masks, lpips),
+            }
+            for rung in rungs.values()
+        ]
+        base_ms = None
+        if settings.model.base == "baked" and settings.model.base in TIMED:
+            ours = Ours(scene, (), Path(task["output"]).parent / "no-model")
+            ours.frame(views[0], clock)
+            frames = [next(iter(ours.frame(view, clock).items())) for view in views]
+            base_ms = float(
+                np.median([sum(frame["parts"].values()) for name, frame in frames if name.startswith(BASE)])
+            )
+        made = {"key": task["key"], "threads": self.threads, "rungs": found, "base_ms": base_ms}
+        write_json(Path(task["output"]), made)
+        return made
+
+    def _references(self, scene: Any, workspace: Workspace, names: list[str]) -> tuple[list[Any], list[Any]]:
+        """Display pictures [1, 3, H, W] and masks [1, 1, H, W] of the test views."""
+        import torch
+
+        truth, masks = [], []
+        for name in names:
+            channels, _ = read_exr(workspace.raytraced("test", name))
+            truth.append(scene.shown(np.stack([channels[c] for c in "RGBA"], axis=-1)))
+            gbuffer, _ = read_exr(workspace.passes("test", name))
+            masks.append(torch.from_numpy(np.ascontiguousarray(gbuffer["mask"] > 0.5)).float()[None, None])
+        return truth, masks
+
+
+def _lpips() -> Any:
+    from dnrtrain.perceptual import build_lpips
+    from dnrtrain.weights import WeightsMissing, load_weights
+
+    try:
+        return build_lpips(load_weights())
+    except WeightsMissing:  # the parent has said so
+        return None
+
+
+def _quality(pictures: list[Any], truth: list[Any], masks: list[Any], lpips: Any) -> dict[str, float | None]:
+    """Means over the views of the metrics that cells have."""
+    from dnrtrain.metrics import image_metrics
+
+    from ..evaluate import flip_error
+
+    rows = []
+    for picture, target, mask in zip(pictures, truth, masks, strict=True):
+        row: dict[str, Any] = dict(image_metrics(picture, target, mask, lpips))
+        row["flip"] = flip_error(_image(target), _image(picture))[0]
+        rows.append(row)
+    return {
+        key: float(np.mean(values)) if (values := [row[key] for row in rows if row[key] is not None]) else None
+        for key in rows[0]
+    }
+
+
+def _image(tensor: Any) -> np.ndarray:
+    return tensor[0].float().clamp(0, 1).permute(1, 2, 0).cpu().numpy()

@@ -1,0 +1,97 @@
+"""The views, samples and steps that a budget of time or a wanted PSNR calls for: a grid is looked at whole."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from .quality import Prior, predict
+from .records import Choice, Interval, Pilot, Prediction, Seconds
+from .seconds import TIME_SPREAD, Costs, noise_at
+
+VIEWS = (4, 6, 8, 10, 12, 16, 20, 25, 32, 40, 50, 65, 80, 100, 150, 200)
+SAMPLES = (4, 8, 16, 32, 64, 128, 256, 512, 1024)
+STEPS = (50, 75, 100, 150, 200, 300, 400, 600, 800, 1200, 1600, 2400, 3200, 4800, 6400, 9600)
+NEAR = 0.02
+"""dB within which two choices count as equally good: the cheaper one is taken."""
+
+
+@dataclass(frozen=True)
+class Predictor:
+    """Costs and quality of any choice. base, gain: dB, of the pilot; batch: views per optimiser step."""
+
+    pilot: Pilot
+    wall: Costs
+    processor: Costs
+    prior: Prior
+    base: float
+    gain: tuple[float, float]
+    batch: int
+
+    def choice(self, views: int, spp: int, steps: int) -> Choice:
+        """The choice of about so many steps: whole passes over the views, one at least."""
+        per_epoch = math.ceil(views / self.batch)
+        epochs = max(1, round(steps / per_epoch))
+        return Choice(views=views, spp=spp, epochs=epochs, steps=epochs * per_epoch)
+
+    def predict(self, choice: Choice) -> Prediction:
+        """What the choice is expected to cost and give."""
+        assert self.pilot.trace is not None
+        select = self.wall.work.policy_seconds
+        raytrace, finetune = self.wall.raytrace(choice.views, choice.spp), self.wall.finetune(choice.steps)
+        total = select + raytrace + finetune
+        seconds = Seconds(
+            select=select,
+            raytrace=raytrace,
+            finetune=finetune,
+            evaluate=self.wall.evaluate(),
+            total=Interval(expected=total, low=total / TIME_SPREAD, high=total * TIME_SPREAD),
+        )
+        noise = noise_at(self.pilot.trace, choice.spp)
+        return Prediction(
+            choice=choice,
+            seconds=seconds,
+            cpu_seconds=self.processor.raytrace(choice.views, choice.spp) + self.processor.finetune(choice.steps),
+            psnr=predict(self.prior, self.base, self.gain, choice.views, choice.steps, noise),
+        )
+
+    def grid(self, candidates: int) -> Iterator[Prediction]:
+        """All choices with at most ``candidates`` views."""
+        views = sorted({*(n for n in VIEWS if n <= candidates), candidates})
+        for count in views:
+            for spp in SAMPLES:
+                for steps in STEPS:
+                    yield self.predict(self.choice(count, spp, steps))
+
+
+def best_within(grid: list[Prediction], seconds: float) -> Prediction | None:
+    """The highest expected PSNR within ``seconds`` of expected time; None where nothing is so fast."""
+    within = [p for p in grid if p.seconds.total.expected <= seconds]
+    if not within:
+        return None
+    top = max(p.psnr.expected for p in within)
+    return min((p for p in within if p.psnr.expected >= top - NEAR), key=lambda p: p.seconds.total.expected)
+
+
+def cheapest_reaching(grid: list[Prediction], psnr: float) -> Prediction | None:
+    """The least expected time whose expected PSNR is at least ``psnr``; None where nothing reaches it."""
+    enough = [p for p in grid if p.psnr.expected >= psnr]
+    return min(enough, key=lambda p: p.seconds.total.expected) if enough else None
+
+
+def budgets(grid: list[Prediction]) -> list[Prediction]:
+    """The best choice within each of a row of budgets, from the cheapest choice on, each twice the one before.
+
+    Ends where more time buys less than a tenth of a decibel.
+    """
+    limit = min(p.seconds.total.expected for p in grid) * 1.01
+    rows: list[Prediction] = []
+    while len(rows) < 12:
+        found = best_within(grid, limit)
+        assert found is not None  # the cheapest choice fits
+        if rows and found.psnr.expected < rows[-1].psnr.expected + 0.1:
+            break
+        rows.append(found)
+        limit = max(limit, found.seconds.total.expected) * 2
+    return rows

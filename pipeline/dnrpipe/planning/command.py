@@ -1,0 +1,214 @@
+"""`dnrpipe plan` behind its options: pilot, prediction, choice; ``plan/plan.json``; carrying a plan out."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from dnrtrain.atomic import write_json
+from dnrtrain.selector.names import TRAINED_NAMES
+
+from ..base import light_is_baked, renderer_inputs
+from ..console import Console
+from ..costs import total
+from ..effects.store import plan_of
+from ..errors import UserError
+from ..prepare import split_views
+from ..settings import Settings
+from ..workspace import Workspace
+from .choose import Predictor, best_within, budgets, cheapest_reaching
+from .pilot import FOLDER, run_pilot
+from .quality import Prior, load_prior, scene_gain, without_noise
+from .records import Pilot, Prediction, Route
+from .routes import break_even, routes
+from .seconds import Costs, Work
+
+if TYPE_CHECKING:
+    from ..session import Session
+
+SCHEMA = 1
+BLIND_POLICY = "farthest"
+RULE_SECONDS = 2.0
+"""Wall seconds allowed for a choice of views that trains nothing."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What was asked for; all None: a table of budgets. seconds: of work from here on. frames: to be rendered."""
+
+    seconds: float | None = None
+    psnr: float | None = None
+    frames: int | None = None
+
+
+def parse_duration(text: str) -> float:
+    """``90``, ``90s``, ``15m``, ``1.5h`` -> seconds. Raises UserError."""
+    units = {"s": 1.0, "m": 60.0, "h": 3600.0}
+    number, unit = (text[:-1], units[text[-1]]) if text[-1:] in units else (text, 1.0)
+    try:
+        seconds = float(number) * unit
+    except ValueError:
+        seconds = 0.0
+    if not 0 < seconds < 1e8:
+        raise UserError(f"--time {text}: expected a duration such as 90s, 15m or 1.5h")
+    return seconds
+
+
+def make_plan(workspace: Workspace, settings: Settings, console: Console, wanted: Wanted) -> dict[str, Any]:
+    """Run the pilot where it is missing and write ``plan/plan.json`` -> its content.
+
+    Raises UserError: a budget that not even the smallest choice fits in, or a target that nothing reaches.
+    """
+    pilot = run_pilot(workspace, settings, console)
+    prior = load_prior()
+    predictor = make_predictor(workspace, settings, pilot, prior)
+    candidates = len(split_views(workspace)["train"])
+    grid = list(predictor.grid(candidates))
+    chosen = _choose(grid, wanted)
+    record: dict[str, Any] = {
+        "schema": SCHEMA,
+        "made": time.time(),
+        "wanted": {"seconds": wanted.seconds, "psnr": wanted.psnr, "frames": wanted.frames},
+        "pilot": {"fingerprint": pilot.fingerprint, "seconds": pilot.seconds, "load": pilot.load},
+        "policy": policy_of(workspace, settings),
+        "base_psnr": predictor.base,
+        "gain": list(predictor.gain),
+        "chosen": chosen.model_dump(mode="json") if chosen else None,
+        "table": [p.model_dump(mode="json") for p in budgets(grid)],
+        "prior": {"source": prior.source, "scenes": prior.scenes, "sd": prior.sd},
+        "settings_default": predictor.predict(_default(predictor, settings, candidates)).model_dump(mode="json"),
+    }
+    if wanted.frames is not None:
+        found, at = whether_to_train(predictor, grid, settings, wanted, chosen)
+        record |= {"routes": [r.model_dump(mode="json") for r in found], "routes_psnr": at}
+        record |= {"break_even": break_even(found), "train": found[0].reaches and found[0].name == "neural renderer"}
+    write_json(workspace.root / FOLDER / "plan.json", record)
+    return record
+
+
+def make_predictor(workspace: Workspace, settings: Settings, pilot: Pilot, prior: Prior) -> Predictor:
+    """Costs and quality of any choice in this workspace, by its pilot."""
+    assert pilot.frames is not None and pilot.training is not None  # the pilot is complete
+    plan = plan_of(workspace, settings)
+    _, _, light, _ = renderer_inputs(workspace, settings, plan)
+    due = None if light is None or light_is_baked(light) else (light["size"], light["spp"])
+    width, height = settings.cameras.width, settings.cameras.height
+    patch = settings.finetune.step2.patch or max(width, height)
+    frames, training = pilot.frames, pilot.training
+    work = Work(
+        pixels=width * height,
+        trained=min(patch, width) * min(patch, height),
+        light=due,
+        policy_seconds=_policy_seconds(workspace, settings, training.seconds),
+        tests=len(split_views(workspace).get("test", [])),
+        evaluation_spp=settings.raytrace.evaluation_spp,
+    )
+    base = without_noise(frames.base.psnr, frames.noise_rmse)
+    measured = without_noise(frames.neural.psnr, frames.noise_rmse) - base
+    return Predictor(
+        pilot=pilot,
+        wall=Costs(pilot, work, "seconds"),
+        processor=Costs(pilot, work, "cpu_seconds"),
+        prior=prior,
+        base=base,
+        gain=scene_gain(prior, measured, training.views, training.steps),
+        batch=settings.finetune.step2.batch,
+    )
+
+
+def whether_to_train(
+    predictor: Predictor, grid: list[Prediction], settings: Settings, wanted: Wanted, chosen: Prediction | None
+) -> tuple[list[Route], float]:
+    """(routes, the cheapest first; the PSNR they are compared at): what was wanted, else what the choice, else what
+    the settings as they are, are expected to give."""
+    assert wanted.frames is not None and predictor.pilot.frames is not None
+    best = max(grid, key=lambda p: p.psnr.expected)
+    at = wanted.psnr or (chosen or best).psnr.expected
+    neural = cheapest_reaching(grid, at)
+    width, height = predictor.pilot.size
+    scale = predictor.wall.work.pixels / (width * height)
+    found = routes(predictor.pilot.frames, neural, predictor.wall.light(), scale, at, wanted.frames)
+    return found, at
+
+
+def overrides_of(record: dict[str, Any]) -> dict[str, Any]:
+    """The settings that carry out a plan's choice."""
+    choice = record["chosen"]["choice"]
+    return {
+        "select": {"budget": choice["views"], "policy": record["policy"]},
+        "raytrace": {"spp": choice["spp"]},
+        "finetune": {"step2": {"epochs": choice["epochs"]}},
+    }
+
+
+def policy_of(workspace: Workspace, settings: Settings) -> str:
+    """The policy that the plan counts on: the settings', or farthest points in place of a trained one that nobody
+    asked for by name."""
+    named = workspace.manifest.overrides.get("select", {}).get("policy")
+    trained = settings.select.policy in TRAINED_NAMES
+    return BLIND_POLICY if trained and named is None else settings.select.policy
+
+
+def apply(session: Session, record: dict[str, Any]) -> dict[str, Any]:
+    """Run the stages with the plan's choice; ``plan/plan.json`` then holds what they took and gave, too."""
+    workspace = session.workspace
+    before = len(workspace.ledger.read())
+    session.adopt(overrides_of(record))
+    names = ["select", "raytrace", "finetune"]
+    if split_views(workspace).get("test"):
+        names.append("evaluate")
+    session.stages(*names)
+    answers = session.answers
+    made = {name: answers[name].get("seconds", 0.0) if answers[name]["ran"] else 0.0 for name in names}
+    spent = workspace.ledger.read()[before:]
+    actual: dict[str, Any] = {
+        "seconds": {**made, "total": sum(made[name] for name in names[:3])},
+        "cpu_seconds": total(r for r in spent if r.purpose == "training").cpu_seconds,
+        "ran": {name: answers[name]["ran"] for name in names},
+        "psnr": answers.get("evaluate", {}).get("mean", {}).get("psnr"),
+    }
+    record = record | {"actual": actual}
+    write_json(workspace.root / FOLDER / "plan.json", record)
+    return record
+
+
+def _choose(grid: list[Prediction], wanted: Wanted) -> Prediction | None:
+    if wanted.seconds is not None:
+        found = best_within(grid, wanted.seconds)
+        if found is None:
+            least = min(grid, key=lambda p: p.seconds.total.expected).seconds.total.expected
+            raise UserError(
+                f"--time: {wanted.seconds:.0f} s are not enough; the smallest choice is expected to take {least:.0f} s"
+            )
+        if wanted.psnr is not None and found.psnr.expected < wanted.psnr:
+            raise UserError(
+                f"--target-psnr {wanted.psnr:g}: within {wanted.seconds:.0f} s at most {found.psnr.expected:.1f} dB are"
+                " expected; give more time or ask for less"
+            )
+        if wanted.psnr is None:
+            return found
+    if wanted.psnr is not None:
+        found = cheapest_reaching(grid, wanted.psnr)
+        if found is None and wanted.frames is None:
+            top = max(p.psnr.expected for p in grid)
+            raise UserError(
+                f"--target-psnr {wanted.psnr:g}: the neural renderer is expected to end at {top:.1f} dB on this scene;"
+                " `dnrpipe plan --frames N` says what path tracing would take"
+            )
+        return found
+    return None
+
+
+def _default(predictor: Predictor, settings: Settings, candidates: int) -> Any:
+    views = min(settings.select.budget, candidates)
+    steps = settings.finetune.step2.epochs * -(-views // predictor.batch)
+    return predictor.choice(views, settings.raytrace.spp, steps)
+
+
+def _policy_seconds(workspace: Workspace, settings: Settings, step_seconds: float) -> float:
+    """Of the selection. A trained policy's steps are taken to last as long as the pilot's."""
+    trains = policy_of(workspace, settings) in TRAINED_NAMES or settings.finetune.step2.start == "coarse"
+    if not trains:
+        return RULE_SECONDS
+    return settings.select.step1.epochs * len(split_views(workspace)["train"]) * step_seconds

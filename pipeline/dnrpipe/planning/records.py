@@ -1,0 +1,155 @@
+"""What the pilot measured and what the plan says, as they stand in ``plan/pilot.json`` and ``plan/plan.json``.
+
+Seconds are on the wall clock unless ``cpu_`` says processor time. PSNR is in display space over white, dB.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict
+
+Clock = Literal["seconds", "cpu_seconds"]
+
+
+class Record(BaseModel):
+    """Frozen, without unknown keys, without NaN."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Traced(Record):
+    """One path-traced view. noise_rmse: of the picture as it is used (denoised where the settings say so)."""
+
+    spp: int
+    pixels: int
+    seconds: float
+    cpu_seconds: float
+    noise_rmse: float | None
+
+
+class TracePart(Record):
+    """startup: seconds until the workers traced their first small view; workers: side by side."""
+
+    points: list[Traced]
+    workers: int
+    startup: float
+
+
+class LightPoint(Record):
+    """One bake of light: texels of the side, paths per texel."""
+
+    size: int
+    spp: int
+    seconds: float
+    cpu_seconds: float
+
+
+class LightPart(Record):
+    """points: one bake so small that it is all start, and a larger one. startup: of the worker."""
+
+    points: list[LightPoint]
+    startup: float
+
+
+class BasePart(Record):
+    """Base images at the pilot's size, seconds each (median); startup: of the worker, kernels compiled."""
+
+    pixels: int
+    seconds: float
+    cpu_seconds: float
+    startup: float
+
+
+class TrainingPart(Record):
+    """seconds, cpu_seconds: of one optimiser step. startup: of the first epoch beyond its steps."""
+
+    views: int
+    spp: int
+    steps: int
+    pixels: int
+    seconds: float
+    cpu_seconds: float
+    startup: float
+    threads: int
+
+
+class FramePoint(Record):
+    """One way to render a frame: milliseconds (processor time over the threads) and mean PSNR."""
+
+    name: str
+    ms: float
+    psnr: float
+
+
+class FramePart(Record):
+    """Frames of the pilot's held-out views. noise_rmse: of their references."""
+
+    base: FramePoint
+    neural: FramePoint
+    rival: list[FramePoint]
+    noise_rmse: float
+    views: int
+
+
+class Pilot(Record):
+    """``plan/pilot.json``. Parts that have not run are None. light: None where no light is baked, too."""
+
+    fingerprint: str
+    size: tuple[int, int]
+    load: float | None = None
+    trace: TracePart | None = None
+    light: LightPart | None = None
+    base: BasePart | None = None
+    training: TrainingPart | None = None
+    frames: FramePart | None = None
+    seconds: float = 0.0
+    """wall seconds that the parts took together"""
+
+
+class Choice(Record):
+    """views to ray-trace, samples per pixel, passes over the views."""
+
+    views: int
+    spp: int
+    epochs: int
+    steps: int
+
+
+class Interval(Record):
+    """A prediction; nine times in ten the value lies between low and high."""
+
+    expected: float
+    low: float
+    high: float
+
+
+class Seconds(Record):
+    """Predicted seconds by stage until the renderer is made; ``evaluate`` is not part of ``total``."""
+
+    select: float
+    raytrace: float
+    finetune: float
+    evaluate: float
+    total: Interval
+
+
+class Prediction(Record):
+    """A choice with what it is expected to cost and give."""
+
+    choice: Choice
+    seconds: Seconds
+    cpu_seconds: float
+    psnr: Interval
+
+
+class Route(Record):
+    """One way to N frames. total = upfront + frames x frame, seconds; psnr: what it gives."""
+
+    name: str
+    what: str
+    upfront: float
+    frame: float
+    total: float
+    psnr: float | None
+    reaches: bool

@@ -1,0 +1,149 @@
+"""The producer's part of the report: what it cost, what it bought, what the next minute would buy.
+
+From ``plan/plan.json`` (`dnrpipe plan`) and ``frontier/results.json`` (`dnrpipe frontier`) where they are there.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from ..frames.ladder import quality_at
+from .data import Budget, FrontierSummary, PlannedRow, Quality
+from .words import duration
+
+NEXT = 60.0
+"""Seconds of work whose worth is told."""
+
+
+def build_budget(root: Path, quality: Quality | None, upfront: float | None) -> Budget | None:
+    """None while nothing was spent and nothing is planned."""
+    plan = _read(root / "plan" / "plan.json")
+    frontier = _frontier(root)
+    if upfront is None and plan is None and frontier is None:
+        return None
+    psnr = next((row.mean for row in quality.rows if row.key == "psnr"), None) if quality else None
+    return Budget(
+        cost=_cost(upfront, plan),
+        bought=_bought(psnr, plan, quality),
+        following=_following(plan),
+        rows=_rows(plan),
+        why=_why(plan),
+        routes=_routes(plan),
+        frontier=frontier,
+    )
+
+
+def _cost(upfront: float | None, plan: dict[str, Any] | None) -> str:
+    if upfront is None:
+        return "Nothing was spent yet."
+    text = f"{duration(upfront)} until the renderer was there"
+    if plan and plan.get("actual"):
+        predicted = plan["chosen"]["seconds"]["total"]["expected"]
+        actual = plan["actual"]["seconds"]["total"]
+        text += f". The planned part took {duration(actual)}; {duration(predicted)} were predicted"
+    return text + "."
+
+
+def _bought(psnr: float | None, plan: dict[str, Any] | None, quality: Quality | None) -> str:
+    if psnr is None:
+        return "Not measured yet; `dnrpipe evaluate` measures it."
+    text = f"{psnr:.1f} dB on views that it never saw"
+    if plan and plan.get("actual") and plan["actual"]["psnr"] is not None:
+        text += f" ({plan['chosen']['psnr']['expected']:.1f} dB were predicted)"
+    if plan:
+        text += f"; its base image alone, which needs no training, has about {plan['base_psnr']:.1f} dB"
+    if quality and quality.frame_seconds and quality.traced_seconds:
+        text += f". A frame takes {duration(quality.frame_seconds)} instead of {duration(quality.traced_seconds)}"
+    return text + "."
+
+
+def _following(plan: dict[str, Any] | None) -> str:
+    if plan is None:
+        return "Unknown; `dnrpipe plan` predicts it."
+    line = [(row["seconds"]["total"]["expected"], row["psnr"]["expected"]) for row in plan["table"]]
+    chosen = plan["chosen"] or plan["settings_default"]
+    now = max(chosen["seconds"]["total"]["expected"], line[0][0])  # nothing is known below the smallest choice
+    here, later = quality_at(line, now), quality_at(line, now + NEXT)
+    assert here is not None and later is not None  # both lie on the line
+    gain = later - here
+    return (
+        f"About {gain:.1f} dB, on top of the {duration(now)} that are planned."
+        if gain >= 0.05
+        else "Less than 0.1 dB: the renderer is as good as its model gets on this scene."
+    )
+
+
+def _rows(plan: dict[str, Any] | None) -> list[PlannedRow]:
+    if plan is None or not plan.get("actual"):
+        return []
+    chosen, actual = plan["chosen"], plan["actual"]
+    rows = [
+        PlannedRow(
+            what=name,
+            predicted=duration(chosen["seconds"][name]),
+            actual=duration(actual["seconds"][name]) if actual["ran"][name] else "was done before",
+        )
+        for name in ("select", "raytrace", "finetune")
+    ]
+    total, psnr = chosen["seconds"]["total"], chosen["psnr"]
+    rows.append(
+        PlannedRow(
+            what="all three",
+            predicted=f"{duration(total['expected'])} ({duration(total['low'])} to {duration(total['high'])})",
+            actual=duration(actual["seconds"]["total"]),
+        )
+    )
+    if actual["psnr"] is not None:
+        rows.append(
+            PlannedRow(
+                what="PSNR, held-out",
+                predicted=f"{psnr['expected']:.1f} dB ({psnr['low']:.1f} to {psnr['high']:.1f})",
+                actual=f"{actual['psnr']:.1f} dB",
+            )
+        )
+    return rows
+
+
+def _why(plan: dict[str, Any] | None) -> list[str]:
+    if plan is None or plan["chosen"] is None:
+        return []
+    from ..planning.words import why
+
+    return why(plan)
+
+
+def _routes(plan: dict[str, Any] | None) -> list[str]:
+    if plan is None or "routes" not in plan:
+        return []
+    from ..planning.words import route_lines
+
+    return [re.sub(r" {2,}", " · ", line.strip()) for line in route_lines(plan)]  # columns are the terminal's
+
+
+def _frontier(root: Path) -> FrontierSummary | None:
+    from ..frontier.command import SCHEMA
+    from ..frontier.words import verdict
+
+    results = _read(root / "frontier" / "results.json")
+    if results is None or results.get("schema") != SCHEMA:
+        return None
+    pictures = []
+    for frames in results["frames"]:
+        path = root / "frontier" / f"frontier-{frames}.png"
+        if path.exists():
+            uri = "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
+            pictures.append((verdict(results, frames), uri))
+    return FrontierSummary(pictures=pictures)
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    """A file of an optional part; None where it is missing or torn, which its own command reports."""
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return value if isinstance(value, dict) else None

@@ -1,0 +1,175 @@
+"""dnrpipe frontier: accounts, the front, break-even, words and plots; and the whole of it, small."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dnrpipe.errors import UserError
+from dnrpipe.frontier.account import break_evens, pareto, settle_frames, total_seconds
+from dnrpipe.frontier.command import numbers
+from dnrpipe.frontier.run import Sweep
+from dnrpipe.frontier.words import markdown, verdict
+from dnrpipe.settings import resolve
+
+
+def point(name: str, upfront: float, frame_ms: float, psnr: float, kind: str = "ours") -> dict[str, Any]:
+    return {
+        "name": name,
+        "kind": kind,
+        "views": 6,
+        "spp": 16,
+        "steps": 150,
+        "upfront": upfront,
+        "frame_ms": frame_ms,
+        "psnr": psnr,
+        "ssim": psnr / 40,
+        "lpips_vgg": 1 / psnr,
+        "flip": None,
+    }
+
+
+def rung(spp: int, ms: float, psnr: float, denoised: bool) -> dict[str, Any]:
+    name = f"{spp} spp {'clean16' if denoised else 'raw'}"
+    metrics = {"psnr": psnr, "ssim": psnr / 40, "lpips_vgg": 1 / psnr, "flip": None}
+    return {"name": name, "spp": spp, "denoised": denoised, "ms": ms, **metrics}
+
+
+def results() -> dict[str, Any]:
+    points = [point("small", 30.0, 50.0, 29.0), point("large", 90.0, 50.0, 31.0), point("poor", 95.0, 50.0, 28.0)]
+    points.append(point("base image alone", 10.0, 40.0, 27.0, "base"))
+    rungs = [rung(1, 10, 18, False), rung(4, 100, 28, True), rung(16, 200, 30, True), rung(64, 800, 33, True)]
+    break_evens(points, rungs)
+    return {
+        "scene": "toy", "resolution": "64x64", "command": "dnrpipe frontier", "commit": None, "date": "2026-11-22",
+        "machine": {"processor": "x"}, "cores": 2, "test_views": 3, "evaluation_spp": 64, "frames": [1, 2000],
+        "points": points, "rungs": rungs,
+    }  # fmt: skip
+
+
+def test_few_frames_are_path_traced_and_many_are_neural() -> None:
+    found = results()
+    assert not {"small", "large"} & set(pareto(found, 1)[:3])
+    assert "small" in pareto(found, 2000)
+    assert "poor" not in pareto(found, 2000)
+    assert "Do not train" in verdict(found, 1)
+    assert "Do not train" not in verdict(found, 2000)
+
+
+@given(st.floats(1.0, 500.0), st.floats(1.0, 300.0), st.floats(18.0, 33.0))
+def test_from_the_break_even_on_training_is_cheaper_at_equal_quality(upfront: float, ms: float, psnr: float) -> None:
+    one = point("x", upfront, ms, psnr)
+    break_evens([one], results()["rungs"])
+    rival, even = one["rival_ms"], one["break_even"]
+    assert rival is not None
+    if even is None:
+        assert rival <= ms
+        return
+    assert total_seconds(one, even) <= even * rival / 1000 + 1e-6
+    if even > 1:
+        assert total_seconds(one, even - 1) > (even - 1) * rival / 1000 - 1e-6
+
+
+def test_points_of_one_model_share_its_least_disturbed_frame() -> None:
+    points = [
+        {"kind": kind, "network_ms": network, "base_ms": base}
+        for kind, network, base in (
+            ("ours", 14.0, 50.0),
+            ("all", 90.0, 50.0),
+            ("paper", 20.0, 0.0),
+            ("base", 0.0, 50.0),
+        )
+    ]
+    settle_frames(points)
+    assert [point["frame_ms"] for point in points] == [64.0, 64.0, 20.0, 50.0]
+
+
+def test_a_point_beyond_the_ladder_has_no_break_even() -> None:
+    one = point("x", 1.0, 1.0, 40.0)
+    break_evens([one], results()["rungs"])
+    assert one["rival_ms"] is None
+    assert one["break_even"] is None
+
+
+def test_the_front_of_a_metric_where_lower_is_better_is_turned_round() -> None:
+    found = results()
+    assert pareto(found, 2000, "lpips_vgg") == pareto(found, 2000, "psnr")
+    assert pareto(found, 2000, "flip") == []
+
+
+def test_the_report_names_front_rivals_and_break_even() -> None:
+    text = markdown(results())
+    assert "## 2000 frames" in text
+    assert "| large | 6 | 16 | 150 | 90.0 | 50.0 | 31.00 |" in text
+    assert "N* = upfront" in text
+
+
+def test_sweeps_have_a_row_of_every_combination_and_the_rivals() -> None:
+    settings = resolve("draft", {}, environment={})
+    rows = Sweep((6, 25), (16, 128), (150, 600)).rows(settings)
+    ours = [row for row in rows if row.views == "farthest" and row.network and row.family == "dnr"]
+    assert len(ours) == 8
+    assert {(row.budget, row.spp) for row in ours} == {(6, 16), (6, 128), (25, 16), (25, 128)}
+    epochs = {row.budget: row.changes["finetune"]["step2"]["epochs"] for row in ours if "600 steps" in row.name}
+    assert epochs == {6: 100, 25: 24}
+    assert {"all candidates", "paper", "base image alone", "6 random views"} <= {row.name for row in rows}
+    assert len(Sweep((6,), (16,), (150,), ()).rows(settings)) == 2  # that one, and the base image
+
+
+def test_lists_of_numbers() -> None:
+    assert numbers("25,6,6", "--budgets", (1,), 40) == (6, 25)
+    assert numbers(None, "--budgets", (6, 12, 25), 10) == (6, 10)
+    for text in ("", "0", "a", "-1", "41", "1.5"):
+        with pytest.raises(UserError, match="--budgets"):
+            numbers(text, "--budgets", (6,), 40)
+
+
+def test_a_scene_is_swept_and_measured_once(
+    tmp_path: Path, demo_blend: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from dnrpipe.cli import _main
+    from dnrtrain.exr import read_exr
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "dnrpipe.toml").write_text(
+        "cameras = {train = 6, val = 0, test = 2, width = 32, height = 32}\n"
+        'passes = {raster = "cycles-direct", coverage_samples = 16, bake_size = 64}\n'
+        "raytrace = {spp = 8, evaluation_spp = 16, max_depth = 3}\n"
+        "base = {light_size = 32, light_spp = 4, samples = 1}\n"
+        "model = {texture_size = 32, width = 8, depth = 2}\n"
+        "finetune = {step2 = {epochs = 2}}\n"
+    )
+    arguments = ["--budgets", "2,3", "--spp", "4,8", "--iterations", "6", "--also", "random,all", "--ladder", "1,4"]
+    arguments += ["--frames", "10,100", "--jobs", "1"]
+    assert _main(["frontier", str(demo_blend), *arguments, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    folder = tmp_path / "demo.dnr" / "frontier"
+    kinds = [one["kind"] for one in found["points"]]
+    assert kinds.count("ours") == 4
+    assert {"random", "all", "base"} <= set(kinds)
+    assert all(one["upfront"] > 0 for one in found["points"])
+    assert {one["views"] for one in found["points"] if one["kind"] == "all"} == {6}
+    assert len(found["rungs"]) == 8
+    assert all(np.isfinite(one["psnr"]) for one in [*found["points"], *found["rungs"]])
+    rows = list(csv.DictReader((folder / "results.csv").open()))
+    assert len(rows) == len(found["points"]) + len(found["rungs"])
+    assert {(folder / f"frontier-{n}.png").exists() for n in (10, 100)} == {True}
+    cells = {path: path.stat().st_mtime_ns for path in (folder / "cells").rglob("*.json")}
+    few, _ = read_exr(tmp_path / "demo.dnr" / "raytraced" / "train-4spp" / _name(tmp_path))
+    many, _ = read_exr(tmp_path / "demo.dnr" / "raytraced" / "train" / _name(tmp_path))
+    assert not np.array_equal(few["R"], many["R"])
+    assert _main(["frontier", *arguments, "-q"]) == 0
+    assert cells == {path: path.stat().st_mtime_ns for path in (folder / "cells").rglob("*.json")}
+    assert _main(["report", "-q"]) == 0
+    assert "Quality against seconds" in (tmp_path / "demo.dnr" / "report" / "report.html").read_text()
+
+
+def _name(folder: Path) -> str:
+    return sorted(path.name for path in (folder / "demo.dnr" / "raytraced" / "train-4spp").glob("*.exr"))[0]

@@ -1,0 +1,309 @@
+"""dnrpipe plan: lines through the pilot, the PSNR model, the choice, whether to train; and the whole of it, small."""
+
+from __future__ import annotations
+
+import functools
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dnrpipe.errors import UserError
+from dnrpipe.planning.choose import Predictor, best_within, budgets, cheapest_reaching
+from dnrpipe.planning.command import parse_duration
+from dnrpipe.planning.quality import LEAST_SHARE, load_prior, predict, scene_gain, share, without_noise
+from dnrpipe.planning.records import (
+    BasePart,
+    FramePart,
+    FramePoint,
+    LightPart,
+    LightPoint,
+    Pilot,
+    Prediction,
+    Traced,
+    TracePart,
+    TrainingPart,
+)
+from dnrpipe.planning.routes import break_even, rival_line, routes, seconds_for
+from dnrpipe.planning.seconds import Costs, Work, noise_at, view_line
+
+PRIOR = load_prior()
+POSITIVE = st.floats(1e-8, 1e-5)
+
+
+def trace_part(per_sample: float, per_pixel: float, noise: float = 0.2, power: float = 0.5) -> TracePart:
+    points = []
+    for spp, side in ((16, 128), (16, 128), (128, 128), (128, 128)):
+        pixels = side * side
+        seconds = pixels * (per_sample * spp + per_pixel)
+        rmse = noise * spp**-power
+        points.append(Traced(spp=spp, pixels=pixels, seconds=seconds, cpu_seconds=seconds, noise_rmse=rmse))
+    return TracePart(points=points, workers=2, startup=3.0)
+
+
+RUNGS = (
+    ("1 spp raw", 10.0, 20.0),
+    ("4 spp clean16", 60.0, 30.0),
+    ("64 spp clean16", 400.0, 35.0),
+    ("poor", 90.0, 25.0),
+)
+
+
+def pilot() -> Pilot:
+    return Pilot(
+        fingerprint="x",
+        size=(128, 128),
+        trace=trace_part(5e-7, 5e-6),
+        light=LightPart(
+            points=[
+                LightPoint(size=16, spp=1, seconds=1.0, cpu_seconds=2.0),
+                LightPoint(size=256, spp=32, seconds=2.5, cpu_seconds=4.5),
+            ],
+            startup=4.0,
+        ),
+        base=BasePart(pixels=128 * 128, seconds=0.05, cpu_seconds=0.1, startup=3.0),
+        training=TrainingPart(
+            views=6, spp=16, steps=150, pixels=128 * 128, seconds=0.05, cpu_seconds=0.07, startup=1.0, threads=2
+        ),
+        frames=FramePart(
+            base=FramePoint(name="base", ms=40, psnr=28.0),
+            neural=FramePoint(name="neural", ms=55, psnr=29.5),
+            rival=[FramePoint(name=name, ms=ms, psnr=psnr) for name, ms, psnr in RUNGS],
+            noise_rmse=0.0,
+            views=3,
+        ),
+    )
+
+
+def predictor() -> Predictor:
+    one = pilot()
+    work = Work(pixels=128 * 128, trained=128 * 128, light=(512, 128), policy_seconds=1.0, tests=12, evaluation_spp=512)
+    gain = scene_gain(PRIOR, 1.5, 6, 150)
+    return Predictor(one, Costs(one, work, "seconds"), Costs(one, work, "cpu_seconds"), PRIOR, 28.0, gain, 1)
+
+
+@functools.cache
+def grid_of_forty() -> list[Prediction]:
+    return list(predictor().grid(40))
+
+
+@given(POSITIVE, POSITIVE)
+def test_the_line_of_a_view_is_found_again(per_sample: float, per_pixel: float) -> None:
+    line = view_line(trace_part(per_sample, per_pixel), "seconds")
+    assert line.at(64, 20_000) == pytest.approx(20_000 * (per_sample * 64 + per_pixel), rel=1e-6)
+
+
+@given(st.lists(st.floats(0.01, 10.0), min_size=4, max_size=4))
+def test_no_part_of_a_line_is_below_zero_whatever_was_measured(times: list[float]) -> None:
+    part = trace_part(1e-7, 1e-6)
+    points = [p.model_copy(update={"seconds": t}) for p, t in zip(part.points, times, strict=True)]
+    line = view_line(part.model_copy(update={"points": points}), "seconds")
+    assert min(line.per_sample, line.per_pixel) >= 0
+    assert line.at(8, 100) <= line.at(16, 100) <= line.at(16, 400)
+    assert line.at(256, 16384) > 0
+
+
+@given(st.floats(0.1, 0.5))
+def test_noise_falls_with_the_power_that_was_measured(power: float) -> None:
+    assert noise_at(trace_part(1e-7, 0, 0.3, power), 512) == pytest.approx(0.3 * 512**-power, rel=1e-6)
+
+
+def test_light_is_extrapolated_by_texels_and_paths() -> None:
+    costs = predictor().wall
+    slope = 1.5 / (256**2 * 32)  # of the bakes above: 1 s of start, 1.5 s of paths
+    assert costs.light() == pytest.approx(4.0 + 1.0 + 512**2 * 128 * slope)
+    done = Costs(costs.pilot, Work(1, 1, None, 0.0, 0, 1), "seconds")
+    assert done.light() == 0.0
+
+
+def test_processor_seconds_count_no_waiting_and_no_cores() -> None:
+    one = predictor()
+    each = view_line(one.pilot.trace, "cpu_seconds").at(16, 128 * 128)  # type: ignore[arg-type]
+    assert one.processor.raytrace(6, 16) - one.processor.light() == pytest.approx(6 * each + 6 * 0.1)
+    assert one.wall.raytrace(6, 16) - one.wall.light() == pytest.approx(3.0 + 3 * each + 3.0 + 6 * 0.05)
+
+
+@given(st.integers(4, 200), st.integers(50, 10_000), st.floats(0.001, 0.2))
+def test_more_views_steps_and_samples_never_hurt(views: int, steps: int, noise: float) -> None:
+    gain = (3.0, 0.3)
+    here = predict(PRIOR, 28.0, gain, views, steps, noise).expected
+    assert predict(PRIOR, 28.0, gain, views + 1, steps, noise).expected >= here
+    assert predict(PRIOR, 28.0, gain, views, steps + 50, noise).expected >= here
+    assert predict(PRIOR, 28.0, gain, views, steps, noise / 2).expected >= here
+
+
+@given(st.floats(-1.0, 8.0))
+def test_the_gain_lies_between_the_pilots_and_the_priors(measured: float) -> None:
+    gain, spread = scene_gain(PRIOR, measured, 6, 150)
+    own = measured / max(share(PRIOR, 6, 150), LEAST_SHARE)
+    assert min(own, PRIOR.gain_mean) - 1e-9 <= gain <= max(own, PRIOR.gain_mean) + 1e-9
+    assert 0 < spread <= PRIOR.gain_sd
+
+
+def test_the_references_noise_is_taken_out() -> None:
+    assert without_noise(30.0, 0.0) == pytest.approx(30.0)
+    assert without_noise(30.0, math.sqrt(5e-4)) == pytest.approx(33.01, abs=0.01)  # half the error was noise
+    assert without_noise(30.0, 1.0) == pytest.approx(40.0)  # never more than 10 dB
+
+
+@settings(deadline=None, max_examples=10)
+@given(st.floats(20, 2000), st.floats(1.0, 3.0))
+def test_a_budget_is_kept_and_more_time_is_never_worse(seconds: float, more: float) -> None:
+    grid = grid_of_forty()
+    one, two = best_within(grid, seconds), best_within(grid, seconds * more)
+    if one is None:
+        assert seconds < min(p.seconds.total.expected for p in grid)
+        return
+    assert one.seconds.total.expected <= seconds
+    assert two is not None
+    assert two.psnr.expected >= one.psnr.expected - 0.02
+    assert one.choice.views <= 40
+
+
+def test_a_target_is_reached_by_the_cheapest_choice_that_does() -> None:
+    grid = grid_of_forty()
+    found = cheapest_reaching(grid, 29.5)
+    assert found is not None
+    assert found.psnr.expected >= 29.5
+    cheaper = [p for p in grid if p.seconds.total.expected < found.seconds.total.expected]
+    assert all(p.psnr.expected < 29.5 for p in cheaper)
+    assert cheapest_reaching(grid, 60.0) is None
+
+
+def test_a_table_of_budgets_rises_in_both() -> None:
+    rows = budgets(grid_of_forty())
+    assert len(rows) > 2
+    assert [r.seconds.total.expected for r in rows] == sorted(r.seconds.total.expected for r in rows)
+    assert [r.psnr.expected for r in rows] == sorted(r.psnr.expected for r in rows)
+
+
+def test_the_ladder_is_followed_beyond_its_end_and_says_so() -> None:
+    line = rival_line(pilot().frames)  # type: ignore[arg-type]
+    assert [name for name, _, _ in line] == ["1 spp raw", "4 spp clean16", "64 spp clean16"]
+    assert seconds_for(line, 30.0) == pytest.approx((0.06, False))
+    beyond = seconds_for(line, 37.0)
+    assert beyond is not None
+    assert beyond[1]
+    assert beyond[0] > 0.4
+    assert seconds_for(line, 80.0) is None
+
+
+def test_few_frames_are_not_worth_training_and_many_are() -> None:
+    one = predictor()
+    grid = grid_of_forty()
+    at = 30.0
+    neural = cheapest_reaching(grid, at)
+    assert one.pilot.frames is not None
+    few = routes(one.pilot.frames, neural, one.wall.light(), 1.0, at, 5)
+    assert few[0].name == "path tracing + denoiser"
+    dear = 33.0  # the rival needs 0.2 s a frame there
+    at_dear = cheapest_reaching(grid, one.base + 0.7 * one.gain[0])
+    many = routes(one.pilot.frames, at_dear, one.wall.light(), 1.0, dear, 1_000_000)
+    assert many[0].name == "neural renderer"
+    even = break_even(many)
+    assert even is not None
+    before, after = (
+        {r.name: r.total for r in routes(one.pilot.frames, at_dear, one.wall.light(), 1.0, dear, n)}
+        for n in (even - 1, even)
+    )
+    assert after["neural renderer"] <= after["path tracing + denoiser"]
+    assert before["neural renderer"] > before["path tracing + denoiser"]
+
+
+def test_the_base_image_alone_is_enough_where_it_is_enough() -> None:
+    one = predictor()
+    assert one.pilot.frames is not None
+    slow = [rung.model_copy(update={"ms": 10 * rung.ms}) for rung in one.pilot.frames.rival]
+    part = one.pilot.frames.model_copy(update={"rival": slow})
+    found = routes(part, cheapest_reaching(grid_of_forty(), 27.0), 0.0, 1.0, 27.0, 10_000)
+    assert found[0].name == "base image alone"
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("90", 90), ("90s", 90), ("15m", 900), ("1.5h", 5400)])
+def test_durations(text: str, seconds: float) -> None:
+    assert parse_duration(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "0", "-3m", "m", "soon", "nan", "1e30"])
+def test_what_is_no_duration_is_refused(text: str) -> None:
+    with pytest.raises(UserError, match="--time"):
+        parse_duration(text)
+
+
+SMALL: dict[str, Any] = {
+    "cameras": {"train": 8, "val": 0, "test": 2, "width": 48, "height": 48},
+    "passes": {"raster": "cycles-direct", "coverage_samples": 16, "bake_size": 64},
+    "raytrace": {"evaluation_spp": 16, "max_depth": 4},
+    "base": {"light_size": 32, "light_spp": 8, "samples": 1},
+    "model": {"texture_size": 32, "width": 8, "depth": 2},
+}
+
+
+def test_a_scene_is_planned_and_the_plan_carried_out(
+    tmp_path: Path, demo_blend: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from dnrpipe.cli import _main
+    from dnrpipe.planning import choose, pilot
+
+    monkeypatch.chdir(tmp_path)
+    for module, name, value in (
+        (pilot, "VIEWS", 3),
+        (pilot, "HELD_OUT", 1),
+        (pilot, "REFERENCE_SPP", 16),
+        (pilot, "SPP", 4),
+        (pilot, "STEPS", 12),
+        (pilot, "RUNGS", (1, 4)),
+        (pilot, "METHODS", ("raw", "clean16-fast")),
+        (choose, "STEPS", (12, 24)),
+        (choose, "SAMPLES", (4, 8)),
+        (choose, "VIEWS", (3, 4)),
+    ):
+        monkeypatch.setattr(module, name, value)
+    (tmp_path / "dnrpipe.toml").write_text(_toml(SMALL))
+    assert _main(["plan", str(demo_blend), "--frames", "3", "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    root = tmp_path / "demo.dnr"
+    assert json.loads((root / "plan" / "plan.json").read_text())["table"] == record["table"]
+    assert record["chosen"] is None
+    assert not (root / "plan" / "pilot").exists()
+    names = {route["name"] for route in record["routes"]}
+    assert names == {"path tracing + denoiser", "base image alone", "neural renderer"}
+    stages = {json.loads(line)["stage"] for line in (root / "costs.jsonl").read_text().splitlines()}
+    assert "plan" in stages
+    stamp = (root / "plan" / "pilot.json").stat().st_mtime_ns
+    assert _main(["plan", "--time", "1h", "--apply", "-q"]) == 0
+    assert (root / "plan" / "pilot.json").stat().st_mtime_ns == stamp  # the pilot is not run twice
+    done = json.loads((root / "plan" / "plan.json").read_text())
+    choice = done["chosen"]["choice"]
+    assert len(json.loads((root / "selection.json").read_text())["views"]) == choice["views"]
+    assert done["actual"]["psnr"] > 10
+    assert done["actual"]["seconds"]["total"] > 0
+    assert all(done["actual"]["ran"].values())
+    assert _main(["plan", "--time", "0.01s"]) == 2
+    assert "not enough" in capsys.readouterr().err
+    assert _main(["report", "-q"]) == 0
+    assert "predicted" in (root / "report" / "report.html").read_text()
+
+
+def _toml(values: dict[str, Any]) -> str:
+    return "\n".join(
+        line
+        for table, content in values.items()
+        for line in (f"[{table}]", *(f"{key} = {json.dumps(value)}" for key, value in content.items()))
+    )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"), [(["--apply"], "--time or --target-psnr"), (["--frames", "0"], "at least 1")]
+)
+def test_bad_requests_are_refused_in_one_line(
+    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from dnrpipe.cli import _main
+
+    assert _main(["plan", *arguments]) == 2
+    assert said in capsys.readouterr().err
