@@ -32,7 +32,7 @@ from .lobes import (
     reflectance,
 )
 from .paths import power_heuristic
-from .recorded import Recorded
+from .recorded import Recorded, prepare_emitters
 from .sequence import GOLDEN, ORDER, TILE, fraction, steps
 from .texels import ATTRIBUTE
 from .visibility import LAMP_PREFIX, UNSEEN_PREFIX, is_one_of
@@ -83,11 +83,7 @@ class BaseRenderer:
         self.glassy = any(mirrors_and_refracts(mi, b.flags()) for b in bsdfs)
         numbers = steps(NUMBERS * (MAX_VERTICES + 1))
         self.tables = mi.UInt32(ORDER.ravel()), mi.Float(numbers)
-        if self.lit:
-            # What emitters make at their first use (a mesh's distribution of areas) must not be part of the recording.
-            one = dr.zeros(mi.SurfaceInteraction3f)
-            source, _ = scene.sample_emitter_direction(one, mi.Point2f(0.5), False)
-            dr.eval(source, scene.pdf_emitter_direction(one, source))
+        prepare_emitters(mi, scene)
         # Recorded at the first call: tracing the plugins anew would take longer than the frame itself.
         self.kernel = Recorded(self._kernel)
 

@@ -23,7 +23,7 @@ from dnrtrain.contract import View
 from .auxiliary import shown_first
 from .engine import Engine
 from .frames_rays import lets_through, pinhole, seen_first
-from .recorded import Recorded
+from .recorded import Recorded, prepare_emitters
 from .texels import ATTRIBUTE
 from .units import scaled_view
 
@@ -60,6 +60,7 @@ class Frames:
             raise UserError("timing frames needs a jit variant of Mitsuba (LLVM or CUDA); see `dnrpipe doctor`")
         self.engine, self.mi, self.size = engine, engine.mi, size
         self.scene = engine.scenes[str(bundle)]
+        prepare_emitters(self.mi, self.scene)
         self.integrator, self.name = engine.integrator(bundle, integrator, max_depth)
         self.passing = lets_through(self.mi, self.scene)
         self._path: dict[int, Any] = {}

@@ -32,3 +32,17 @@ class Recorded:
         finally:
             if collecting:
                 gc.enable()
+
+
+def prepare_emitters(mi: Any, scene: Any) -> None:
+    """Let emitters make what they make at their first use (a mesh's distribution of areas), once, before recording.
+
+    Within a recording Dr.Jit refuses it: "virtual function call ... no such object instance".
+    """
+    import drjit as dr
+
+    if not scene.emitters():
+        return
+    here = dr.zeros(mi.SurfaceInteraction3f)
+    source, _ = scene.sample_emitter_direction(here, mi.Point2f(0.5), False)
+    dr.eval(source, scene.pdf_emitter_direction(here, source))
