@@ -8,16 +8,22 @@ import pytest
 
 REPO = Path(__file__).resolve().parents[1]
 SHARED = REPO.parent / "shared" / "assets"
+SHARED_FIXTURES = ("tiny", "server")
+"""Fixtures that take long and that several files use."""
 
 
+@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Side by side go whole files, not single tests, so that what a file's tests share is made once.
 
-    The end-to-end tests share a workspace between files.
+    Some files share a finished workspace, or a server.
     """
+    shared = {
+        item.path: name for item in items for name in SHARED_FIXTURES if name in getattr(item, "fixturenames", ())
+    }
     for item in items:
-        folder = item.path.parent.name
-        item.add_marker(pytest.mark.xdist_group("e2e" if folder == "e2e" else f"{folder}/{item.path.stem}"))
+        name = shared.get(item.path, f"{item.path.parent.name}/{item.path.stem}")
+        item.add_marker(pytest.mark.xdist_group(name))
 
 
 @pytest.fixture(scope="session")
