@@ -8,6 +8,9 @@ DEMO    := demo-output
 APT     := libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1 libatomic1 libllvm19 libegl1 libgl1-mesa-dri
 APT_DEV := chromium
 
+# Pages with tables made from docs/results.
+RESULTS := $(addprefix docs/,ablation.md bench-select.md cost.md frames.md noise.md)
+
 .DEFAULT_GOAL := help
 .PHONY: help setup system browser demo test lint types imports docs docs-check robustness bench bench-effects bench-frames fidelity scenes clean
 
@@ -49,11 +52,11 @@ imports: $(STAMP)
 
 docs: $(STAMP)  ## regenerate the CLI reference from --help, the ablation's tables from its results
 	$(BIN)/python tools/cli_reference.py docs/cli.md
-	$(BIN)/python -m tools.result_tables docs/ablation.md docs/frames.md docs/noise.md docs/cost.md
+	$(BIN)/python -m tools.result_tables $(RESULTS)
 
 docs-check: $(STAMP)
 	$(BIN)/python tools/cli_reference.py --check docs/cli.md
-	$(BIN)/python -m tools.result_tables --check docs/ablation.md docs/frames.md docs/noise.md docs/cost.md
+	$(BIN)/python -m tools.result_tables --check $(RESULTS)
 	$(BIN)/python -m tools.robustness_table --check docs/robustness.md
 
 robustness: setup  ## every case of docs/robustness.md, 2,000 damaged files of each format, 50 kills; an hour or more

@@ -2,9 +2,9 @@
 
 A part stands between ``<!-- rows -->`` or ``<!-- KIND FILE -->``, FILE in docs/, and ``<!-- end -->``.
 Kinds: results (of `dnrpipe ablate`), frames (of tools.bench_frames), noise (of tools.bench_noise),
-frontier (of `dnrpipe frontier`), plan-check (of tools.plan_check).
+frontier (of `dnrpipe frontier`), plan-check (of tools.plan_check), selection (of `dnrpipe bench-select`).
 
-python -m tools.result_tables [--check] docs/ablation.md docs/frames.md docs/noise.md docs/cost.md
+python -m tools.result_tables [--check] docs/ablation.md docs/*.md
 """
 
 from __future__ import annotations
@@ -23,8 +23,10 @@ from dnrpipe.ablation.rows import GROUPS, ROWS
 from dnrpipe.ablation.tables import markdown
 from dnrpipe.frontier.command import read_frontier
 from dnrpipe.frontier.words import markdown as frontier_markdown
+from dnrpipe.selectbench.results import read_results as selection_results
+from dnrpipe.selectbench.tables import markdown as selection_markdown
 
-KINDS = "rows|results|frames|noise|frontier|plan-check"
+KINDS = "rows|results|frames|noise|frontier|plan-check|selection"
 PART = re.compile(rf"(<!-- ({KINDS})(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -49,6 +51,8 @@ def generate(text: str, folder: Path) -> str:
             body = noise_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
         elif match[2] == "frontier":
             body = lowered(frontier_markdown(read_frontier(folder / match[3])))
+        elif match[2] == "selection":
+            body = lowered(selection_markdown(selection_results(folder / match[3]), pictures=False))
         elif match[2] == "plan-check":
             body = check_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
         else:
@@ -61,7 +65,7 @@ def generate(text: str, folder: Path) -> str:
 def lowered(text: str) -> str:
     """A page's own tables, one heading lower and without its title."""
     _, _, body = text.partition("\n")
-    return body.strip().replace("\n## ", "\n### ")
+    return body.strip().replace("\n### ", "\n#### ").replace("\n## ", "\n### ")
 
 
 def main(arguments: list[str]) -> int:
