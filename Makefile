@@ -35,7 +35,7 @@ demo: setup  ## the demo scene from .blend to report; prints the report's path
 	@$(BIN)/dnrpipe report -w $(DEMO)/demo.dnr
 
 test: setup browser lint types imports docs-check  ## lint, types, import rules, documentation, all tests
-	$(BIN)/pytest -q -n 2 --dist loadgroup --durations 15
+	$(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations 15
 
 browser:
 	@sh tools/system-libraries.sh $(APT_DEV)
@@ -61,7 +61,7 @@ docs-check: $(STAMP)
 
 robustness: setup  ## every case of docs/robustness.md, 2,000 damaged files of each format, 50 kills; an hour or more
 	$(BIN)/python -m tools.robustness_table --check docs/robustness.md
-	$(BIN)/pytest -q -n 2 --dist loadgroup $$($(BIN)/python -m tools.robustness_table --tests docs/robustness.md)
+	$(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder $$($(BIN)/python -m tools.robustness_table --tests docs/robustness.md)
 	$(BIN)/python -m tools.faults.fuzz --count 2000
 	$(BIN)/python -m tools.faults.inject --kills 50
 

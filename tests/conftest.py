@@ -3,27 +3,32 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 REPO = Path(__file__).resolve().parents[1]
 SHARED = REPO.parent / "shared" / "assets"
-SHARED_FIXTURES = ("tiny", "server")
-"""Fixtures that take long and that several files use."""
+TOGETHER = ("tests/e2e", "tests/service")
+ALONE = ("test_demo.py", "test_queue.py")
 
 
-@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Side by side go whole files, not single tests, so that what a file's tests share is made once.
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Side by side go whole files, so that what a file's tests share is made once.
 
-    Some files share a finished workspace, or a server.
+    Some folders share a finished workspace, or a server, between files, and stay together. (pytest-xdist 3.8's own
+    ``--dist loadgroup`` overlooks its marks under pytest 9.)
     """
-    shared = {
-        item.path: name for item in items for name in SHARED_FIXTURES if name in getattr(item, "fixturenames", ())
-    }
-    for item in items:
-        name = shared.get(item.path, f"{item.path.parent.name}/{item.path.stem}")
-        item.add_marker(pytest.mark.xdist_group(name))
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByFile(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = nodeid.split("::", 1)[0]
+            folder, name = file.rsplit("/", 1)
+            return folder if folder in TOGETHER and name not in ALONE else file
+
+    return ByFile(config, log)
 
 
 @pytest.fixture(scope="session")
