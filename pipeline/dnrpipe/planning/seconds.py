@@ -20,7 +20,7 @@ from ..errors import UserError
 from .records import Clock, Pilot, TracePart
 
 TIME_SPREAD = 1.25
-"""Nine stages in ten took between 1/1.25 and 1.25 times what was predicted (docs/cost.md)."""
+"""Intervals of seconds reach from 1/1.25 to 1.25 times the prediction: an assumption, not yet measured."""
 
 
 @dataclass(frozen=True)
