@@ -202,7 +202,8 @@ def test_an_override_makes_stale_only_what_it_touches() -> None:
     from dnrpipe.stages import STAGES
 
     def told(stage: str, **effects: Any) -> Any:
-        return STAGES[stage].settings(resolve(None, {"effects": effects}, environment={}))
+        chosen = {"effects": effects, "select": {"policy": "rl-paper"}}  # which trains a model
+        return STAGES[stage].settings(resolve(None, chosen, environment={}))
 
     for stage, touched in (("select", False), ("finetune", False), ("raytrace", True), ("evaluate", True)):
         assert (told(stage, disable=["caustics"]) != told(stage)) == touched

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from dnrpipe.console import Console
-from dnrpipe.raytrace.tracer import _repair, estimate_noise
+from dnrpipe.raytrace.noise import half_noise
+from dnrpipe.raytrace.pictures import repair
 from dnrpipe.tasks import warn_repairs
 from dnrtrain.contract import ContractError
 from dnrtrain.exr import read_exr, write_exr
@@ -23,32 +24,29 @@ def test_nan_from_an_integrator_is_traced_again() -> None:
     half_a, half_b = picture(), picture()
     half_a[0, 0, 1] = half_a[3, 4, 0] = np.nan
     half_b[2, 2, 2] = np.inf
-    seeds: list[int] = []
+    seeds: list[tuple[int, int]] = []
 
-    def render(spp: int, seed: int) -> tuple[np.ndarray, int]:
-        seeds.append(seed)
-        return picture(0.25), spp
+    def again(attempt: int, index: int) -> np.ndarray:
+        seeds.append((attempt, index))
+        return picture(0.25)
 
-    a, b, repaired, masked = _repair(render, half_a, half_b, 8, 3)
-    assert (repaired, masked) == (3, 0)
-    assert a[0, 0, 1] == a[3, 4, 0] == 0.25 and b[2, 2, 2] == 0.25
-    assert (a == 0.5).sum() == 4 * 5 * 4 - 2 * 4  # whole pixels are replaced, others stay
-    assert len(set(seeds)) == len(seeds) == 2
+    assert repair((half_a, half_b), again) == (3, 0)
+    assert half_a[0, 0, 1] == half_a[3, 4, 0] == 0.25 and half_b[2, 2, 2] == 0.25
+    assert (half_a == 0.5).sum() == 4 * 5 * 4 - 2 * 4  # whole pixels are replaced, others stay
+    assert seeds == [(0, 0), (0, 1)]
 
 
 def test_what_stays_nan_is_masked_and_counted() -> None:
     bad = picture()
     bad[1, 1] = np.nan
-    again = picture(np.nan)
-    _, _, repaired, masked = _repair(lambda spp, seed: (again, spp), bad, picture(), 8, 3)
-    assert (repaired, masked) == (0, 1)
+    assert repair((bad, picture()), lambda attempt, index: picture(np.nan)) == (0, 1)
     assert (bad[1, 1] == 0).all() and np.isfinite(bad).all()
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-40, 1e8])
 def test_noise_of_extreme_pictures(scale: float) -> None:
-    relative, absolute = estimate_noise(picture(scale), picture(scale))
-    assert relative == absolute == 0.0
+    noise = half_noise(picture(scale), picture(scale))
+    assert noise.relative == noise.rmse == 0.0
 
 
 def test_repairs_are_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

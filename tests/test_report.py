@@ -204,9 +204,9 @@ def test_every_half_done_workspace_has_a_report(tmp_path: Path) -> None:
         ("evaluation/metrics.json", '{"views": [{"name": "../../etc/x"}]}', r"views\.0\.name"),
         ("selection.json", "[]", r"selection\.json: not a JSON object.*dnrpipe select"),
         ("checkpoints/step1/model.json", '{"history": [{"epoch": "x"}]}', r"history\.0\.epoch"),
-        ("cameras/test.json", '{"frames": [{}]}', r"test\.json: frame 0"),
+        ("cameras/test.json", '{"frames": [{}]}', r"test\.json: damaged \(frame 0"),
         ("evaluation/0003.truth.png", "not a picture", r"0003\.truth\.png: damaged image"),
-        ("raytraced/train/0011.exr", "not an exr", r"0011\.exr: damaged EXR"),
+        ("raytraced/train/0011.exr", "not an exr", r"0011\.exr: damaged \(EXR"),
         ("costs.jsonl", '{"a": 1}\n', r"costs\.jsonl:1: not a cost record"),
     ],
 )

@@ -115,10 +115,6 @@ def test_stopped_in_order(tmp_path: Path) -> None:
     """SIGTERM: exit code 0, the running job is queued again, and goes on when the server is there again."""
     server = Server(tmp_path / "root")
     try:
-        with server.client() as client:
-            client.upload(SCENE, "a.blend")
-            job = client.submit(JobRequest(command="prepare", workspace="a", scene="a.blend", settings=TINY))
-            next(e for e in client.events(job.id) if e.kind in ("progress", "message"))
         second = subprocess.run(
             [sys.executable, "-m", "dnrpipe.cli", "serve", "--root", str(server.root), "--port", "0"],
             capture_output=True,
@@ -127,6 +123,10 @@ def test_stopped_in_order(tmp_path: Path) -> None:
             check=False,
         )
         assert second.returncode == 2 and "another server works here" in second.stderr
+        with server.client() as client:
+            client.upload(SCENE, "a.blend")
+            job = client.submit(JobRequest(command="prepare", workspace="a", scene="a.blend", settings=TINY))
+            next(e for e in client.events(job.id) if e.kind in ("progress", "message"))
         assert server.stop() == 0
         rows = sqlite3.connect(server.root / ".service" / "queue.sqlite").execute("SELECT state, starts FROM jobs")
         assert rows.fetchall() == [("queued", 1)]

@@ -41,6 +41,11 @@ FULL: dict[int | str, dict[str, Any]] = {
     503: {"model": Problem, "description": "Too many streams"},
     507: {"model": Problem, "description": "No space left"},
 }
+EVENT: dict[str, Any] = {
+    "type": "object",
+    "properties": {name: {"type": "string"} for name in ("id", "event", "data")} | {"retry": {"type": "integer"}},
+}
+"""One server-sent event, as its fields are parsed."""
 JobPath = Annotated[int, Path(ge=1, le=2**53, description="The job's number")]
 
 router = APIRouter(tags=["jobs"], responses=REFUSED)
@@ -121,7 +126,7 @@ def logs(
     responses=NOT_FOUND
     | {
         200: {
-            "content": {"text/event-stream": {"schema": {"type": "string"}}},
+            "content": {"text/event-stream": {"schema": EVENT}},
             "description": "Server-sent events: id, event (its kind), data (JSON). Ends when the job has.",
         },
         503: FULL[503],
