@@ -36,15 +36,16 @@ def _until(client: Client, job: int, *states: str, seconds: float = 60) -> Job:
 def test_killed_while_it_trains(server: Server, trained: str) -> None:
     """kill -9 of the server in the middle of training: everything dies with it, and the job goes on at the next start.
 
-    The epochs before the kill are not trained again: each is reported exactly once.
+    The epochs before the kill are not trained again.
     """
     with server.client() as client:
         job = next(j for j in client.jobs() if j.request.workspace == trained)
         assert job.state == "done" and job.starts == 2 and job.crashes == 0
         events = list(client.events(job.id))
         epochs = [e.data["epoch"] for e in events if e.kind == "epoch" and e.data["stage"] == "finetune"]
-        assert sorted(set(epochs)) == list(range(1, 41))
-        assert len(epochs) - len(set(epochs)) <= 1  # at most the one that was under way
+        # The one under way at the kill: trained again (told twice), or saved but not told of yet (not told).
+        assert set(epochs) <= set(range(1, 41)) and len(set(epochs)) >= 39 and epochs[-1] == 40
+        assert len(epochs) - len(set(epochs)) <= 1
         states = [e.data["state"] for e in events if e.kind == "state"]
         assert states == ["queued", "running", "queued", "running", "done"]
         assert [e.id for e in events] == sorted({e.id for e in events})
