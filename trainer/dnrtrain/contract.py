@@ -153,6 +153,18 @@ class View(BaseModel):
         """Camera centre in world space, float64 [3]."""
         return self.matrix[:3, 3]
 
+    @property
+    def intrinsics(self) -> dict[str, float]:
+        """Width, height, focal lengths and principal point in pixels, by the names of a ``transforms`` file."""
+        return {
+            "w": self.width,
+            "h": self.height,
+            "fl_x": self.fl_x,
+            "fl_y": self.fl_y,
+            "cx": self.cx,
+            "cy": self.cy,
+        }
+
     def ray_directions(self) -> np.ndarray:
         """Unit world-space directions from the camera through pixel centres, float32 [H, W, 3]."""
         x = (np.arange(self.width) + 0.5 - self.cx) / self.fl_x
@@ -168,12 +180,7 @@ def write_cameras(path: Path, views: Sequence[View], split: str) -> None:
     frames = [
         {
             "file_path": f"{split}/{view.name}",
-            "w": view.width,
-            "h": view.height,
-            "fl_x": view.fl_x,
-            "fl_y": view.fl_y,
-            "cx": view.cx,
-            "cy": view.cy,
+            **view.intrinsics,
             "transform_matrix": [list(row) for row in view.c2w],
         }
         for view in views

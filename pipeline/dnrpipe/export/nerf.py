@@ -140,12 +140,7 @@ def _moved(view: View, scale: float, shift: np.ndarray) -> View:
 
 def _intrinsics(view: View) -> dict[str, float]:
     return {
-        "w": view.width,
-        "h": view.height,
-        "fl_x": view.fl_x,
-        "fl_y": view.fl_y,
-        "cx": view.cx,
-        "cy": view.cy,
+        **view.intrinsics,
         "camera_angle_x": 2 * math.atan(0.5 * view.width / view.fl_x),
         "camera_angle_y": 2 * math.atan(0.5 * view.height / view.fl_y),
     }

@@ -28,12 +28,12 @@ def coverage_maps(root: Path, candidates: Sequence[View], chosen: Sequence[str])
 
     None where passes are missing (the scene was cleared away, or is being prepared again) or nothing is seen.
     """
-    by_name = {view.name: view for view in candidates}
-    if any(name not in by_name for name in chosen):
+    others = {view.name: view for view in candidates}
+    if not others.keys() >= set(chosen):
         return None  # cameras were made again after the choice
-    others = [view for view in candidates if view.name not in set(chosen)]
+    picked = [others.pop(name) for name in chosen]
     step = max(1, -(-len(others) // LOOKED_AT))
-    views = [*(by_name[name] for name in chosen), *others[::step]]
+    views = [*picked, *list(others.values())[::step]]
     try:
         sightings = read_sightings([root / "passes" / "train" / f"{view.name}.exr" for view in views], views)
     except ContractError:
@@ -44,8 +44,8 @@ def coverage_maps(root: Path, candidates: Sequence[View], chosen: Sequence[str])
     there = seen >= 0
     counted = angle[there & (seen > 0)]
     return CoverageMaps(
-        seen=_picture(seen / max(1, seen.max()), there, seen == 0, "viridis", "how many chosen views see it"),
-        angle=_picture(1.0 - np.minimum(angle, FARTHEST) / FARTHEST, there, seen == 0, "viridis", "degrees off"),
+        seen=_picture(seen / max(1, seen.max()), there, seen == 0, "how many chosen views see it"),
+        angle=_picture(1.0 - np.minimum(angle, FARTHEST) / FARTHEST, there, seen == 0, "degrees off"),
         most=int(seen.max()),
         farthest=FARTHEST,
         uncovered=uncovered,
@@ -79,13 +79,13 @@ def _cells(sightings: Sightings, chosen: int) -> tuple[np.ndarray, np.ndarray, f
     return number.reshape(grid, grid), angle.reshape(grid, grid), float(1.0 - pixels[served].sum() / pixels.sum())
 
 
-def _picture(values: np.ndarray, there: np.ndarray, unseen: np.ndarray, colours: str, what: str) -> Picture:
+def _picture(values: np.ndarray, there: np.ndarray, unseen: np.ndarray, what: str) -> Picture:
     """Values [G, G] in [0, 1], V up -> an opaque-where-``there`` picture with V upwards."""
     from matplotlib import colormaps
     from PIL import Image
 
     rgba = np.zeros((*values.shape, 4), np.uint8)
-    rgba[..., :3] = np.rint(colormaps[colours](values)[..., :3] * 255)
+    rgba[..., :3] = np.rint(colormaps["viridis"](values)[..., :3] * 255)
     rgba[unseen, :3] = UNSEEN
     rgba[there, 3] = 255
     image = Image.fromarray(rgba[::-1]).resize((SIDE, SIDE), Image.Resampling.NEAREST)

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from ..errors import UserError
-from ..executors import LocalWorker, TaskFailed, WorkerDied
+from ..executors import MAX_ATTEMPTS, LocalWorker, TaskFailed, WorkerDied
 from .config import ServerConfig
 from .live_pace import Pace
 from .live_scene import LiveRequest, LiveScene, open_scene
@@ -18,8 +18,6 @@ from .root import ServiceRoot
 
 FRAME_SECONDS = 120.0
 """The first frame loads the scene and compiles kernels; one that takes longer than this hangs."""
-TRIES = 3
-"""A process that died is replaced; on a fresh one the first recording of a kernel may fail (Dr.Jit), the second not."""
 TEND = 2.0
 REFERENCE_SPP = 4
 MOST_SPP = 1024
@@ -75,7 +73,7 @@ class LiveSession:
 
     def _ask(self, task: dict[str, Any]) -> dict[str, Any]:
         reason = ""
-        for _ in range(TRIES):
+        for _ in range(MAX_ATTEMPTS):  # a process that died is replaced
             try:
                 return self._worker.ask(task, FRAME_SECONDS)
             except (TaskFailed, WorkerDied, OSError, ValueError) as error:
