@@ -64,6 +64,7 @@ robustness: setup  ## every case of docs/robustness.md, 2,000 damaged files of e
 	$(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder $$($(BIN)/python -m tools.robustness_table --tests docs/robustness.md)
 	$(BIN)/python -m tools.faults.fuzz --count 2000
 	$(BIN)/python -m tools.faults.inject --kills 50
+	$(BIN)/python -m tools.faults.memory
 
 bench-effects: setup  ## the effect plan against "everything on", on the benchmark scenes
 	$(BIN)/python tools/bench_effects.py

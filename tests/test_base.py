@@ -12,9 +12,11 @@ import pytest
 from dnrpipe.blender.bundle.ply import weld, write_ply
 from dnrpipe.raytrace import plugins
 from dnrpipe.raytrace.base import CENTRES, MEANS, BaseRenderer
+from dnrpipe.raytrace.engine import Engine
 from dnrpipe.raytrace.lightmap import LightBaker
 from dnrpipe.raytrace.lobes import diffuse_context
 from dnrpipe.raytrace.sensors import sensor_dict
+from dnrpipe.raytrace.surface_maps import SurfaceMapper
 from dnrpipe.raytrace.texels import grouped_meshes
 from dnrpipe.raytrace.variants import choose_variant
 from dnrtrain.contract import BASE_CHANNELS, View
@@ -93,6 +95,94 @@ def rendered(scene: Any, light: np.ndarray, view: View, samples: int = 4) -> dic
 
 def colour(channels: dict[str, np.ndarray]) -> np.ndarray:
     return np.stack([channels[f"base.{c}"] for c in "RGBA"], axis=-1)
+
+
+NAN = float("nan")
+
+
+def poisoned_room(folder: Path, name: str) -> Any:
+    """A glossy wall, a matt floor and two lamps, one parameter of which is not finite."""
+    grey = {"type": "diffuse", "reflectance": rgb(0.5, 0.5, 0.5)}
+    glossy = {"type": "roughconductor", "alpha": 0.2, "specular_reflectance": rgb(0.5, 0.5, 0.5)}
+    lamps = [{"type": "point", "position": [x, 0.0, 2.0], "intensity": rgb(6, 6, 6)} for x in (-0.5, 0.5)]
+    scene = corner_room(folder, grey, glossy, lamps[0], other=lamps[1])
+    if name:
+        parameters = mi.traverse(scene)
+        parameters[name] = mi.Color3f(NAN, 1, 1)
+        parameters.update()
+    return scene
+
+
+@pytest.mark.parametrize(
+    ("name", "lost", "repaired", "masked"),
+    [
+        ("", False, False, False),
+        ("light.intensity.value", True, True, False),
+        ("wall.bsdf.specular_reflectance.value", True, True, False),
+        ("floor.bsdf.reflectance.value", True, False, True),
+    ],
+)
+def test_samples_that_are_not_finite_are_counted(
+    tmp_path: Path, name: str, lost: bool, repaired: bool, masked: bool
+) -> None:
+    """A NaN lamp, a NaN mirror, a NaN reflectance: pictures and light stay finite, and say what they lost."""
+    scene = poisoned_room(tmp_path, name)
+    baker = LightBaker(mi, scene, onwards())
+    light = baker.bake(16, 16, 0)
+    renderer = BaseRenderer(mi, scene, light, 2)
+    channels = renderer.frame(camera())
+    assert np.isfinite(light).all() and all(np.isfinite(values).all() for values in channels.values())
+    assert (baker.lost > 0, renderer.repaired > 0, renderer.masked > 0) == (lost, repaired, masked)
+    assert renderer.repaired + renderer.masked < SIZE * SIZE
+    assert np.isfinite(BaseRenderer(mi, scene, light, 1).frame(camera())["base.R"]).all()
+    mapper = SurfaceMapper(mi, scene)
+    assert all(np.isfinite(values).all() for values in mapper.maps(16, 4, 0).values())
+    assert (mapper.lost > 0) == (name == "floor.bsdf.reflectance.value")
+
+
+def test_large_pictures_in_bands_have_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Memory is bounded by launches of few rows; the last band is smaller than the others."""
+    from dnrpipe.raytrace import base
+
+    scene = poisoned_room(tmp_path, "")
+    light = np.ones((2, 2, 16, 16, 3), np.float32)
+    whole = BaseRenderer(mi, scene, light, 2).frame(camera())
+    monkeypatch.setattr(base, "MAX_RAYS", 2 * SIZE * 13)
+    renderer = BaseRenderer(mi, scene, light, 2)
+    launches: list[int] = []
+    kernel = renderer.kernel
+    monkeypatch.setattr(renderer, "kernel", lambda *given: launches.append(given[-1]) or kernel(*given))
+    banded = renderer.frame(camera())
+    assert launches == [13, 13, 13, 9]
+    assert all((banded[name] == whole[name]).all() for name in whole)
+
+
+def test_guides_of_large_pictures_are_means_of_several_launches(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from dnrpipe.raytrace import engine as module
+
+    engine: Any = object.__new__(Engine)
+    engine.mi, engine.compiled, engine.unit_scale = mi, True, 1.0
+    engine.scenes = {"room": poisoned_room(tmp_path, "")}
+    whole = engine.auxiliary(Path("room"), camera(), 64)
+    monkeypatch.setattr(module, "MAX_AUXILIARY", 20 * SIZE * SIZE)
+    parts = engine.auxiliary(Path("room"), camera(), 64)  # 20 + 20 + 20 + 4 samples
+    for one, other in zip(whole[:2], parts[:2], strict=True):
+        assert not np.array_equal(one, other)
+        assert np.abs(one - other).mean() < 0.01
+    assert parts[0].mean() == pytest.approx(whole[0].mean(), rel=0.01)
+
+
+def test_guides_that_are_not_finite_are_counted(tmp_path: Path) -> None:
+    """The denoiser's albedo of a floor that reflects NaN."""
+    engine: Any = object.__new__(Engine)
+    engine.mi, engine.compiled, engine.unit_scale = mi, True, 1.0
+    for name, lost in (("", False), ("floor.bsdf.reflectance.value", True)):
+        engine.scenes = {"room": poisoned_room(tmp_path, name)}
+        albedo, normal, count = engine.auxiliary(Path("room"), camera(), 4)
+        assert np.isfinite(albedo).all() and np.isfinite(normal).all()
+        assert (count > 0) == lost
 
 
 def test_light_in_a_white_furnace_is_one_on_both_sides(tmp_path: Path) -> None:

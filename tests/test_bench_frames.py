@@ -9,8 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tools.bench_frames.motion import Surface, changes, flicker, project, reproject
+from tools.bench_frames.upfront import at_equal_time, break_even, lines, upfront
 
 from dnrpipe.cameras import orbit_views
+from dnrpipe.costs import CostRecord
 from dnrpipe.frames.ladder import classes, crossover, frontier, quality_at, standing
 from dnrpipe.settings import CameraSettings
 from dnrtrain.contract import View
@@ -162,3 +164,46 @@ def test_what_was_hidden_before_takes_no_part() -> None:
     assert not changes([np.zeros((48, 64, 3))] * 2, [nothing, after])[0][1].any()
     with pytest.raises(ValueError, match="too far apart"):
         flicker([np.zeros((48, 64, 3))] * 2, [np.zeros((48, 64, 3))] * 2, [nothing, after])
+
+
+def _record(stage: str, unit: str, name: str, cpu: float, **more: object) -> CostRecord:
+    fields = {"time": 1.0, "run": "r", "purpose": "training", "seconds": cpu, **more}
+    return CostRecord.model_validate({"stage": stage, "unit": unit, "name": name, "cpu_seconds": cpu, **fields})
+
+
+def test_what_comes_before_the_first_frame_is_counted_once_and_without_the_conversion() -> None:
+    records = [
+        _record("prepare", "scene", "convert", 50.0),
+        _record("prepare", "view", "train/0000", 4.0),
+        _record("raytrace", "view", "train/0000", 100.0),  # traced again below: its last cost counts
+        _record("raytrace", "view", "train/0000", 6.0),
+        _record("raytrace", "scene", "light", 10.0),
+        _record("raytrace", "view", "test/0000", 70.0, purpose="evaluation"),
+        *(_record("finetune", "epoch", f"epoch {n}", cpu) for n, cpu in enumerate([6.0, 6.0, 6.0, 9.0, 12.0])),
+    ]
+    found = upfront(records, threads=2)
+    assert found == {"passes": 2.0, "tracing": 8.0, "training": 30.0, "total": 40.0}
+
+
+def test_frames_at_equal_time_and_the_frames_from_which_ours_is_cheaper() -> None:
+    rows = {name: {"ms": ms, "psnr": psnr} for name, (ms, psnr) in LADDER.items()}
+    rows |= {"neural, 1 rays": {"ms": 20.0, "psnr": 28.0}, "neural, 8 rays": {"ms": 60.0, "psnr": 33.0}}
+    scene = {
+        "scene": "box",
+        "rows": rows,
+        "frontier": ["1", "4", "16"],
+        "standing": {n: standing(LADDER, (r["ms"], r["psnr"])) for n, r in rows.items() if n.startswith("neural")},
+        "upfront": {"training": 5.0, "total": 6.0},
+    }
+    one = at_equal_time(scene, 200)
+    assert (one["name"], one["ms"]) == ("neural, 8 rays", pytest.approx(90.0))  # 6 s over 200 frames: 30 ms each
+    assert one["rival"] == pytest.approx(quality_at(LINE, 90.0))
+    # 28 dB take the rival 80 ms: 6 s / (80 - 20) ms. 33 dB it never reaches: at most 6 s / (160 - 60) ms.
+    assert break_even(scene) == ("neural, 8 rays", 60, True)
+    assert break_even({**scene, "standing": {"neural, 1 rays": scene["standing"]["neural, 1 rays"]}}) == (
+        "neural, 1 rays",
+        100,
+        False,
+    )
+    assert "at most 60 frames (8 rays)" in "\n".join(lines([scene]))
+    assert lines([{"scene": "without a ledger"}]) == []

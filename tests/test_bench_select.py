@@ -28,7 +28,7 @@ from dnrpipe.selectbench.rigs import inside, surface_points, walk, winding
 from dnrpipe.selectbench.tables import difference, markdown
 from dnrpipe.settings import CameraSettings, resolve
 from dnrtrain.contract import View
-from dnrtrain.selector.names import NAMES
+from dnrtrain.selector.names import NAMES, TRAINED_NAMES
 
 SUMMARY = {
     "bounds": {"center": [1.0, -2.0, 0.5], "radius": 1.5, "min": [0, -3, 0], "max": [2, -1, 1]},
@@ -99,6 +99,7 @@ def test_pools_and_policies_by_name() -> None:
 def test_every_policy_of_the_trainer_competes() -> None:
     assert {c.policy for c in CONTENDERS.values()} | {"rl-paper"} == {*NAMES, "rl"}
     assert set(SIMPLE) <= set(GROUPS["core"]) and all(CONTENDERS[name].rule for name in GROUPS["core"])
+    assert set(TRAINED_NAMES) <= set(GROUPS["all"]) and not set(TRAINED_NAMES) & set(GROUPS["core"])
     rewards = {
         settings_of(CONTENDERS[name], resolve("draft", {}, environment={}), 7).select.step1.reward
         for name in GROUPS["rewards"]

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import json
+import os
+import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
 
+from dnrpipe import executors
+from dnrpipe.errors import UserError
 from dnrpipe.executors import LocalWorker, Retry, TaskFailed, TaskResult, WorkerDied, run_tasks
 
 WORKER = """
-import os, pathlib, signal, sys, tempfile, time
+import os, pathlib, resource, signal, sys, tempfile, time
 print("noise on import")
 
 class Worker:
@@ -34,6 +40,12 @@ class Worker:
             raise ValueError("bad input,\\nsaid on two lines")
         elif kind == "sleep":
             time.sleep(0.4)
+        elif kind == "greedy-once":
+            mark = pathlib.Path(self.common["folder"]) / f"greedy-{task['n']}"
+            if not mark.exists():
+                mark.touch()
+                resource.setrlimit(resource.RLIMIT_AS, (1 << 28, 1 << 28))
+            bytearray(1 << 29)
         elif kind == "litter":
             pathlib.Path(tempfile.gettempdir(), "left-behind").touch()
             return {"temporary": tempfile.gettempdir()}
@@ -44,7 +56,7 @@ class Worker:
 @pytest.fixture
 def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     (tmp_path / "fragile_worker.py").write_text(WORKER)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     return "fragile_worker"
 
 
@@ -84,10 +96,47 @@ def test_bad_input_is_not_retried_and_is_one_line(module: str, tmp_path: Path) -
 
 def test_a_hung_worker_is_killed(module: str, tmp_path: Path) -> None:
     started = time.monotonic()
-    results, _ = _run(module, tmp_path, ["hang", "ok"], timeout=1.0)
-    assert time.monotonic() - started < 20
+    results, _ = _run(module, tmp_path, ["hang", "ok"], timeout=5.0)  # a busy machine starts a worker in seconds
+    assert time.monotonic() - started < 45
     assert "hung" in (results[0].error or "")
     assert results[1].result is not None
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="RLIMIT_AS is Linux's to keep")
+def test_a_worker_out_of_memory_says_so_and_its_task_is_tried_on_a_fresh_one(module: str, tmp_path: Path) -> None:
+    """The first worker stays as short of memory as it is: tried there again the task would fail again."""
+    results, retries = _run(module, tmp_path, ["greedy-once", "ok"], workers=1)
+    assert [r.reason for r in retries] == ["out of memory (MemoryError)"]
+    assert [r.error for r in results] == [None, None]
+    assert results[0].attempts == 2
+
+
+def test_a_time_limit_from_the_environment(module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DNRPIPE_TASK_TIMEOUT", "1.5s")
+    started = time.monotonic()
+    results, retries = _run(module, tmp_path, ["hang"])
+    assert time.monotonic() - started < 20
+    assert [r.reason for r in retries] == ["worker hung for 2 s"]
+    assert results[0].error == "worker hung for 2 s" and results[0].died
+    monkeypatch.setenv("DNRPIPE_TASK_TIMEOUT", "soon")
+    with pytest.raises(UserError, match="DNRPIPE_TASK_TIMEOUT=soon: expected a time"):
+        _run(module, tmp_path, ["ok"])
+
+
+def test_a_time_limit_from_what_tasks_took(module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hours before anything is known, then a multiple of the longest, and twice that for the second try."""
+    patience = executors.Patience()
+    assert (patience.limit(1), patience.words()) == (6 * 3600, "")
+    for seconds in (4.0, 100.0, 50.0):
+        patience.took(seconds)
+    assert (patience.limit(1), patience.limit(2)) == (3000, 6000)
+    assert patience.words() == "; the longest so far took 100 s"
+    monkeypatch.setattr(executors, "LEAST_LIMIT", 0.5)
+    monkeypatch.setattr(executors, "SLOWEST", 1.0)
+    results, retries = _run(module, tmp_path, ["sleep", "hang"], workers=1)
+    assert results[0].error is None
+    assert "hung" in retries[0].reason and "the longest so far took" in retries[0].reason
+    assert "hung" in (results[1].error or "") and results[1].seconds > 1
 
 
 def test_a_module_that_cannot_be_imported_fails_every_task(tmp_path: Path) -> None:
@@ -105,7 +154,7 @@ def test_a_worker_that_cannot_be_started_is_an_error_and_not_a_hang(module: str,
 def test_a_worker_that_cannot_be_made_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code = "class Worker:\n    def __init__(self, common):\n        raise ValueError('broken bundle')\n"
     (tmp_path / "broken_worker.py").write_text(code)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     results, retries = _run("broken_worker", tmp_path, ["ok"])
     assert results[0].error == "broken bundle"
     assert not results[0].died
@@ -124,10 +173,6 @@ def test_closing_the_iterator_kills_the_workers(module: str, tmp_path: Path) -> 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="PR_SET_PDEATHSIG is Linux's")
 def test_workers_die_with_their_parent(module: str, tmp_path: Path) -> None:
-    import os
-    import signal
-    import subprocess
-
     script = (
         "from dnrpipe.executors import run_tasks; from pathlib import Path;"
         f"list(run_tasks('{module}', {{'folder': '.'}}, [{{'kind': 'hang', 'n': 0}}], workers=1,"
@@ -151,6 +196,19 @@ def test_workers_die_with_their_parent(module: str, tmp_path: Path) -> None:
     for pid in children:
         os.kill(pid, signal.SIGKILL)
     raise AssertionError("a worker outlived its parent")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="PR_SET_PDEATHSIG is Linux's")
+def test_a_worker_whose_parent_died_before_it_could_ask_ends_at_once(module: str, tmp_path: Path) -> None:
+    """Its task is in the pipe already; it must not be begun, for nobody will take the answer."""
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    command = [sys.executable, "-m", "dnrpipe.executors", module]
+    line = json.dumps({"folder": str(tmp_path)}) + "\n" + json.dumps({"kind": "ok", "n": 0}) + "\n"
+    orphan = subprocess.run([*command, str(dead.pid)], input=line, capture_output=True, text=True, timeout=60)
+    assert (orphan.returncode, orphan.stdout) == (1, "")
+    kept = subprocess.run([*command, str(os.getpid())], input=line, capture_output=True, text=True, timeout=60)
+    assert kept.returncode == 0 and json.loads(kept.stdout)["result"]["n"] == 0
 
 
 def _running(pid: int) -> bool:
@@ -177,3 +235,26 @@ def test_a_single_worker_outlives_errors_and_is_replaced_when_it_dies(module: st
         assert worker.ask({"kind": "plain", "n": 3}, 60)["pid"] != first["pid"]
     finally:
         worker.close()
+
+
+def test_a_scene_that_opened_at_the_second_try_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A refusal stays one line: the first try is told of only where the second one helped."""
+    from types import SimpleNamespace
+    from typing import Any
+
+    from dnrpipe import prepare
+    from dnrpipe.console import Console
+
+    workspace: Any = SimpleNamespace(log=lambda stage: tmp_path / "log")
+    for last in (TaskResult({}, {"warnings": []}), TaskResult({}, None, "worker hung for 60 s", 2, died=True)):
+        outcomes = iter([Retry({}, "worker hung for 60 s"), last])
+        monkeypatch.setattr(prepare, "run_tasks", lambda *_, found=outcomes, **__: found)
+        if last.result is not None:
+            assert prepare._attempt(tmp_path / "a.blend", {}, workspace, Console(quiet=True)) == last.result
+            assert "scene: worker hung for 60 s; opening it once more went well" in capsys.readouterr().err
+        else:
+            with pytest.raises(UserError, match="could not open it"):
+                prepare._attempt(tmp_path / "a.blend", {}, workspace, Console(quiet=True))
+            assert capsys.readouterr().err == ""

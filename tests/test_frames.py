@@ -121,7 +121,7 @@ note(albedo=np.abs(guide.albedo[inside] - [0.6, 0.4, 0.2]).max(), inside=inside.
 def test_auxiliary_images_show_what_is_behind_glass(tmp_path: Path) -> None:
     code = """
 kept = frames.auxiliary(views[0], 64, 3).albedo
-albedo, normal = engine.auxiliary(folder / "scene.xml", views[0], 64)
+albedo, normal, _ = engine.auxiliary(folder / "scene.xml", views[0], 64)
 half = len(albedo) // 2
 for name, image in (("frames", kept), ("engine", albedo)):
     note(**{name + colour: image[half, half, i] for i, colour in enumerate("RGB")})
@@ -185,6 +185,50 @@ note(**worst)
     assert found["normal"] < 1e-4
     assert found["depth"] < 1e-4
     assert found["cover"] < 1e-3
+
+
+def test_silhouettes_in_several_launches_are_the_same(tmp_path: Path) -> None:
+    """Memory is bounded: edge pixels are looked at in parts."""
+    found = _run(
+        tmp_path,
+        "",
+        """
+from dnrpipe.raytrace import frames as module
+mask = frames.gbuffer(views[0])["mask"] > 0
+whole = frames.coverage(views[0], mask)
+module.MAX_EDGE_RAYS = 16 * 7
+parts = frames.coverage(views[0], mask)
+note(same=(whole == parts).all(), partial=((whole > 0) & (whole < 1)).sum())
+""",
+        views=1,
+    )
+    assert found["same"] == 1
+    assert found["partial"] > 20
+
+
+def test_cutouts_in_several_launches_cover_as_much(tmp_path: Path) -> None:
+    """A quarter of a veil, everywhere: 16 rays a pixel in one launch, and in four launches of four cells each."""
+    found = _run(
+        tmp_path,
+        HALF_THERE,
+        """
+from dnrpipe.raytrace import frames as module
+mask = frames.gbuffer(views[0])["mask"] > 0
+whole = frames.coverage(views[0], mask)
+module.MAX_EDGE_RAYS = 4 * whole.size
+other = Frames(engine, folder / "scene.xml", "path", 5, frames.size)
+parts = other.coverage(views[0], mask)
+again = other.coverage(views[0], mask)
+steps = np.round(parts * 16) - parts * 16
+note(whole=whole.mean(), parts=parts.mean(), off=np.abs(whole - parts).mean(), steps=np.abs(steps).max(),
+     fine=(np.round(parts * 4) != parts * 4).mean(), same=(parts == again).all())
+""",
+        views=1,
+    )
+    assert found["parts"] == pytest.approx(found["whole"], rel=0.02)
+    assert 0 < found["off"] < 0.1  # other random points
+    assert found["steps"] < 1e-4 and found["fine"] > 0.1  # of 16 rays, not of 4
+    assert found["same"] == 1
 
 
 def test_views_of_another_size_and_odd_ray_counts_are_refused(tmp_path: Path) -> None:

@@ -146,7 +146,18 @@ def test_a_scene_is_swept_and_measured_once(
         "model = {texture_size = 32, width = 8, depth = 2}\n"
         "finetune = {step2 = {epochs = 2}}\n"
     )
-    arguments = ["--budgets", "2,3", "--spp", "4,8", "--iterations", "6", "--also", "random,all", "--ladder", "1,4"]
+    arguments = [
+        "--budgets",
+        "2,3",
+        "--spp",
+        "4,8",
+        "--iterations",
+        "6",
+        "--also",
+        "random,all,cycles",
+        "--ladder",
+        "1,4",
+    ]
     arguments += ["--frames", "10,100", "--jobs", "1"]
     assert _main(["frontier", str(demo_blend), *arguments, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
@@ -156,7 +167,13 @@ def test_a_scene_is_swept_and_measured_once(
     assert {"random", "all", "base"} <= set(kinds)
     assert all(one["upfront"] > 0 for one in found["points"])
     assert {one["views"] for one in found["points"] if one["kind"] == "all"} == {6}
-    assert len(found["rungs"]) == 8
+    cycles = {rung["name"]: rung for rung in found["rungs"] if rung["name"].startswith("Cycles")}
+    assert len(found["rungs"]) == 8 + len(cycles)
+    assert set(cycles) == {f"Cycles {n} spp {how}" for n in (1, 4) for how in ("raw", "denoised-fast", "denoised")}
+    assert all(rung["ms"] > 0 for rung in cycles.values())
+    # Against 16 samples of its own: more samples and the denoiser both help.
+    assert cycles["Cycles 4 spp raw"]["psnr"] > cycles["Cycles 1 spp raw"]["psnr"] > 12
+    assert cycles["Cycles 1 spp denoised"]["psnr"] > cycles["Cycles 1 spp raw"]["psnr"]
     assert all(np.isfinite(one["psnr"]) for one in [*found["points"], *found["rungs"]])
     rows = list(csv.DictReader((folder / "results.csv").open()))
     assert len(rows) == len(found["points"]) + len(found["rungs"])

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import functools
 import json
-import math
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dnrpipe.errors import UserError
 from dnrpipe.planning.choose import Predictor, best_within, budgets, cheapest_reaching
 from dnrpipe.planning.command import parse_duration
-from dnrpipe.planning.quality import LEAST_SHARE, load_prior, predict, scene_gain, share, without_noise
+from dnrpipe.planning.quality import LEAST_SHARE, load_prior, predict, scene_gain, share
 from dnrpipe.planning.records import (
     BasePart,
     FramePart,
@@ -30,6 +30,7 @@ from dnrpipe.planning.records import (
 )
 from dnrpipe.planning.routes import break_even, rival_line, routes, seconds_for
 from dnrpipe.planning.seconds import Costs, Work, noise_at, view_line
+from dnrpipe.planning.worker import without_reference
 
 PRIOR = load_prior()
 POSITIVE = st.floats(1e-8, 1e-5)
@@ -73,7 +74,6 @@ def pilot() -> Pilot:
             base=FramePoint(name="base", ms=40, psnr=28.0),
             neural=FramePoint(name="neural", ms=55, psnr=29.5),
             rival=[FramePoint(name=name, ms=ms, psnr=psnr) for name, ms, psnr in RUNGS],
-            noise_rmse=0.0,
             views=3,
         ),
     )
@@ -144,10 +144,17 @@ def test_the_gain_lies_between_the_pilots_and_the_priors(measured: float) -> Non
     assert 0 < spread <= PRIOR.gain_sd
 
 
-def test_the_references_noise_is_taken_out() -> None:
-    assert without_noise(30.0, 0.0) == pytest.approx(30.0)
-    assert without_noise(30.0, math.sqrt(5e-4)) == pytest.approx(33.01, abs=0.01)  # half the error was noise
-    assert without_noise(30.0, 1.0) == pytest.approx(40.0)  # never more than 10 dB
+def test_noise_of_the_references_does_not_count() -> None:
+    generator = torch.Generator().manual_seed(0)
+    truth = torch.rand(1, 3, 64, 64, generator=generator)
+    picture = truth + 0.02 * torch.randn(truth.shape, generator=generator)
+    first, second = (truth + 0.1 * torch.randn(truth.shape, generator=generator) for _ in range(2))
+    known = torch.ones(64, 64, dtype=torch.bool)
+    mean, error = without_reference(picture, first, second, known)
+    assert mean == pytest.approx(0.02**2, abs=4 * error)  # against the mean of both it would be 0.0054
+    assert error < 0.0002
+    first[..., 5, 7], known[5, 7] = 1e6, False  # a pixel that is not known
+    assert without_reference(picture, first, second, known)[0] == pytest.approx(mean, rel=0.05)
 
 
 @settings(deadline=None, max_examples=10)
@@ -247,7 +254,8 @@ def test_a_scene_is_planned_and_the_plan_carried_out(
     tmp_path: Path, demo_blend: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from dnrpipe.cli import _main
-    from dnrpipe.planning import choose, pilot
+    from dnrpipe.planning import choose
+    from dnrpipe.planning import pilot_parts as pilot
 
     monkeypatch.chdir(tmp_path)
     for module, name, value in (

@@ -6,16 +6,20 @@ import itertools
 import json
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from dnrpipe.console import Console
+from dnrpipe.selection import epochs_of_step1, progress
 from dnrpipe.settings import Settings, resolve
 from dnrpipe.stages import STAGES, fingerprint, run_stage
 from dnrpipe.training import read_selection
 from dnrpipe.workspace import Source, Workspace
 from dnrtrain.contract import write_cameras
+from dnrtrain.selector.names import ACTIVE_NAMES
+from dnrtrain.settings import ModelSettings
 
 sys.path.insert(0, str(Path(__file__).parent / "trainer"))
 
@@ -95,6 +99,57 @@ def test_rl_is_the_alias_of_rl_paper_and_stays_what_it_was() -> None:
     assert set(recorded[1]) == {"budget", "policy", "seed", "step1"}
 
 
+@pytest.mark.parametrize("policy", ACTIVE_NAMES)
+def test_a_policy_with_models_of_its_own(
+    workspace: Workspace, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, policy: str
+) -> None:
+    """Its epochs and its choosing are booked; no epoch goes to the training that step 2 does not start from."""
+    import dnrpipe.selection
+
+    class Everything:
+        """A plan of effects that leaves nothing off: there is no converted scene to plan for."""
+
+        def model(self, model: ModelSettings) -> ModelSettings:
+            return model
+
+    monkeypatch.setattr(dnrpipe.selection, "plan_of", lambda *_: Everything())
+    workspace.scene.mkdir(parents=True)
+    (workspace.scene / "frame.json").write_text(synthetic.FRAME.model_dump_json())
+    held = synthetic.dome(1, 24, seed=1)
+    files, _ = synthetic.write_scene(workspace.root / "made", held)
+    workspace.passes("val", held[0].name).parent.mkdir(parents=True)
+    files[0].rename(workspace.passes("val", held[0].name))
+    write_cameras(workspace.cameras("val"), held, "val")
+    small: dict[str, Any] = {"texture_size": 16, "width": 4, "depth": 1}
+    active = {"members": 2, "rounds": 2, "epochs": 1}
+    settings = resolve(
+        None,
+        {"select": {"budget": 4, "policy": policy, "active": active}, "model": small},
+        environment={},
+    )
+    found, _ = choose(workspace, settings, capsys)
+    assert found["policy"] == policy and found["details"]["start"] == 2
+    assert len(set(found["views"])) == len(found["gains"]) == len(found["why"]) == 4
+    assert [batch["trained_on"] for batch in found["details"]["batches"]] == [2, 3]
+    epochs = {"ensemble": 4, "variance": 2}[policy]
+    booked = workspace.ledger.read()
+    assert [r.name for r in booked] == [*(f"epoch {n}" for n in range(1, epochs + 1)), "selection"]
+    assert all(r.stage == "select" and r.seconds > 0 for r in booked) and epochs_of_step1(settings) == epochs
+    again, _ = choose(workspace, settings, capsys)
+    assert again == found and len(workspace.ledger.read()) == epochs + 1
+    done, wanted = progress(workspace, settings)
+    assert done == wanted
+
+
+def test_settings_of_active_policies_make_only_these_stale() -> None:
+    def recorded(policy: str, **changes: Any) -> Any:
+        return STAGES["select"].settings(resolve(None, {"select": {"policy": policy, **changes}}, environment={}))
+
+    more = {"active": {"members": 5}}
+    assert recorded("ensemble") != recorded("ensemble", **more)
+    assert recorded("rl-paper") == recorded("rl-paper", **more) and recorded("auto") == recorded("auto", **more)
+
+
 def test_when_step_1_trains() -> None:
     assert [told(p).trains_step1 for p in ("auto", "kmedoids", "random", "rl")] == [False, False, False, True]
     assert all(told(p, **COARSE).trains_step1 for p in ("auto", "rl"))
@@ -151,6 +206,45 @@ def test_rounds_trace_a_part_and_go_on(
     assert booked == [("select", f"selection {number}") for number in (1, 2, 3)]
     again, _ = choose(workspace, settings, capsys)
     assert again == found
+
+
+def test_a_choice_beside_a_coarse_model_is_made_once(
+    workspace: Workspace, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Step 1 trains with the views that were chosen in rounds, and its record names them."""
+    import dnrpipe.selection
+    from dnrtrain.selector.auto import AutoPolicy
+
+    workspace.scene.mkdir(parents=True)
+    (workspace.scene / "frame.json").write_text(synthetic.FRAME.model_dump_json())
+    validation = synthetic.dome(1, 24, seed=1)
+    write_cameras(workspace.cameras("val"), validation, "val")
+    (made,), _ = synthetic.write_scene(workspace.root / "made", validation)
+    target = workspace.passes("val", validation[0].name)
+    target.parent.mkdir(parents=True)
+    made.rename(target)
+    traced: list[list[str]] = []
+    monkeypatch.setattr(dnrpipe.selection, "trace_round", trace_by_hand(workspace, traced))
+    monkeypatch.setattr(dnrpipe.selection, "plan_of", lambda *_: SimpleNamespace(model=lambda settings: settings))
+    asked: list[int] = []
+    first_look = AutoPolicy.choose
+
+    def choose_auto(self: AutoPolicy, candidates: Any, budget: int, *rest: Any) -> Any:
+        asked.append(budget)
+        return first_look(self, candidates, budget, *rest)
+
+    monkeypatch.setattr(AutoPolicy, "choose", choose_auto)
+    select = {"budget": 5, "policy": "auto", "rounds": 2, "step1": {"epochs": 1}}
+    small = {"texture_size": 16, "width": 4, "depth": 1, "stride": 1}
+    settings = resolve(
+        None, {"select": select, "model": NO_BASE["model"] | small, "device": "cpu", **COARSE}, environment={}
+    )
+    found, said = choose(workspace, settings, capsys)
+    assert "step 2 starts from the coarse model" in said
+    assert asked == [3] and traced == [found["views"][:3]]  # and the second look is another policy's work
+    record = json.loads((workspace.checkpoints("step1") / "model.json").read_text())
+    assert record["selected"] == found["views"] and record["why"] == found["why"]
+    assert [r.name for r in workspace.ledger.read()] == ["selection 1", "selection 2", "epoch 1"]
 
 
 def test_rounds_make_ray_tracing_count() -> None:

@@ -5,6 +5,11 @@
 
 Seconds are processor seconds of a stage, which other work on the machine does not stretch. The PSNR is predicted with
 the prior refitted without the scene (``tools.plan_prior``), so that it has not seen what it predicts.
+
+Whether to train at all is asked for each scene at the PSNR of its best measured neural point. What each route really
+costs is read off the frontier: path tracing on its measured ladder, the base image where it is good enough, the
+cheapest measured neural point that is. The answer counts as right where the route it names costs at most 15 % more
+than the cheapest.
 """
 
 from __future__ import annotations
@@ -19,23 +24,34 @@ from tools.plan_prior import read_cells, without
 
 from dnrpipe.ablation.results import made_by
 from dnrpipe.errors import UserError
+from dnrpipe.frames.ladder import crossover, frontier
 from dnrpipe.frontier.command import read_frontier
+from dnrpipe.planning.choose import VIEWS, Predictor
 from dnrpipe.planning.command import make_predictor
 from dnrpipe.planning.pilot import read_pilot
+from dnrpipe.planning.records import Choice, Interval, Route
+from dnrpipe.planning.routes import routes
 from dnrpipe.session import resolve_settings
 from dnrpipe.workspace import Workspace
 from dnrtrain.atomic import write_json
 
+FRAMES = (200, 2000)
+NEAR = 1.15
 
-def check(root: Path, scene: str, cells: Path) -> list[dict[str, Any]]:
-    """A row per point of the frontier: predicted and actual. Raises UserError: no pilot, or no frontier."""
+
+def opened(root: Path, scene: str, cells: Path) -> tuple[dict[str, Any], Predictor]:
+    """(what the frontier measured, what the plan predicts with). Raises UserError: no pilot, or no frontier."""
     workspace = Workspace.open(root)
     pilot = read_pilot(workspace)
     if pilot is None:
         raise UserError(f"{root}: has no pilot; run `dnrpipe plan -w {root}`")
     results = read_frontier(root / "frontier" / "results.json")
     prior = without(read_cells(cells), scene, str(cells))
-    predictor = make_predictor(workspace, resolve_settings(workspace, {}, None), pilot, prior)
+    return results, make_predictor(workspace, resolve_settings(workspace, {}, None), pilot, prior)
+
+
+def check(scene: str, results: dict[str, Any], predictor: Predictor) -> list[dict[str, Any]]:
+    """A row per point of the frontier: predicted and actual."""
     cores, threads = results["cores"], results["threads"]
     rows = []
     for point in results["points"]:
@@ -61,6 +77,69 @@ def check(root: Path, scene: str, cells: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def routes_of(scene: str, results: dict[str, Any], predictor: Predictor) -> list[dict[str, Any]]:
+    """Per number of frames: which route the plan names, which is the cheapest, and what each really costs, seconds."""
+    neural = [point for point in results["points"] if point["kind"] == "ours"]
+    wanted = max(point["psnr"] for point in neural)
+    found = []
+    for frames in FRAMES:
+        expected = _expected(predictor, results, wanted, frames)
+        actual = _actual(results, neural, wanted, frames)
+        named, best = expected[0].name, min(actual, key=lambda name: actual[name])
+        found.append(
+            {
+                "scene": scene,
+                "frames": frames,
+                "psnr": round(wanted, 2),
+                "named": named,
+                "cheapest": best,
+                "expected": {route.name: round(route.total, 1) for route in expected if route.reaches},
+                "actual": {name: round(seconds, 1) for name, seconds in actual.items()},
+                "right": named in actual and actual[named] <= NEAR * actual[best],
+            }
+        )
+    return found
+
+
+def _expected(predictor: Predictor, results: dict[str, Any], wanted: float, frames: int) -> list[Route]:
+    """The plan's routes by the frontier's clock: processor seconds over the cores and over training's threads."""
+
+    def total(choice: Choice) -> float:
+        costs = predictor.processor
+        return costs.raytrace(choice.views, choice.spp) / results["cores"] + (
+            costs.finetune(choice.steps) / results["threads"]
+        )
+
+    enough = [p for p in predictor.grid(max(VIEWS)) if p.psnr.expected >= wanted]
+    neural = min(enough, key=lambda p: total(p.choice)) if enough else None
+    if neural is not None:
+        seconds = total(neural.choice)
+        clock = neural.seconds.model_copy(update={"total": Interval(expected=seconds, low=seconds, high=seconds)})
+        neural = neural.model_copy(update={"seconds": clock})
+    width, height = predictor.pilot.size
+    scale = predictor.wall.work.pixels / (width * height)
+    assert predictor.pilot.frames is not None  # make_predictor asked for it
+    light = predictor.processor.light() / results["cores"]
+    return routes(predictor.pilot.frames, neural, light, scale, wanted, frames)
+
+
+def _actual(results: dict[str, Any], neural: list[dict[str, Any]], wanted: float, frames: int) -> dict[str, float]:
+    """Seconds of each route that reaches ``wanted``, without the candidates' passes, which the plan takes as given."""
+
+    def total(point: dict[str, Any]) -> float:
+        return point["upfront"] - point["parts"]["passes"] + frames * point["frame_ms"] / 1000
+
+    found = {"neural renderer": min(total(point) for point in neural if point["psnr"] >= wanted)}
+    points = {rung["name"]: (rung["ms"], rung["psnr"]) for rung in results["rungs"]}
+    ms = crossover([points[name] for name in frontier(points)], wanted)
+    if ms is not None:
+        found["path tracing + denoiser"] = frames * ms / 1000
+    base = next(point for point in results["points"] if point["kind"] == "base")
+    if base["psnr"] >= wanted:
+        found["base image alone"] = total(base)
+    return found
+
+
 def markdown(record: dict[str, Any]) -> str:
     """Predicted and actual side by side, medians below."""
     lines = [
@@ -82,7 +161,28 @@ def markdown(record: dict[str, Any]) -> str:
         f"Median error: tracing {100 * off['tracing']:.0f} %, training {100 * off['training']:.0f} %, both together"
         f" {100 * off['total']:.0f} %; PSNR {lost:.2f} dB, {inside} of {len(rows)} inside their interval.",
     ]
+    if record.get("routes"):
+        lines += ["", *_routes_table(record["routes"])]
     return "\n".join(lines)
+
+
+def _routes_table(found: list[dict[str, Any]]) -> list[str]:
+    names = {"path tracing + denoiser": "path tracing", "base image alone": "base image", "neural renderer": "neural"}
+    lines = [
+        "| scene | frames | dB wanted | plan names | cheapest | right | expected, s | measured, s |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for one in found:
+        cells = [
+            ", ".join(f"{names[name]} {seconds:.0f}" for name, seconds in one[key].items())
+            for key in ("expected", "actual")
+        ]
+        lines.append(
+            f"| {one['scene']} | {one['frames']} | {one['psnr']:.1f} | {names[one['named']]} |"
+            f" {names[one['cheapest']]} | {'yes' if one['right'] else 'no'} | {' | '.join(cells)} |"
+        )
+    right = sum(one["right"] for one in found)
+    return [*lines, "", f"Right in {right} of {len(found)} cases."]
 
 
 def main() -> int:
@@ -93,15 +193,24 @@ def main() -> int:
     parser.add_argument("--out", type=Path, help="JSON of all rows")
     options = parser.parse_args()
     rows: list[dict[str, Any]] = []
+    asked: list[dict[str, Any]] = []
     try:
         for text in options.workspaces:
             scene, _, root = text.rpartition("=")
             path = Path(root)
-            rows += check(path, scene or path.name.removesuffix(".dnr"), options.cells)
+            name = scene or path.name.removesuffix(".dnr")
+            results, predictor = opened(path, name, options.cells)
+            rows += check(name, results, predictor)
+            asked += routes_of(name, results, predictor)
     except UserError as error:
         print(error, file=sys.stderr)
         return 2
-    record = {**made_by(), "command": "python -m tools.plan_check " + " ".join(sys.argv[1:]), "rows": rows}
+    record = {
+        **made_by(),
+        "command": "python -m tools.plan_check " + " ".join(sys.argv[1:]),
+        "rows": rows,
+        "routes": asked,
+    }
     if options.out:
         write_json(options.out, record)
     print(markdown(record))

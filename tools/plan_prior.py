@@ -1,12 +1,11 @@
-"""What `dnrpipe plan` knows before its pilot: measure a few cells on the benchmark scenes, fit the shared parameters.
+"""What `dnrpipe plan` knows before its pilot: shared parameters, fitted to what was measured on the benchmark scenes.
 
-    python -m tools.plan_prior sweep --out .cache/prior [--scenes a,b]   # minutes a scene; goes on where it stopped
-    python -m tools.plan_prior collect .cache/prior/cells.json --workspaces .cache/prior/scenes
+    python -m tools.plan_prior collect .cache/plan/*.dnr/frontier/results.json docs/results/ablation-core.json ...
     python -m tools.plan_prior fit                                       # -> pipeline/dnrpipe/planning/prior.json
 
-``sweep`` trains the default model on each scene with few and many views, steps and samples, and keeps the results of
-all scenes in ``OUT/cells.json``. ``collect`` keeps what matters in docs/results/plan-prior.json. ``fit`` reads that,
-fits :mod:`dnrpipe.planning.quality`, leaves every scene out in turn, and prints how far off it is then.
+``collect`` gathers cells (views, samples, steps, PSNR, PSNR of the base image, noise of the training pictures) of
+`dnrpipe frontier`, of `dnrpipe ablate`, and of its own older output in docs/results/plan-prior.json. ``fit`` reads
+that, fits :mod:`dnrpipe.planning.quality`, leaves every scene out in turn, and prints how far off it is then.
 """
 
 from __future__ import annotations
@@ -14,94 +13,70 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from dnrpipe.ablation.results import gather
-from dnrpipe.ablation.rows import Row
-from dnrpipe.ablation.run import Ablation, Request
-from dnrpipe.ablation.scenes import BENCHMARK, find_scenes
-from dnrpipe.console import Console
 from dnrpipe.planning.quality import LEAST_SHARE, Prior, load_prior, predict, scene_gain, share
-from dnrpipe.settings import resolve
 from dnrtrain.atomic import write_json
 from dnrtrain.exr import read_metadata
 
-GRID = ((6, 16, 25), (6, 16, 67), (25, 16, 6), (25, 16, 16), (25, 4, 16))
-"""(views, samples per pixel, epochs): the pilot's own corner first."""
-SETTINGS: dict[str, Any] = {
-    "cameras": {"test": 6, "val": 0},
-    "raytrace": {"evaluation_spp": 256},
-    "select": {"policy": "farthest"},
-}
-
-
-def rows() -> list[Row]:
-    """The grid as rows of an ablation, and the base image alone."""
-    found = [
-        Row(
-            f"{views}v-{spp}spp-{epochs}e",
-            f"{views} views, {spp} spp, {epochs} epochs",
-            "dnr",
-            {"finetune": {"step2": {"epochs": epochs}}},
-            budget=views,
-            spp=spp,
-        )
-        for views, spp, epochs in GRID
-    ]
-    return [*found, Row("base", "the base image alone, no network", "dnr", network=False)]
-
-
-def sweep(scenes: str | None, out: Path, jobs: int) -> None:
-    """Scene after scene; ``out/cells.json`` holds those that are done."""
-    base = resolve("draft", SETTINGS, environment={})
-    known = {cell["key"]: cell for cell in _read(out / "cells.json")["cells"]} if (out / "cells.json").exists() else {}
-    facts = {"settings": SETTINGS, "preset": "draft", "spp": {row.name: row.spp for row in rows() if row.spp}}
-    for source in find_scenes(scenes or ",".join(BENCHMARK)):
-        request = Request([source], rows(), 1, base, {}, None, out, jobs)
-        run = Ablation(request, Console())
-        run.run()
-        files = {place: out / "cells" / place[0] / f"{key}.json" for place, key in run.cells.items()}
-        results = gather(files, request.rows, facts)
-        known |= {cell["key"]: cell for cell in results["cells"]}
-        results |= {"command": "python -m tools.plan_prior " + " ".join(sys.argv[1:])}
-        write_json(out / "cells.json", results | {"cells": list(known.values())})
+NEURAL_KINDS = ("ours", "random", "all")
+"""Points of a frontier that are the default model, however their views were chosen."""
+ABLATION_SPP = 128
+"""Samples of training views in `dnrpipe ablate`, preset draft."""
 
 
 def collect(sources: list[Path], workspaces: list[Path], out: Path) -> None:
-    """Cells of results files (of ``sweep`` and of `dnrpipe ablate`, row dnr) with their base and noise, in one file."""
-    found = []
+    """Cells of all sources in one file. workspaces: folders of the ablation's, whose files tell the noise."""
+    found: list[dict[str, Any]] = []
     for source in sources:
         results = _read(source)
-        bases = {cell["scene"]: cell["psnr"] for cell in results["cells"] if cell["row"] == "base"}
-        for cell in results["cells"]:
-            if not (cell["row"] in ("dnr", "all-views") or "spp-" in cell["row"]) or cell["scene"] not in bases:
-                continue
-            spp = int(cell["row"].split("-")[1].removesuffix("spp")) if "spp-" in cell["row"] else 128
-            noise = _noise(workspaces, cell["scene"], spp)
-            if noise is None:
-                continue
-            found.append(
-                {
-                    **{name: cell[name] for name in ("scene", "seed", "views", "steps", "psnr")},
-                    "spp": spp,
-                    "noise": round(noise, 5),
-                    "base": bases[cell["scene"]],
-                    "source": source.name,
-                }
-            )
+        if "points" in results:
+            found += _of_frontier(source, results)
+        elif all("noise" in cell for cell in results["cells"]):
+            found += results["cells"]
+        else:
+            found += _of_ablation(source, results, workspaces)
     write_json(out, {"command": "python -m tools.plan_prior " + " ".join(sys.argv[1:]), "cells": found})
     print(f"{len(found)} cells of {len({cell['scene'] for cell in found})} scenes: {out}")
 
 
-def _noise(workspaces: list[Path], scene: str, spp: int) -> float | None:
-    """RMSE of the scene's training pictures at ``spp``, by their files in the first workspace that has some."""
-    for folder in workspaces:
+def _of_frontier(source: Path, results: dict[str, Any]) -> list[dict[str, Any]]:
+    root = source.resolve().parent.parent
+    base = next(point["psnr"] for point in results["points"] if point["kind"] == "base")
+    found = []
+    for point in results["points"]:
+        if point["kind"] in NEURAL_KINDS and (noise := _noise([root], point["spp"])) is not None:
+            found.append(_cell(point, results["scene"], point["spp"], noise, base, "frontier"))
+    return found
+
+
+def _of_ablation(source: Path, results: dict[str, Any], workspaces: list[Path]) -> list[dict[str, Any]]:
+    bases = {cell["scene"]: cell["psnr"] for cell in results["cells"] if cell["row"] == "base"}
+    found = []
+    for cell in results["cells"]:
+        if cell["row"] not in ("dnr", "all-views") or cell["scene"] not in bases:
+            continue
+        noise = _noise([folder / f"{cell['scene']}.dnr" for folder in workspaces], ABLATION_SPP)
+        if noise is not None:
+            found.append(_cell(cell, cell["scene"], ABLATION_SPP, noise, bases[cell["scene"]], source.name))
+    return found
+
+
+def _cell(measured: dict[str, Any], scene: str, spp: int, noise: float, base: float, source: str) -> dict[str, Any]:
+    kept = {name: measured[name] for name in ("seed", "views", "steps", "psnr")}
+    return {"scene": scene, **kept, "spp": spp, "noise": round(noise, 5), "base": base, "source": source}
+
+
+def _noise(roots: Sequence[Path], spp: int) -> float | None:
+    """RMSE of training pictures at ``spp``, by their files in the first workspace that has some."""
+    for root in roots:
         for split in (f"train-{spp}spp", "train"):
-            files = sorted((folder / f"{scene}.dnr" / "raytraced" / split).glob("*.exr"))
+            files = sorted((root / "raytraced" / split).glob("*.exr"))
             known = [m for f in files if (m := read_metadata(f)) and m.get("spp") == spp and m.get("noise_rmse")]
             if known:
                 return float(np.sqrt(np.mean([m["noise_rmse"] ** 2 for m in known])))
@@ -203,21 +178,15 @@ def main() -> int:
     """The verbs of the module's docstring."""
     parser = argparse.ArgumentParser(prog="python -m tools.plan_prior", description=__doc__)
     verbs = parser.add_subparsers(dest="verb", required=True)
-    first = verbs.add_parser("sweep")
-    first.add_argument("--scenes", help="names, comma-separated (default: the ten benchmark scenes)")
-    first.add_argument("--out", type=Path, default=Path(".cache/prior"))
-    first.add_argument("--jobs", type=int, default=0)
     second = verbs.add_parser("collect")
     second.add_argument("sources", nargs="+", type=Path, help="results files")
-    second.add_argument("--workspaces", nargs="+", type=Path, required=True, help="folders of the scenes' workspaces")
+    second.add_argument("--workspaces", nargs="*", type=Path, default=[], help="folders of the ablation's workspaces")
     second.add_argument("--out", type=Path, default=Path("docs/results/plan-prior.json"))
     third = verbs.add_parser("fit")
     third.add_argument("cells", type=Path, nargs="?", default=Path("docs/results/plan-prior.json"))
     third.add_argument("--out", type=Path, default=Path("pipeline/dnrpipe/planning/prior.json"))
     options = parser.parse_args()
-    if options.verb == "sweep":
-        sweep(options.scenes, options.out, options.jobs)
-    elif options.verb == "collect":
+    if options.verb == "collect":
         collect(options.sources, options.workspaces, options.out)
     else:
         fit(options.cells, options.out)

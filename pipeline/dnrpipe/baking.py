@@ -58,6 +58,10 @@ def bake(
                     refused += [tap["key"] for entry in outcome.task["layer"] for tap in entry["taps"]]
                     bar.advance()
                 else:
+                    for name, lost in outcome.result["repaired"].items():
+                        console.warn(
+                            f"repaired: {lost} baked texels of '{name}' were not finite; neighbours stand for them"
+                        )
                     bar.advance()
         finally:
             outcomes.close()  # type: ignore[attr-defined]

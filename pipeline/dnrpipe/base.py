@@ -22,10 +22,10 @@ from .effects.plan import EffectPlan
 from .effects.store import plan_of, resolve_plan, trace_config
 from .errors import UserError
 from .executors import Retry, run_tasks
-from .raytrace.variants import choose_variant
+from .raytrace.variants import VariantChoice, choose_variant
 from .scene_files import scene_fingerprint
 from .settings import Settings
-from .tasks import run_view_tasks, task_name, view_record, warn_repairs
+from .tasks import is_made, run_view_tasks, task_name, view_record, warn_repairs
 from .workspace import Workspace, digest
 
 LIGHT_VERSION, BASE_VERSION = 5, 11
@@ -76,10 +76,13 @@ def base_views(
     stage: Any,
     purpose: Any,
     paths: Sequence[Path] | None = None,
+    held_out: View | None = None,
 ) -> list[dict[str, Any]]:
     """Render the base images of ``views`` that are missing or out of date; returns all tasks ([] where none is due).
 
-    paths: where they go instead of ``base/<split>``. Raises UserError where this machine has no jit variant of Mitsuba.
+    paths: where they go instead of ``base/<split>``. held_out: a test view, which evaluation will want, rendered by
+    the same worker while it is there and booked as evaluation's; its task is not returned. Raises UserError where this
+    machine has no jit variant of Mitsuba.
     """
     kind = settings.model.base
     if kind not in RENDERED or not views:
@@ -87,16 +90,14 @@ def base_views(
     plan = resolve_plan(workspace, settings, console, run_id, stage)
     common, environment, stamp = _prepared(workspace, settings, console, run_id, plan, stage)
     paths = paths or [base_path(workspace, split, view.name) for view in views]
-    tasks = []
-    for view, path in zip(views, paths, strict=True):
-        data = view.model_dump(mode="json")
-        tasks.append({"view": data, "output": str(path), "fingerprint": digest([BASE_VERSION, stamp, data])})
+    tasks = [_task(view, path, stamp) for view, path in zip(views, paths, strict=True)]
+    ahead = [] if held_out is None else [_task(held_out, base_path(workspace, "test", held_out.name), stamp)]
 
     def book(task: dict[str, Any], result: dict[str, Any], workers: int) -> CostRecord:
         record = view_record(
             run=run_id,
-            stage=stage,
-            purpose=purpose,
+            stage="evaluate" if task in ahead else stage,
+            purpose="evaluation" if task in ahead else purpose,
             task=task,
             result=result,
             workers=workers,
@@ -108,7 +109,7 @@ def base_views(
         "base images",
         "dnrpipe.raytrace.base_worker",
         common,
-        tasks,
+        [*tasks, *ahead],
         workspace=workspace,
         console=console,
         stage=stage,
@@ -118,6 +119,18 @@ def base_views(
     )
     warn_repairs(tasks, console)
     return tasks
+
+
+def base_is_made(workspace: Workspace, settings: Settings, split: str, view: View) -> bool:
+    """Whether the view's base image is on disk and up to date; looks at files alone, without Mitsuba."""
+    # No file depends on the variant that rendered it.
+    *_, stamp = renderer_inputs(workspace, settings, plan_of(workspace, settings), VariantChoice("llvm_ad_rgb", {}, ""))
+    return is_made(_task(view, base_path(workspace, split, view.name), stamp))
+
+
+def _task(view: View, path: Path, stamp: str) -> dict[str, Any]:
+    data = view.model_dump(mode="json")
+    return {"view": data, "output": str(path), "fingerprint": digest([BASE_VERSION, stamp, data])}
 
 
 def _prepared(
@@ -144,12 +157,12 @@ def ready_inputs(workspace: Workspace, settings: Settings) -> tuple[dict[str, An
 
 
 def renderer_inputs(
-    workspace: Workspace, settings: Settings, plan: EffectPlan
+    workspace: Workspace, settings: Settings, plan: EffectPlan, choice: VariantChoice | None = None
 ) -> tuple[dict[str, Any], dict[str, str], dict[str, Any] | None, str]:
     """(what the workers share, their environment, the task that bakes the light or None, a hash of all that decides
-    the images but for the view)."""
+    the images but for the view). choice: instead of the variant that this machine can run."""
     chosen, kind = settings.base, settings.model.base
-    choice = choose_variant(settings.raytrace.variant)
+    choice = choice or choose_variant(settings.raytrace.variant)
     if choice.variant.startswith("scalar"):
         raise UserError(
             f"model.base={kind} needs a jit variant of Mitsuba (LLVM or CUDA; see `dnrpipe doctor`);"
@@ -221,6 +234,8 @@ def _bake(
                 raise UserError(f"baking light failed twice: {outcome.error}; see {workspace.log(stage)}")
             result = outcome.result
             bar.advance(note=f"{task['size']}² texels, {task['spp']} spp")
+            if result["lost"]:
+                console.warn(f"repaired: {result['lost']} samples of the baked light were not finite and are left out")
             workspace.ledger.append(
                 CostRecord(
                     time=time.time(),
@@ -234,7 +249,7 @@ def _bake(
                     device=f"mitsuba {common['variant']}",
                     spp=task["spp"],
                     peak_mb=result["peak_mb"],
-                    detail={"texels": result["texels"]},
+                    detail={"texels": result["texels"], "lost": result["lost"]},
                 )
             )
 

@@ -5,6 +5,8 @@ Every line has ``time`` (unix seconds) and ``kind``; the rest depends on the kin
     message    level (info, warning), text
     progress   label, done, total, seconds_left (None until something is done), note
     epoch      stage (select, finetune), epoch, epochs, losses, val, seconds
+    preview    stage (finetune), split, view, epoch, epochs, and files by what they show (prediction, truth),
+               relative to the workspace, until the next one; psnr in dB, None where there is no reference yet
     picture    split, view, and files by what they show, relative to the workspace; psnr in dB
 
 The file is appended to, so that a command that is run again goes on in it. Readers must bear a torn last line.

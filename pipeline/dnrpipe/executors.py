@@ -2,8 +2,9 @@
 
 A renderer runs in a process of its own: bpy is process-global state, and a bad LLVM or GL driver kills
 the process it lives in. The parent survives, reports, retries a task once on a fresh worker, and goes on.
+A worker that does not answer is killed after a while: see :class:`Patience`.
 
-Protocol: ``python -m dnrpipe.executors MODULE``. The worker calls ``MODULE.Worker(common)`` once, then
+Protocol: ``python -m dnrpipe.executors MODULE PARENT``. The worker calls ``MODULE.Worker(common)`` once, then
 ``worker(task) -> result`` for every JSON line on standard input. Answers are JSON lines on a private copy
 of standard output; what libraries print goes to the log file.
 """
@@ -27,9 +28,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from .amounts import parse_seconds
 from .errors import UserError
 
 MAX_ATTEMPTS = 2
+TIMEOUT_VARIABLE = "DNRPIPE_TASK_TIMEOUT"
+FIRST_LIMIT = 6 * 3600.0
+"""Seconds that a task may take while none has ended yet: paper-sized light on two cores is well within."""
+LEAST_LIMIT = 600.0
+"""Below it nothing counts as hung, however quick the others were: machines swap, and sleep."""
+SLOWEST = 30.0
+"""A task may take so many times the longest one so far."""
 
 
 @dataclass
@@ -62,6 +71,48 @@ class Retry:
     reason: str
 
 
+class Patience:
+    """How long a task may take before its worker counts as hung.
+
+    Args:
+        fixed: seconds; None: those of DNRPIPE_TASK_TIMEOUT, else SLOWEST times the longest task that ended so far
+            (LEAST_LIMIT at least, FIRST_LIMIT before any has).
+
+    Raises UserError: the variable is no number of seconds above 0.
+    """
+
+    def __init__(self, fixed: float | None = None) -> None:
+        self.fixed = _configured_limit() if fixed is None else fixed
+        self.longest: float | None = None
+
+    def limit(self, attempt: int) -> float:
+        """Seconds for try number ``attempt`` of a task; further tries get twice as long, unless told otherwise."""
+        if self.fixed is not None:
+            return self.fixed
+        usual = FIRST_LIMIT if self.longest is None else max(LEAST_LIMIT, SLOWEST * self.longest)
+        return usual * (1 if attempt == 1 else 2)
+
+    def took(self, seconds: float) -> None:
+        """A task ended after so many seconds."""
+        self.longest = max(seconds, self.longest or 0.0)
+
+    def words(self) -> str:
+        """What the limit came from."""
+        if self.fixed is not None or self.longest is None:
+            return ""
+        return f"; the longest so far took {self.longest:.0f} s"
+
+
+def _configured_limit() -> float | None:
+    text = os.environ.get(TIMEOUT_VARIABLE, "").strip()
+    if not text:
+        return None
+    try:
+        return parse_seconds(text)
+    except ValueError:
+        raise UserError(f"{TIMEOUT_VARIABLE}={text}: expected a time such as 90, 20m or 2h") from None
+
+
 def run_tasks(
     module: str,
     common: dict[str, Any],
@@ -69,7 +120,7 @@ def run_tasks(
     *,
     workers: int,
     log: Path,
-    timeout: float = 3600.0,
+    timeout: float | None = None,
     environment: dict[str, str] | None = None,
     follow: Callable[[TaskResult], Sequence[dict[str, Any]]] | None = None,
 ) -> Iterator[TaskResult | Retry]:
@@ -79,12 +130,13 @@ def run_tasks(
         module: importable module with a class ``Worker(common)`` that is callable with a task.
         common: JSON-able, sent once to each worker.
         log: file to which the workers' output is appended.
-        timeout: seconds after which a silent task counts as hung; its worker is killed.
+        timeout: seconds after which a silent task counts as hung; its worker is killed. None: see :class:`Patience`.
         environment: variables added to the workers' environment.
         follow: called with each TaskResult before it is yielded; returns tasks to do after it.
 
-    Closing the iterator (Ctrl-C in the consumer) kills the workers.
+    Closing the iterator (Ctrl-C in the consumer) kills the workers. Raises UserError: see :class:`Patience`.
     """
+    patience = Patience(timeout)
     pending: queue.SimpleQueue[tuple[dict[str, Any], int]] = queue.SimpleQueue()
     for task in tasks:
         pending.put((task, 1))
@@ -109,7 +161,7 @@ def run_tasks(
                 try:
                     if slot.process is None or slot.process.poll() is not None:
                         slot.process = _spawn(module, common, log, surroundings)
-                    answer = _ask(slot.process, task, timeout)
+                    answer = _ask(slot.process, task, patience.limit(attempt), patience.words())
                 except (WorkerDied, OSError, ValueError) as death:  # also: cannot be started, torn answer
                     _kill(slot.process)
                     slot.process = None
@@ -117,7 +169,11 @@ def run_tasks(
                 if stopping.is_set():
                     return
                 seconds = time.monotonic() - started
+                if answer.get("retry"):  # on a fresh worker: this one may be short of memory, or half broken
+                    _close(slot.process, force=True)
+                    slot.process = None
                 if "error" not in answer:
+                    patience.took(seconds)
                     outcomes.put(TaskResult(task, answer["result"], None, attempt, seconds))
                 elif attempt < MAX_ATTEMPTS and answer.get("retry", True):
                     outcomes.put(Retry(task, answer["error"]))
@@ -200,7 +256,7 @@ class _Counter:
 def _spawn(module: str, common: dict[str, Any], log: Path, environment: dict[str, str]) -> subprocess.Popen[str]:
     with log.open("a") as sink:
         process = subprocess.Popen(
-            [sys.executable, "-m", "dnrpipe.executors", module],
+            [sys.executable, "-m", "dnrpipe.executors", module, str(os.getpid())],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=sink,
@@ -216,7 +272,8 @@ def _spawn(module: str, common: dict[str, Any], log: Path, environment: dict[str
     return process
 
 
-def _ask(process: subprocess.Popen[str], task: dict[str, Any], timeout: float) -> dict[str, Any]:
+def _ask(process: subprocess.Popen[str], task: dict[str, Any], timeout: float, why: str = "") -> dict[str, Any]:
+    """The answer to a task. Raises WorkerDied, also after ``timeout`` seconds (``why``: where that number is from)."""
     assert process.stdin is not None and process.stdout is not None
     hung = threading.Event()
 
@@ -235,7 +292,7 @@ def _ask(process: subprocess.Popen[str], task: dict[str, Any], timeout: float) -
         except OSError:
             line = ""
         if not line:
-            raise WorkerDied(f"worker hung for {timeout:.0f} s" if hung.is_set() else _epitaph(process))
+            raise WorkerDied(f"worker hung for {timeout:.0f} s{why}" if hung.is_set() else _epitaph(process))
         return json.loads(line)
     finally:
         timer.cancel()
@@ -247,7 +304,8 @@ def _epitaph(process: subprocess.Popen[str]) -> str:
     code = process.returncode
     if code is not None and code < 0:
         with contextlib.suppress(ValueError):
-            return f"worker was killed by {signal.Signals(-code).name}"
+            guess = " (out of memory?)" if -code == signal.SIGKILL else ""
+            return f"worker was killed by {signal.Signals(-code).name}{guess}"
     return f"worker ended with exit code {code}"
 
 
@@ -273,17 +331,22 @@ def _close(process: subprocess.Popen[str] | None, *, force: bool) -> None:
         process.stdout.close()
 
 
-def die_with_parent() -> None:
-    """Ask Linux to kill this worker when the thread that started it dies; elsewhere stdin's end serves."""
+def die_with_parent(parent: int) -> None:
+    """Ask Linux to kill this process when the thread that started it dies; elsewhere stdin's end serves.
+
+    parent: number of the process that started this one. Where it died before we could ask, this process ends at once.
+    """
     if sys.platform == "linux":
         import ctypes
 
         parent_death_signal = 1  # PR_SET_PDEATHSIG
         ctypes.CDLL(None, use_errno=True).prctl(parent_death_signal, signal.SIGKILL)
+        if os.getppid() != parent:
+            os._exit(1)
 
 
-def _worker_main(module: str) -> int:
-    die_with_parent()
+def _worker_main(module: str, parent: int) -> int:
+    die_with_parent(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
@@ -299,6 +362,8 @@ def _worker_main(module: str) -> int:
 
             traceback.print_exc()
             reason = " ".join(str(error).split()) or type(error).__name__
+            if isinstance(error, MemoryError):
+                reason = f"out of memory ({reason})"
             # Bad input and a full disk stay what they are; anything else gets its second try.
             full = isinstance(error, OSError) and error.errno == errno.ENOSPC
             retry = not (full or isinstance(error, ValueError | UserError))
@@ -311,4 +376,4 @@ def _worker_main(module: str) -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(_worker_main(sys.argv[1]))
+    raise SystemExit(_worker_main(sys.argv[1], int(sys.argv[2])))

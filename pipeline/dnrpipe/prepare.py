@@ -211,11 +211,13 @@ def _run_conversion(source: Path, folder: Path, workspace: Workspace, settings: 
 
 
 def _attempt(source: Path, task: dict[str, Any], workspace: Workspace, console: Console) -> dict[str, Any]:
-    """The worker's result, or what went wrong as a UserError."""
+    """The worker's result, or what went wrong as a UserError; a second try is told of where it helped."""
     result: dict[str, Any] = {}
+    first = ""
     with console.bar("scene", 1) as bar:
         for outcome in run_tasks("dnrpipe.blender.prepare", {}, [task], workers=1, log=workspace.log("prepare")):
             if isinstance(outcome, Retry):
+                first = outcome.reason
                 continue
             if outcome.errno == errno.ENOSPC:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), task["scene_dir"])
@@ -225,6 +227,8 @@ def _attempt(source: Path, task: dict[str, Any], workspace: Workspace, console: 
                 raise UserError(str(outcome.error))
             result = outcome.result
             bar.advance()
+    if first:
+        console.warn(f"scene: {first}; opening it once more went well")
     return result
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import View
 from dnrtrain.events import Selected
-from dnrtrain.selector.names import TRAINED_NAMES
+from dnrtrain.selector.names import ACTIVE_NAMES, TRAINED_NAMES
 
 from .console import Bar, Console
 from .costs import CostRecord
@@ -115,7 +115,7 @@ def _choose_by(
     choice: Choice | None = None
     for number, budget in enumerate(stages, start=1):
         if choice is not None:
-            _book(workspace, run_id, f"selection {number - 1}", clock, cpu)
+            _book(workspace, run_id, f"selection {number - 1}", *_since(clock, cpu))
             trace_round(workspace, settings, console, run_id, [views[i] for i in choice.views])
             clock, cpu = time.monotonic(), time.process_time()
         title = f"choosing by {select.policy}" + (f", round {number} of {len(stages)}" if len(stages) > 1 else "")
@@ -129,7 +129,7 @@ def _choose_by(
                 choice = go_on(candidates, choice, traced, budget, tick)
             tick(bar.total)
     assert choice is not None  # there is at least one round
-    _book(workspace, run_id, "selection" if len(stages) == 1 else f"selection {len(stages)}", clock, cpu)
+    _book(workspace, run_id, "selection" if len(stages) == 1 else f"selection {len(stages)}", *_since(clock, cpu))
     return choice
 
 
@@ -137,8 +137,13 @@ def _advance(bar: Bar, weighed: int) -> None:
     bar.advance(min(weighed, bar.total - bar.done))  # a policy's effort is an estimate
 
 
-def _book(workspace: Workspace, run_id: str, name: str, clock: float, cpu: float) -> None:
-    """Book what choosing took since ``clock`` (monotonic) and ``cpu`` (processor seconds)."""
+def _since(clock: float, cpu: float) -> tuple[float, float]:
+    """Wall and processor seconds since ``clock`` (monotonic) and ``cpu`` (process time)."""
+    return time.monotonic() - clock, time.process_time() - cpu
+
+
+def _book(workspace: Workspace, run_id: str, name: str, seconds: float, cpu_seconds: float) -> None:
+    """Book what choosing took."""
     workspace.ledger.append(
         CostRecord(
             time=time.time(),
@@ -147,11 +152,22 @@ def _book(workspace: Workspace, run_id: str, name: str, clock: float, cpu: float
             purpose="training",
             unit="scene",
             name=name,
-            seconds=time.monotonic() - clock,
-            cpu_seconds=time.process_time() - cpu,
+            seconds=seconds,
+            cpu_seconds=cpu_seconds,
             device="cpu",
         )
     )
+
+
+def epochs_of_step1(settings: Settings) -> int:
+    """Epochs that step 1 trains, those of the policy's own models included."""
+    select = settings.select
+    if select.policy not in ACTIVE_NAMES:
+        return select.step1.epochs
+    from dnrtrain.selector.active import active_epochs
+
+    own = active_epochs(select.policy, select.active, select.budget)
+    return own + (select.step1.epochs if settings.starts_coarse or not own else 0)
 
 
 def _train_and_choose(
@@ -165,8 +181,8 @@ def _train_and_choose(
     if select.policy not in TRAINED_NAMES:
         console.say(f"select: policy {select.policy} needs no training, but step 2 starts from the coarse model")
     rule = rule_of(settings)
-    looks = rule.looks if rule is not None else select.policy != "rl-paper"
-    sightings = look(workspace, console, views) if looks else None
+    choice = None if rule is None else _choose_by(rule, workspace, settings, console, run_id, views)
+    sightings = look(workspace, console, views) if select.policy == "fisher" else None
     validation = split_views(workspace)["val"]
     stamp = fingerprint(STAGES["select"], workspace, settings)
     assert stamp is not None  # its inputs were required
@@ -184,15 +200,18 @@ def _train_and_choose(
         checkpoints=workspace.checkpoints("step1"),
         fingerprint=stamp,
         sightings=sightings,
+        choice=choice,
+        active=select.active,
+        coarse=settings.starts_coarse,
     )
-    for event in follow(events, "select", select.step1.epochs, workspace, console, run_id):
+    epochs = epochs_of_step1(settings)
+    for event in follow(events, "select", epochs, workspace, console, run_id):
         if isinstance(event, Selected):
             chosen = event
+            if event.seconds and choice is None:  # 0 where a finished run was found
+                _book(workspace, run_id, "selection", event.seconds, event.cpu_seconds)
     assert chosen is not None  # run_step1 ends with Selected
-    if rule is None or (select.rounds == 1 and not select.weights):
-        return chosen
-    choice = _choose_by(rule, workspace, settings, console, run_id, views)
-    return Selected([views[i].name for i in choice.views], select.policy, choice.details, choice.gains, choice.why)
+    return chosen
 
 
 def look(workspace: Workspace, console: Console, views: list[View]) -> Sightings:

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, field_validator
 
 from dnrtrain.selector.names import TRAINED_NAMES, PolicyName, full_name
-from dnrtrain.settings import LossWeights, ModelSettings, Step1Settings, Step2Settings, Strict
+from dnrtrain.settings import ActiveSettings, LossWeights, ModelSettings, Step1Settings, Step2Settings, Strict
 
 from .amounts import parse_seconds, parse_share
 from .effects.plan import EffectName
@@ -25,7 +25,7 @@ from .errors import UserError
 ENVIRONMENT_PREFIX = "DNRPIPE_"
 ENVIRONMENT_OTHER = {
     *("DNRPIPE_WORKSPACE", "DNRPIPE_CACHE", "DNRPIPE_PRESET"),
-    *("DNRPIPE_EVENTS", "DNRPIPE_SERVER", "DNRPIPE_TOKEN_FILE"),
+    *("DNRPIPE_EVENTS", "DNRPIPE_SERVER", "DNRPIPE_TOKEN_FILE", "DNRPIPE_TASK_TIMEOUT"),
 }
 
 
@@ -140,6 +140,7 @@ class SelectSettings(Strict):
     )
     seed: int = Field(default=0, ge=0)
     step1: Step1Settings = Step1Settings()
+    active: ActiveSettings = ActiveSettings()
 
     @field_validator("policy", mode="before")
     @classmethod
@@ -151,6 +152,12 @@ class FinetuneSettings(Strict):
     """Step 2."""
 
     seed: int = Field(default=0, ge=0)
+    preview_seconds: float = Field(
+        default=10.0,
+        ge=0,
+        le=1e6,
+        description="of training between pictures of a held-out view, to look at, at least; 0 = no pictures",
+    )
     step2: Step2Settings = Step2Settings()
 
 
@@ -172,7 +179,12 @@ class Settings(Strict):
     @property
     def trains_step1(self) -> bool:
         """Whether the coarse model is wanted: by the policy, or as the start of step 2."""
-        return self.select.policy in TRAINED_NAMES or self.finetune.step2.start == "coarse"
+        return self.select.policy in TRAINED_NAMES or self.starts_coarse
+
+    @property
+    def starts_coarse(self) -> bool:
+        """Whether step 2 starts from step 1's model."""
+        return self.finetune.step2.start == "coarse"
 
 
 # The default model, "dnr": it corrects an image of baked light (docs/method.md; figures in docs/experiments.md).

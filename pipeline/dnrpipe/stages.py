@@ -17,6 +17,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from dnrtrain.selector.names import ACTIVE_NAMES, SHIPPED_WEIGHTS
+
 from . import __version__
 from .console import Console, clock
 from .effects.plan import NEURAL
@@ -88,7 +90,9 @@ def _selection(settings: Settings) -> list[Any]:
         parts.append(_selector_weights(settings))
     if not settings.trains_step1:
         return [settings.select.model_dump(include={"budget", "policy", "seed"}), *parts]
-    select = settings.select.model_dump(exclude={"rounds", "weights"})
+    if settings.select.policy in ACTIVE_NAMES:
+        parts.append([settings.select.active.model_dump(), settings.starts_coarse])
+    select = settings.select.model_dump(exclude={"rounds", "weights", "active"})
     if select["policy"] == "rl-paper":
         select["policy"] = "rl"  # its first name: what was trained under it stays done
     return [settings.model.coarse().model_dump(), select, _neural(settings), *parts]
@@ -96,10 +100,8 @@ def _selection(settings: Settings) -> list[Any]:
 
 def _selector_weights(settings: Settings) -> str:
     """Hash of the learned selector's weights; "" while there are none."""
-    import dnrtrain.selector
-
     named = settings.select.weights
-    path = Path(named) if named else Path(dnrtrain.selector.__path__[0]) / "dqn.safetensors"
+    path = Path(named) if named else SHIPPED_WEIGHTS
     return file_sha256(path) if path.is_file() else ""
 
 
@@ -159,8 +161,8 @@ STAGES: dict[str, Stage] = {
             does="step 2: six losses on the selected ray-traced views",
             needs=("select", "raytrace"),
             reads=("passes", "raytraced/train", "base/train", "checkpoints/step1"),
-            writes=("checkpoints/step2",),
-            settings=lambda s: [s.model.model_dump(), s.finetune.model_dump(), _neural(s)],
+            writes=("checkpoints/step2", "preview"),
+            settings=lambda s: [s.model.model_dump(), s.finetune.model_dump(exclude={"preview_seconds"}), _neural(s)],
             run="dnrpipe.training:run_finetune",
             progress="dnrpipe.training:finetune_progress",
         ),

@@ -151,3 +151,8 @@ def warn_repairs(tasks: Sequence[dict[str, Any]], console: Console) -> None:
         if repaired or masked:
             rest = f", {masked} more set to zero" if masked else ""
             console.warn(f"repaired: {repaired} pixels in view {task_name(task)} that were not finite{rest}")
+        if guides := int(metadata.get("guides_masked") or 0):
+            console.warn(
+                f"repaired: {guides} pixels of the denoiser's guides in view {task_name(task)} were not finite;"
+                " there it saw the colour alone"
+            )

@@ -12,7 +12,8 @@ from dnrtrain.exr import read_metadata
 from .base import RENDERED, base_path, base_views
 from .console import Console
 from .costs import CostRecord
-from .effects.store import lenses, resolve_plan, trace_config, variant_for
+from .effects.plan import EffectPlan
+from .effects.store import lenses, plan_of, resolve_plan, trace_config, variant_for
 from .passes import run_passes
 from .prepare import split_views
 from .scene_files import scene_fingerprint
@@ -29,6 +30,8 @@ SAMPLES_VERSION = 1
 
 def run(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
     """Trace the selected views that are not on disk yet, and render the base images that go with them."""
+    from .previews import shown_view  # which imports this module
+
     by_name = {view.name: view for view in split_views(workspace)["train"]}
     selected = [by_name[name] for name in read_selection(workspace)["views"]]
     tasks = trace_views(
@@ -43,7 +46,15 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
         purpose="training",
     )
     bases = base_views(
-        workspace, settings, console, run_id, views=selected, split="train", stage="raytrace", purpose="training"
+        workspace,
+        settings,
+        console,
+        run_id,
+        views=selected,
+        split="train",
+        stage="raytrace",
+        purpose="training",
+        held_out=shown_view(workspace, settings),
     )
     made: list[Any] = [task["fingerprint"] for task in [*tasks, *bases]]
     spp = [(read_metadata(Path(task["output"])) or {}).get("spp") for task in tasks]
@@ -85,35 +96,9 @@ def trace_views(
 
     spp: samples per pixel, where the settings name no noise or time for the split (:func:`goal_of`).
     """
-    scene_print = scene_fingerprint(workspace)
     plan = resolve_plan(workspace, settings, console, run_id, stage)
-    known = lenses(workspace, settings) if plan.on("depth-of-field") else {}
     goal = goal_of(settings, split)
-    tasks: list[dict[str, Any]] = [
-        {
-            "view": view.model_dump(mode="json"),
-            "output": str(workspace.raytraced(split, view.name)),
-            "spp": spp,
-            "integrator": plan.integrator,
-            "max_depth": plan.max_depth,
-            "lens": known.get(view.name),
-            "seed": view_seed(settings.raytrace.seed, split, view.name),
-        }
-        for view in views
-    ]
-    light = [sorted(plan.left_out), plan.on("spectral")]
-    wanted = settings.raytrace.evaluation_denoise if split == "test" else settings.raytrace.denoise
-    for task in tasks:
-        decisive = {key: task[key] for key in ("view", "spp", "integrator", "max_depth", "lens", "seed")}
-        if goal is not None:
-            del task["spp"], decisive["spp"]
-            path = workspace.raytraced(split, task_name(task).partition("/")[2])
-            task["samples"] = str(path.parent / "samples" / f"{path.stem}.npz")
-            task["samples_print"] = digest([SAMPLES_VERSION, scene_print, decisive, light])
-            decisive["goal"] = [goal.noise, goal.seconds, goal.limit]
-        if wanted:
-            task["denoise"] = decisive["denoise"] = True
-        task["fingerprint"] = digest([TRACE_VERSION, scene_print, decisive, light])
+    tasks = _tasks(workspace, settings, plan, views, split, spp)
     if all(is_made(task) for task in tasks):
         return tasks
     choice = variant_for(plan, settings)
@@ -147,6 +132,50 @@ def trace_views(
     else:
         run_passes(label, common, tasks, goal, **arguments)
     warn_repairs(tasks, console)
+    return tasks
+
+
+def reference_is_made(workspace: Workspace, settings: Settings, view: View) -> bool:
+    """Whether a test view's reference is on disk and up to date."""
+    plan = plan_of(workspace, settings)
+    if plan.max_depth is None:
+        return False  # the pilot that decides it has not run, or was of another scene
+    (task,) = _tasks(workspace, settings, plan, [view], "test", settings.raytrace.evaluation_spp)
+    return is_made(task)
+
+
+def _tasks(
+    workspace: Workspace, settings: Settings, plan: EffectPlan, views: list[View], split: str, spp: int
+) -> list[dict[str, Any]]:
+    """What :func:`trace_views` has to do, with the fingerprints of the files that come out."""
+    scene_print = scene_fingerprint(workspace)
+    known = lenses(workspace, settings) if plan.on("depth-of-field") else {}
+    goal = goal_of(settings, split)
+    tasks: list[dict[str, Any]] = [
+        {
+            "view": view.model_dump(mode="json"),
+            "output": str(workspace.raytraced(split, view.name)),
+            "spp": spp,
+            "integrator": plan.integrator,
+            "max_depth": plan.max_depth,
+            "lens": known.get(view.name),
+            "seed": view_seed(settings.raytrace.seed, split, view.name),
+        }
+        for view in views
+    ]
+    light = [sorted(plan.left_out), plan.on("spectral")]
+    wanted = settings.raytrace.evaluation_denoise if split == "test" else settings.raytrace.denoise
+    for task in tasks:
+        decisive = {key: task[key] for key in ("view", "spp", "integrator", "max_depth", "lens", "seed")}
+        if goal is not None:
+            del task["spp"], decisive["spp"]
+            path = workspace.raytraced(split, task_name(task).partition("/")[2])
+            task["samples"] = str(path.parent / "samples" / f"{path.stem}.npz")
+            task["samples_print"] = digest([SAMPLES_VERSION, scene_print, decisive, light])
+            decisive["goal"] = [goal.noise, goal.seconds, goal.limit]
+        if wanted:
+            task["denoise"] = decisive["denoise"] = True
+        task["fingerprint"] = digest([TRACE_VERSION, scene_print, decisive, light])
     return tasks
 
 

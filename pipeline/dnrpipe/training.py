@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from dnrtrain.contract import DamagedFile, View, read_cameras
-from dnrtrain.events import Diverged, EpochEnd, Event, Note
+from dnrtrain.events import Diverged, EpochEnd, Event, Note, Previewed
 
 from .base import RENDERED, base_path
 from .console import Bar, Console
@@ -31,6 +31,8 @@ def run_finetune(workspace: Workspace, settings: Settings, console: Console, run
     """Step 2: fine-tune the coarse DNR on the selected ray-traced views."""
     from dnrtrain.step2 import run_step2
 
+    from .previews import LivePicture  # which imports this module
+
     by_name = {view.name: view for view in split_views(workspace)["train"]}
     names = read_selection(workspace)["views"]
     dataset = load(workspace, [by_name[name] for name in names], "train", raytraced=True, base=settings.model.base)
@@ -38,6 +40,7 @@ def run_finetune(workspace: Workspace, settings: Settings, console: Console, run
     assert stamp is not None
     folder = workspace.checkpoints("step2")
     weights = perceptual_weights(console)
+    picture = LivePicture(workspace, settings, console, run_id, dataset)
     events = run_step2(
         dataset,
         None,
@@ -49,9 +52,11 @@ def run_finetune(workspace: Workspace, settings: Settings, console: Console, run
         checkpoints=folder,
         fingerprint=digest([stamp, weights is not None]),
         weights=weights,
+        preview=picture.preview,
     )
-    for _ in follow(events, "finetune", settings.finetune.step2.epochs, workspace, console, run_id):
-        pass
+    for event in follow(events, "finetune", settings.finetune.step2.epochs, workspace, console, run_id):
+        if isinstance(event, Previewed):
+            picture.show(event)
     return Outcome(file_sha256(folder / "model.safetensors"), {"perceptual": weights is not None, "views": len(names)})
 
 

@@ -9,6 +9,7 @@ scene.dnr/
   raytraced/<split>/<view>.exr  path-traced views
   base/                         baked light; base images, base/<split>/<view>.exr
   checkpoints/{step1,step2}/    weights and histories
+  preview/                      a held-out view as fine-tuning last rendered it
   evaluation/  renders/  report/  logs/
   costs.jsonl                   the ledger
 """
@@ -114,6 +115,10 @@ class Workspace:
     @property
     def evaluation(self) -> Path:
         return self.root / "evaluation"
+
+    @property
+    def preview(self) -> Path:
+        return self.root / "preview"
 
     def cameras(self, split: str) -> Path:
         return self.root / "cameras" / f"{split}.json"

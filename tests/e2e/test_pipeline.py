@@ -35,7 +35,9 @@ def test_only_the_selected_views_are_traced(tiny: Path) -> None:
 
 def test_evaluation_is_booked_apart(tiny: Path) -> None:
     records = Ledger(tiny / "costs.jsonl").read()
-    assert {r.purpose for r in records if r.stage in ("select", "raytrace", "finetune")} == {"training"}
+    assert {r.purpose for r in records if r.stage in ("select", "raytrace")} == {"training"}
+    shown = {(r.purpose, r.unit, r.name.partition(" ")[0]) for r in records if r.stage == "finetune"}
+    assert shown == {("training", "epoch", "epoch"), ("evaluation", "view", "preview/0001")}  # looked at, not needed
     assert {r.purpose for r in records if r.stage == "evaluate"} == {"evaluation"}
     assert {r.purpose for r in records if r.name.startswith("test/")} == {"evaluation"}
 

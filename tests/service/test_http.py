@@ -50,6 +50,8 @@ def test_killed_while_it_trains(server: Server, trained: str) -> None:
         assert states == ["queued", "running", "queued", "running", "done"]
         assert [e.id for e in events] == sorted({e.id for e in events})
         assert any(e.kind == "picture" for e in events)
+        shown = [e.data["epoch"] for e in events if e.kind == "preview"]
+        assert shown[0] == 1 and shown[-1] == 40 and len(shown) >= 3  # and where it went on
         # Taken up in the middle, by the header that browsers send: the rest, nothing twice.
         middle = events[len(events) // 2].id
         assert [e.id for e in client.events(job.id, after=middle)] == [e.id for e in events if e.id > middle]

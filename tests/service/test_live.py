@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import shutil
 import time
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,11 @@ from PIL import Image
 from tests.browser import find_chromium
 from tests.service.devtools import page
 from tests.service.harness import Server, empty_workspace
+from tests.service.test_planned import prediction
 from websockets.sync.client import connect
 
 from dnrpipe.service.live_pace import BUDGET, LEVELS, PATIENCE, START, Pace
+from dnrpipe.service.models import JobRequest
 from dnrpipe.service.routes_live import unpack
 
 needs_chromium = pytest.mark.skipif(find_chromium() is None, reason="no Chromium")
@@ -173,6 +176,11 @@ def test_dashboard_and_viewer_in_a_browser(server: Server, trained: str) -> None
         tab.wait_for("document.querySelectorAll('#curves svg polyline').length > 0")
         tab.wait_for("document.querySelector('#truth').naturalWidth > 0")
         tab.wait_for("document.querySelector('#note').textContent === 'done'")
+        tab.wait_for("document.querySelector('#live-prediction').naturalWidth === 48")
+        caption = tab.evaluate("document.querySelector('#live-caption').textContent")
+        assert caption.startswith("Test view ") and "epoch 40 of 40" in caption and "will ray-trace" in caption
+        assert tab.evaluate("document.querySelector('#live-beside').hidden && !document.querySelector('#live').hidden")
+        assert tab.evaluate("document.querySelector('#plan').hidden")
         assert "Ray-traced 2 of 4 candidates" in tab.evaluate("document.querySelector('#cost').textContent")
         before = tab.evaluate("document.querySelector('#sphere svg').innerHTML")
         x, y = tab.evaluate(
@@ -208,6 +216,44 @@ def test_dashboard_and_viewer_in_a_browser(server: Server, trained: str) -> None
         assert "base image" in tab.evaluate("document.querySelector('#times').textContent")
         tab.evaluate("document.querySelector('input[value=depth]').click()")
         tab.wait_for("document.querySelector('#picture').dataset.mode === 'depth'")
+        assert tab.errors == []
+
+
+@needs_chromium
+def test_what_changes_while_a_job_runs_in_a_browser(server: Server, trained: str) -> None:
+    """The live picture comes and goes on by itself, with the reference beside it; seconds planned and spent."""
+    workspace = server.root / "watched.dnr"
+    shutil.copytree(server.root / f"{trained}.dnr", workspace, ignore=shutil.ignore_patterns("preview", ".lock*"))
+    (workspace / "plan").mkdir()
+    plan = {"made": time.time(), "chosen": None, "settings_default": prediction(2, 60)}
+    plan["settings_default"]["choice"]["spp"] = 8
+    (workspace / "plan" / "plan.json").write_text(json.dumps(plan))
+    settings: dict[str, Any] = {"finetune.step2.epochs": 60, "finetune.preview_seconds": 0.5}
+    epoch = "Number(document.querySelector('#live').dataset.epoch)"
+    with server.client() as client, page() as tab:
+        job = client.submit(JobRequest(command="finetune", workspace="watched", settings=settings)).id
+        tab.open(server.url)
+        tab.wait_for(f"!!document.querySelector('#jobs tr[data-job=\"{job}\"]')")
+        tab.evaluate(f"document.querySelector('#jobs tr[data-job=\"{job}\"]').click()")
+        tab.wait_for(f"!document.querySelector('#live').hidden && {epoch}", 120)
+        first = tab.evaluate(epoch)
+        picture = tab.evaluate("document.querySelector('#live-prediction').src")
+        tab.wait_for(f"{epoch} > {first}", 120)
+        assert tab.evaluate("document.querySelector('#live-prediction').src") != picture
+        assert tab.evaluate("document.querySelector('#live-truth').naturalWidth") == 48
+        assert " dB" in tab.evaluate("document.querySelector('#live-caption').textContent")
+        tab.wait_for("!document.querySelector('#plan').hidden")
+        rows = tab.evaluate(
+            "[...document.querySelectorAll('#plan tbody tr')].map(r => [...r.children].map(c => c.textContent))"
+        )
+        assert [row[0] for row in rows] == ["select", "raytrace", "finetune", "until the renderer is there", "evaluate"]
+        assert rows[1] == ["raytrace", "0:20", "done before"] and rows[3][1] == "1:00 (0:48 to 1:15)"
+        assert "2 views, 8 spp, 60 epochs" in tab.evaluate("document.querySelector('#plan caption').textContent")
+        for _ in client.events(job):
+            pass
+        tab.wait_for(f"{epoch} === 60")
+        spent = "document.querySelector('#plan tbody tr:nth-child(3) td:nth-child(3)').textContent"
+        tab.wait_for(f"/^\\d+:\\d\\d$/.test({spent})")  # no longer "so far"
         assert tab.errors == []
 
 

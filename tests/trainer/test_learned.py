@@ -16,7 +16,8 @@ from dnrtrain.contract import ContractError
 from dnrtrain.selector.doptimal import harmonics
 from dnrtrain.selector.dqn import ValueNetwork, load_network, rollout, save_network, train
 from dnrtrain.selector.environment import FEATURES, Environment, exchange, in_order
-from dnrtrain.selector.learned import SHIPPED, DqnPolicy
+from dnrtrain.selector.learned import DqnPolicy
+from dnrtrain.selector.names import SHIPPED_WEIGHTS
 from dnrtrain.selector.protocol import Candidates
 from dnrtrain.selector.sightings import collect, look_at
 from dnrtrain.selector.surrogate import RIDGE, Surrogate
@@ -158,7 +159,7 @@ def test_weights_are_kept_whole(tmp_path: Path) -> None:
     read, info = load_network(tmp_path / "w.safetensors")
     probe = torch.rand(5, len(FEATURES))
     assert torch.equal(read(probe), network(probe)) and info["scenes"] == ["a"]
-    for path, said in ((tmp_path / "none", "or damaged"), (SHIPPED.with_name("pool.py"), "damaged")):
+    for path, said in ((tmp_path / "none", "or damaged"), (SHIPPED_WEIGHTS.with_name("pool.py"), "damaged")):
         with pytest.raises(ContractError, match=said):
             load_network(path)
     checkpoint.save(tmp_path / "old.safetensors", network.state_dict(), {"features": ["age"]})

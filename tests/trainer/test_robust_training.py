@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from statistics import mean
 
 import pytest
 import torch
@@ -174,19 +175,24 @@ def test_identical_views(scene: Scene, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_bfloat16_ends_where_float32_does(scene: Scene, tmp_path: Path) -> None:
-    """Held-out PSNR within 0.1 dB once the learning rate has fallen far enough for a run to come to rest."""
+    """Held-out PSNR within 0.1 dB once the learning rate has fallen far enough for a run to come to rest.
+
+    Mean of three seeds: on so small a scene one run's rounding alone is worth 0.1 dB, either way, by processor.
+    """
     target = scene.held_out.tensors.target
     assert target is not None
     changes = {"epochs": 40, "ema": 0.97, "learning_rate_end": 1e-5, "augment": False}
-    scores = {}
-    for precision in ("float32", "bfloat16"):
+    scores: dict[str, list[float]] = {"float32": [], "bfloat16": []}
+    for precision, found in scores.items():
         settings = FRESH.model_copy(update={**changes, "precision": precision})
-        fine_tune(scene.traced, tmp_path / precision, settings, MODEL.model_copy(update={"width": 16}))
-        pictures = render_views(load_model(tmp_path / precision / "step2"), scene.held_out)
-        scores[precision] = float(psnr(pictures, target).mean())
+        for seed in range(3):
+            folder = tmp_path / f"{precision}-{seed}"
+            list(events_of(scene.traced, folder, settings, MODEL.model_copy(update={"width": 16}), seed))
+            pictures = render_views(load_model(folder / "step2"), scene.held_out)
+            found.append(float(psnr(pictures, target).mean()))
     print(scores)
-    assert min(scores.values()) > 22
-    assert abs(scores["float32"] - scores["bfloat16"]) < 0.1
+    assert min(map(min, scores.values())) > 22
+    assert abs(mean(scores["float32"]) - mean(scores["bfloat16"])) < 0.1
 
 
 # -- damage ------------------------------------------------------------------------------------------------

@@ -41,6 +41,8 @@ def _one(options: argparse.Namespace) -> int:
 
     try:
         os.environ.update(choose_variant().environment)  # before anything imports Mitsuba
+        # As the command line does: waiting threads that spin cost processor time on a machine that does other things.
+        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
         from .run import Options, bench
 
         (root,) = options.workspaces

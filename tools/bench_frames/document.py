@@ -15,6 +15,8 @@ from typing import Any
 from dnrpipe.frames.ours import BASE, NEURAL
 from dnrtrain.atomic import atomic_path, write_json
 
+from . import upfront
+
 PACKAGES = ("mitsuba", "drjit", "mitsuba-oidn", "torch", "numpy")
 
 
@@ -71,6 +73,15 @@ def markdown(record: dict[str, Any]) -> str:
         "",
         *_overview(scenes),
     ]
+    counted = upfront.lines(scenes)
+    if counted:
+        lines += [
+            "",
+            "Everything counted, for so many frames: what came before the first one (passes, tracing, light, base"
+            " images, training) is spread over them, and the rival gets that time for each of its frames.",
+            "",
+            *counted,
+        ]
     for scene in scenes:
         lines += ["", *_scene(scene)]
     return "\n".join(lines) + "\n"

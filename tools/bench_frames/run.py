@@ -20,6 +20,7 @@ from dnrtrain.weights import WeightsMissing, load_weights
 
 from .reference import Reference, make_references
 from .stability import measure
+from .upfront import upfront
 
 CLASSES = (0.03, 0.07, 0.3)
 """Seconds per 128² pixels that the classes are named by; their limits grow with the pixel count."""
@@ -75,8 +76,12 @@ def bench(root: Path, options: Options, tell: Callable[[str], None]) -> dict[str
             for part, ms in frame["parts"].items():
                 ran.parts.setdefault(part, []).append(ms)
         tell(f"{scene.name}: view {number + 1} of {len(scene.views)}")
+    for rung in rungs.values():
+        if rung.masked and rung.method == "raw":
+            tell(f"{scene.name}: repaired: {rung.masked} pixels of {rung.name} were not finite and are black")
     truth = [scene.shown(picture) for picture in reference.pictures]
     result = _figures(scene, options, reference, truth, rungs, own)
+    result["upfront"] = upfront(scene.workspace.ledger.read(), options.threads)
     if options.orbit > 1:
         shown = [(rungs[name].spp, rungs[name].method) for name in result["frontier"] if rungs[name].method != "raw"]
         result["stability"] = measure(

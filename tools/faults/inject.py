@@ -15,6 +15,7 @@ import itertools
 import json
 import os
 import random
+import resource
 import shutil
 import signal
 import subprocess
@@ -52,6 +53,9 @@ COMMANDS = {
     "finetune": "finetune",
     "evaluate": "evaluate",
 }
+HANG_SECONDS = 60
+"""After which a worker counts as hung here; a healthy task takes a few, a busy machine some more."""
+PAGE = 4096
 CLOCK = """
 import os, time
 _real, _calls = time.time, [0]
@@ -159,23 +163,49 @@ def kill(bench: Bench, folder: Path, stage: str, dice: random.Random) -> Result:
     return result
 
 
-def worker_dies(bench: Bench, folder: Path, stage: str, number: signal.Signals) -> Result:
-    """A worker process is killed: by SIGSEGV as a bad driver does, by SIGKILL as the kernel does without memory."""
-    result = Result(f"worker killed by {number.name}", stage)
+def worker_struck(bench: Bench, folder: Path, stage: str, kind: str, strike: Callable[[int], None]) -> Result:
+    """Something happens to the first worker process of a stage; the command says so, and its task is done by another.
+
+    strike: called with the worker's number; raises ProcessLookupError where it is gone already.
+    """
+    result = Result(kind, stage)
     copy = bench.undone(folder, stage)
-    process = bench.start(stage, copy)
+    process = bench.start(stage, copy, DNRPIPE_TASK_TIMEOUT=f"{HANG_SECONDS}s")
     struck = False
     while process.poll() is None and not struck:
         time.sleep(0.2)
-        for child in _workers(process.pid):
+        for child in _workers(process.pid)[:1]:
             with contextlib.suppress(ProcessLookupError):
-                os.kill(child, number)
+                strike(child)
                 struck = True
     errors = bench.finish(process, result)
-    if not struck or ("trying once more" not in errors and stage != "prepare"):
-        result.problems.append("no worker was there to be killed" if not struck else "the death was not said")
+    if not struck or "once more" not in errors:
+        result.problems.append("no worker was there to be struck" if not struck else f"not said: {errors[-200:]}")
+    if "SIGSTOP" in kind and struck and "worker hung for" not in errors:
+        result.problems.append(f"not called a hang: {errors[-200:]}")
     bench.complete(copy, stage, result)
     return result
+
+
+def worker_dies(bench: Bench, folder: Path, stage: str, number: signal.Signals) -> Result:
+    """A worker process is killed: by SIGSEGV as a bad driver does, by SIGKILL as the kernel does without memory."""
+    return worker_struck(bench, folder, stage, f"worker killed by {number.name}", lambda pid: os.kill(pid, number))
+
+
+def worker_hangs(bench: Bench, folder: Path, stage: str) -> Result:
+    """A worker process stops answering, for ever."""
+    kind = "worker hangs (SIGSTOP)"
+    return worker_struck(bench, folder, stage, kind, lambda pid: os.kill(pid, signal.SIGSTOP))
+
+
+def worker_starves(bench: Bench, folder: Path, stage: str, dice: random.Random) -> Result:
+    """A worker process gets no further memory, from some moment on: whatever it asks for is refused."""
+
+    def starve(pid: int) -> None:
+        time.sleep(dice.uniform(0.0, 3.0))
+        resource.prlimit(pid, resource.RLIMIT_AS, (PAGE, PAGE))
+
+    return worker_struck(bench, folder, stage, "worker out of memory (RLIMIT_AS)", starve)
 
 
 def _workers(parent: int) -> list[int]:
@@ -303,6 +333,11 @@ def campaign(kills: int, seed: int) -> dict[str, list[Callable[[Bench, Path], Re
             lambda b, f, s=stage, n=number: worker_dies(b, f, s, n)
             for stage in ("prepare", "raytrace")
             for number in (signal.SIGSEGV, signal.SIGKILL)
+        ],
+        "hang": [lambda b, f, s=stage: worker_hangs(b, f, s) for stage in ("prepare", "raytrace", "evaluate")],
+        "memory": [
+            lambda b, f, s=stage: worker_starves(b, f, s, dice)
+            for stage in ("prepare", "raytrace", "raytrace", "evaluate")
         ],
         "disk": [lambda b, f, s=stage: disk_full(b, f, s, dice) for stage in ("raytrace", "finetune", "evaluate")],
         "read-only": [lambda b, f, s=stage: read_only(b, f, s) for stage in ("select", "finetune")],

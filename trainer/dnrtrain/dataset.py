@@ -230,7 +230,8 @@ def load_views(
             _check_size(image_file, channels, size, camera)
         colour = _stack(image_file, channels, RASTER_CHANNELS)
         stacks["target"].append(display.over_white(colour[:3], colour[3:]))
-    maps = {name: torch.stack(values) if values else None for name, values in stacks.items()}
+    # One map after the other: no more than the largest of them is in memory twice.
+    maps = {name: torch.stack(values) if (values := stacks.pop(name)) else None for name in list(stacks)}
     tensors = Batch(**maps, display=None if base == "none" else display)  # type: ignore[arg-type]
     return ViewSet(tuple(c.name for c in cameras), np.stack([c.matrix for c in cameras]), tensors)
 

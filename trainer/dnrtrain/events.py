@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,8 @@ class Selected:
 
     gains, why: per view, see :class:`dnrtrain.selector.protocol.Choice`; empty where a run from before they were kept
     is found again.
+    seconds, cpu_seconds: wall and process time of choosing, beside that of the epochs; 0 where a finished run is found
+    again.
     """
 
     views: list[str]
@@ -39,6 +44,8 @@ class Selected:
     details: dict[str, Any] = field(default_factory=dict)
     gains: list[float] = field(default_factory=list)
     why: list[str] = field(default_factory=list)
+    seconds: float = field(default=0.0, compare=False)
+    cpu_seconds: float = field(default=0.0, compare=False)
 
 
 @dataclass(frozen=True)
@@ -64,4 +71,22 @@ class Note:
     text: str
 
 
-Event = EpochEnd | Selected | Diverged | Note
+@dataclass(frozen=True)
+class Previewed:
+    """A view as the model renders it that training would leave if it ended now; it is looked at, nothing else.
+
+    image: display RGB over white, float32 [H, W, 3] in [0, 1]. psnr: in dB against the view's target, None without one.
+    seconds: wall time of rendering; device: as in :class:`EpochEnd`.
+    """
+
+    stage: str
+    epoch: int
+    epochs: int
+    view: str
+    image: np.ndarray
+    psnr: float | None
+    seconds: float
+    device: str = "cpu"
+
+
+Event = EpochEnd | Selected | Diverged | Note | Previewed

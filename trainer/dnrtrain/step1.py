@@ -3,7 +3,8 @@
 With ``rl-paper`` an episode walks ``budget`` candidate views; every view taken is one training step of the DNR
 and gives the agent its reward. With any other policy the DNR trains on all candidates in random order for the same
 number of steps, without an agent: ``fisher`` asks the finished DNR, and for a policy that needs no training it is worth
-its time where step 2 starts from its weights.
+its time where step 2 starts from its weights. ``ensemble`` and ``variance`` train coarse DNRs of their own, on the
+views that they chose so far (:mod:`.selector.active`); each of these is a run of step 1 itself, in a folder below.
 
 The joint loss 0.1·L_RL + 1.0·L_DNRc (equation 5) is stepped by two Adam optimisers: the observation is
 detached, so the two gradients touch disjoint parameters and the sum splits exactly. L_RL = Σ_t (equation
@@ -12,14 +13,15 @@ detached, so the two gradients touch disjoint parameters and the sum splits exac
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import shutil
+from collections.abc import Generator, Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
 from . import checkpoint
 from .contract import ContractError, DamagedFile
@@ -39,20 +41,19 @@ from .schedule import (
     step_random,
     validate,
 )
-from .selector.agent import RewardScale, best_action, epsilon_at, epsilon_greedy, follow, reward_of, td_target
-from .selector.baselines import FarthestPolicy
+from .selector.active import active_epochs, choose_actively
 from .selector.fisher import choose_by_fisher
-from .selector.names import full_name
+from .selector.names import ACTIVE_NAMES, full_name
 from .selector.policies import untrained
 from .selector.protocol import Candidates, Choice, check_budget
-from .selector.qnetwork import QNetwork
 from .selector.sightings import Sightings
-from .settings import ModelSettings, Step1Settings
+from .settings import ActiveSettings, ModelSettings, Step1Settings
+from .walker import Walker
 
 AGENTS = "rl-paper"
 """The policy whose agent learns while the renderer trains; others that step 1 trains for ask the finished renderer."""
-PROBES = 4
-"""Views whose loss the ``improvement`` reward watches."""
+MEMBERS = "members"
+"""Folder of the models that a policy trains for itself, below that of the step; gone when it has chosen."""
 
 
 def run_step1(
@@ -69,6 +70,9 @@ def run_step1(
     checkpoints: Path,
     fingerprint: str,
     sightings: Sightings | None = None,
+    choice: Choice | None = None,
+    active: ActiveSettings | None = None,
+    coarse: bool = True,
 ) -> Iterator[Event]:
     """Train the coarse DNR (and the selector); the last event is :class:`Selected`.
 
@@ -82,14 +86,24 @@ def run_step1(
         checkpoints: this step's own folder; a run that was interrupted there with the same fingerprint
             and settings is continued after its last whole epoch, a finished one answers at once.
         sightings: what the candidates see, for policies that look at it.
+        choice: what the policy has chosen already, where it needs no training; None: it is asked here.
+        active: for policies with models of their own (default: :class:`~dnrtrain.settings.ActiveSettings`).
+        coarse: whether the saved model is wanted, as the start of step 2. Without it those policies spare themselves
+            the training on all candidates; the saved model is then the first of their last batch.
 
     Raises:
-        ContractError: budget out of range, unknown policy, views without targets.
+        ContractError: budget out of range, unknown policy, views without targets, a choice of another size.
     """
+    if choice is not None and len(choice.views) != budget:
+        raise ContractError(f"{len(choice.views)} views were chosen, but the budget is {budget}")
     if np.shape(camera_positions) != (len(views), 3):
         raise ContractError(f"{len(views)} views but camera positions of shape {np.shape(camera_positions)}")
     candidates = Candidates(np.asarray(camera_positions, np.float64), views.camera_directions, sightings)
-    run = _Step1(views, val, candidates, model, settings, policy, budget, seed, device, checkpoints, fingerprint)
+    run = _Step1(
+        views, val, candidates, model, settings, policy, budget, seed, device, checkpoints, fingerprint,
+        active or ActiveSettings(), coarse,
+    )  # fmt: skip
+    run.choice = choice
     yield from run.events()
 
 
@@ -109,9 +123,12 @@ class _Step1:
         device: str,
         folder: Path,
         fingerprint: str,
+        active: ActiveSettings,
+        coarse: bool,
     ) -> None:
         check_budget(budget, len(views))
         self.rule = untrained(policy)
+        self.choice: Choice | None = None
         policy = full_name(policy)
         require_target(views, "step 1")
         self.candidates = candidates
@@ -122,26 +139,25 @@ class _Step1:
         # Under its first name, so that runs from before it had two are found again.
         known = "rl" if policy == "rl-paper" else policy
         parts = [model.model_dump(), settings.model_dump(), known, budget, seed, device]
+        self.active, own_epochs = active, 0
+        if policy in ACTIVE_NAMES:
+            own_epochs = active_epochs(policy, active, budget)
+            parts += [active.model_dump(), coarse]
+        self.epochs = settings.epochs if coarse or not own_epochs else 0
+        self.all_epochs = self.epochs + own_epochs
         self.key = run_key(fingerprint, views, parts)
         self.episodes = -(-len(views) // budget)
         self.total_steps = settings.epochs * self.episodes * budget
         self.dnr = DNR(model, seed).to(device)
-        self.agent: QNetwork | None = None
-        self.slow: QNetwork | None = None
-        if policy == AGENTS:
-            shape = (len(views), model.texture_channels, settings.embedding, seed + 1)
-            self.agent, self.slow = QNetwork(*shape).to(device), QNetwork(*shape).to(device)
         self.adam_dnr = adam([self.dnr], settings.learning_rate, device, settings.texture_rate_scale)
-        self.adam_agent = adam([self.agent], settings.learning_rate, device) if self.agent else None
-        self.probes: list[int] = []
-        if self.agent and settings.reward == "improvement":
-            self.probes = FarthestPolicy().choose(candidates, min(PROBES, len(views)), seed).views
-        elif self.agent and settings.reward == "improvement-all":
-            self.probes = list(range(len(views)))
-        self.scale = RewardScale(raw=settings.reward_scale == "raw")
+        self.walker: Walker | None = None
+        if policy == AGENTS:
+            self.walker = Walker(self.dnr, self.views, candidates, settings, budget, seed, device)
         self.notes: list[str] = []
         self.watch = Watch()
         self.history: list[dict] = []
+        self.booked: dict[str, float] = {}
+        """What the epochs of a policy's own models took in this run."""
         self.book = EpochBook()
         self.step = 0
 
@@ -158,13 +174,16 @@ class _Step1:
         for text in self.notes:
             yield Note(text)
         if first:
-            yield Note(f"step 1 continues after epoch {first} of {self.settings.epochs}")
+            yield Note(f"step 1 continues after epoch {first} of {self.epochs}")
         epoch = first
-        while epoch < self.settings.epochs:
+        while epoch < self.epochs:
             done = self._epoch(epoch)
             yield done
             epoch += isinstance(done, EpochEnd)
-        choice = self._select()
+        book = EpochBook()
+        choice = yield from self._select()
+        spent = book.entry(0, 0.0, {})
+        choosing = {name: max(0.0, spent[name] - self.booked.get(name, 0.0)) for name in ("seconds", "cpu_seconds")}
         names = [self.views.names[i] for i in choice.views]
         info = {
             "fingerprint": self.fingerprint,
@@ -181,20 +200,23 @@ class _Step1:
             "bfloat16": self.dnr.use_bfloat16,
             "restarts": self.watch.restarts,
             "history": self.history,
+            "choosing": choosing,
         }
         checkpoint.save_model(self.folder, self.dnr, info)
-        yield Selected(names, self.policy, choice.details, choice.gains, choice.why)
+        shutil.rmtree(self.folder / MEMBERS, ignore_errors=True)
+        yield Selected(names, self.policy, choice.details, choice.gains, choice.why, **choosing)
 
     def _epoch(self, epoch: int) -> EpochEnd | Diverged:
         """One epoch; where it diverged, the state is that before it, at a lower rate."""
         self.book = EpochBook()
         self.step = epoch * self.episodes * self.budget
-        if self.agent is None:
+        trained: list[nn.Module] = [self.dnr]
+        if self.walker is None:
             self._train_all(epoch)
         else:
+            trained.append(self.walker.agent)
             for episode in range(self.episodes):
-                self._episode(epoch, episode)
-        trained = [module for module in (self.dnr, self.agent) if module is not None]
+                self.walker.episode(epoch, episode, self._train_view, lambda: self._rate(self.step - 1), self.book)
         with torch.no_grad():
             picture = self.dnr(self.views.batch([0])).rgb
         reason = self.watch.trouble(self.book, "dnr", self.history, picture, *trained)
@@ -219,7 +241,7 @@ class _Step1:
         return EpochEnd(
             "step1",
             epoch + 1,
-            self.settings.epochs,
+            self.all_epochs,
             entry["losses"],
             scores,
             entry["seconds"],
@@ -257,97 +279,68 @@ class _Step1:
         for view in order[: self.episodes * self.budget]:
             self._train_view(view)
 
-    def _episode(self, epoch: int, episode: int) -> None:
-        """Select ``budget`` views one after the other, training the DNR and the agent on the way."""
-        assert self.agent is not None and self.slow is not None and self.adam_agent is not None
-        s, agent = self.settings, self.agent
-        random = step_random(self.seed, STEP1, epoch, episode)
-        epsilon = epsilon_at(epoch, s.epochs, s.epsilon_start, s.epsilon_end)
-        selected = torch.zeros(len(self.views), dtype=torch.bool, device=self.device)
-        view = int(random.integers(len(self.views)))
-        loss, texture = self._train_view(view)
-        self.scale.reward(loss)
-        selected[view] = True
-        probe = self._probe_loss()
-        for taken in range(1, self.budget):
-            values = agent(selected, agent.encode(texture))
-            view = epsilon_greedy(values.detach(), selected, epsilon, random)
-            loss, texture = self._train_view(view)
-            if s.reward == "improvement-own":
-                probe, after = loss, self._loss_on([view])
-            else:
-                after = self._probe_loss()
-            reward = reward_of(s.reward, self.scale.reward(loss), probe, after)
-            probe = after
-            selected = selected.clone()
-            selected[view] = True
-            terminal = taken == self.budget - 1
-            slow = self.slow if s.q_target == "double" else agent
-            target = td_target(agent, slow, reward, s.gamma, selected, agent.encode(texture), terminal)
-            loss_rl = (values[view] - target).square()
-            if not guarded_step(self.adam_agent, s.weight_rl * loss_rl, self._rate(self.step - 1)):
-                self.book.skipped += 1
-            follow(self.slow, agent)
-            self.book.add(rl=float(loss_rl.detach()), reward=reward, q=float(values[view].detach()))
-
-    def _probe_loss(self) -> float | None:
-        return self._loss_on(self.probes) if self.probes else None
-
-    @torch.no_grad()
-    def _loss_on(self, views: list[int]) -> float:
-        """Mean L_DNRc of some candidates."""
-        losses = []
-        for view in views:
-            batch = self.views.batch([view])
-            assert batch.target is not None
-            losses.append(F.mse_loss(self.dnr(batch).rgb, batch.target))
-        return float(torch.stack(losses).mean())
-
     # -- the selection ---------------------------------------------------------------------------------
 
-    def _select(self) -> Choice:
-        """The policy's choice: by the trained agent's greedy roll-out where there is one."""
+    def _select(self) -> Generator[Event, None, Choice]:
+        """The policy's choice, by the trained agent's greedy roll-out where there is one; yields what models
+        trained for it tell."""
+        if self.choice is not None:
+            return self.choice
+        if self.policy in ACTIVE_NAMES:
+            return (
+                yield from choose_actively(
+                    self.policy, self.views, self.candidates, self.budget, self.seed, self.active, self._train_member
+                )
+            )
         if self.rule is not None:
             return self.rule.choose(self.candidates, self.budget, self.seed)
-        if self.agent is None:
+        if self.walker is None:
             return choose_by_fisher(self.dnr, self.views, self.candidates, self.budget, self.seed)
-        return self._roll_out()
+        return self.walker.roll_out()
 
-    @torch.no_grad()
-    def _roll_out(self) -> Choice:
-        assert self.agent is not None
-        random = step_random(self.seed, STEP1, -1, -1)
-        order = [int(random.integers(len(self.views)))]
-        selected = torch.zeros(len(self.views), dtype=torch.bool, device=self.device)
-        selected[order[0]] = True
-        values: list[float] = []
-        while len(order) < self.budget:
-            texture = self.dnr(self.views.batch([order[-1]])).texture
-            q = self.agent(selected, self.agent.encode(texture))
-            order.append(best_action(q, selected))
-            selected[order[-1]] = True
-            values.append(float(q[order[-1]]))
-        details: dict[str, Any] = {"reward": self.settings.reward, "measure": "action value when it was taken"}
-        if values and np.isfinite(values).all():
-            details["action_values"] = values
-        finite = [value if np.isfinite(value) else 0.0 for value in values]
-        why = ["drawn at random, as in every episode", *(f"highest action value: {value:.4f}" for value in values)]
-        return Choice(order, [0.0, *finite], why, details)
+    def _train_member(self, views: list[int], batch: int, member: int) -> Generator[Event, None, DNR]:
+        """A coarse DNR of its own on some candidates: step 1 without an agent, of so many epochs over them.
+
+        It goes on where an interrupted run stopped. Its epochs are numbered, and booked, behind those before it.
+        """
+        some, folder = self.views.subset(views), self.folder / MEMBERS / f"{batch}-{member}"
+        epochs, before = self.active.epochs, len(self.history)
+        settings = self.settings.model_copy(update={"epochs": epochs, "validation_views": 0})
+        seed = int(np.random.SeedSequence([self.seed, batch, member]).generate_state(1)[0])
+        events = run_step1(
+            some, None, some.camera_positions, self.dnr.settings, settings,
+            policy="random", budget=len(some), seed=seed, device=self.device, checkpoints=folder,
+            fingerprint=self.fingerprint,
+        )  # fmt: skip
+        for event in events:
+            if isinstance(event, Selected):
+                continue
+            if isinstance(event, EpochEnd | Diverged):
+                for name in ("seconds", "cpu_seconds"):
+                    self.booked[name] = self.booked.get(name, 0.0) + getattr(event, name)
+                event = replace(event, epoch=before + event.epoch)
+            yield replace(event, epochs=self.all_epochs) if isinstance(event, EpochEnd) else event
+        record = checkpoint.read_record(folder)
+        assert record is not None  # it has just finished
+        for ours, own in ((self.history, record["history"]), (self.watch.restarts, record["restarts"])):
+            ours += [{**entry, "epoch": before + entry["epoch"]} for entry in own]
+        model = checkpoint.load_model(folder, self.device)
+        if not self.epochs and member == 0:
+            self.dnr = model
+        return model
 
     # -- checkpoints -----------------------------------------------------------------------------------
 
     def _save(self, epoch: int) -> None:
         tensors = checkpoint.prefixed("dnr", self.dnr.state_dict())
         tensors |= checkpoint.prefixed("adam_dnr", checkpoint.optimiser_tensors(self.adam_dnr))
-        if self.agent is not None and self.slow is not None and self.adam_agent is not None:
-            tensors |= checkpoint.prefixed("agent", self.agent.state_dict())
-            tensors |= checkpoint.prefixed("slow", self.slow.state_dict())
-            tensors |= checkpoint.prefixed("adam_agent", checkpoint.optimiser_tensors(self.adam_agent))
+        if self.walker is not None:
+            tensors |= self.walker.tensors()
         info = {
             "run": self.key,
             "epoch": epoch,
             "bfloat16": self.dnr.use_bfloat16,
-            "reward_mean": self.scale.mean,
+            "reward_mean": None if self.walker is None else self.walker.scale.mean,
             "restarts": self.watch.restarts,
             "history": self.history,
         }
@@ -370,10 +363,7 @@ class _Step1:
 
     def _load(self, saved: checkpoint.Saved) -> None:
         self.dnr.use_bfloat16, self.history = saved.info["bfloat16"], saved.info["history"]
-        self.scale = RewardScale(saved.info["reward_mean"], raw=self.settings.reward_scale == "raw")
         checkpoint.load_module(self.dnr, checkpoint.unprefixed("dnr", saved.tensors))
         checkpoint.restore_optimiser(self.adam_dnr, checkpoint.unprefixed("adam_dnr", saved.tensors))
-        if self.agent is not None and self.slow is not None and self.adam_agent is not None:
-            checkpoint.load_module(self.agent, checkpoint.unprefixed("agent", saved.tensors))
-            checkpoint.load_module(self.slow, checkpoint.unprefixed("slow", saved.tensors))
-            checkpoint.restore_optimiser(self.adam_agent, checkpoint.unprefixed("adam_agent", saved.tensors))
+        if self.walker is not None:
+            self.walker.load(saved)

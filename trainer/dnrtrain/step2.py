@@ -17,6 +17,7 @@ from .losses import Step2Loss
 from .model import DNR
 from .perceptual import PerceptualLoss
 from .precision import decide_bfloat16
+from .preview import Preview, Previewer
 from .schedule import (
     STEP2,
     Averaged,
@@ -46,6 +47,7 @@ def run_step2(
     checkpoints: Path,
     fingerprint: str,
     weights: Mapping[str, Mapping[str, Tensor]] | None,
+    preview: Preview | None = None,
 ) -> Iterator[Event]:
     """Fine-tune; yields an event per epoch and leaves ``model.safetensors`` and ``model.json``.
 
@@ -56,11 +58,13 @@ def run_step2(
         checkpoints: this step's own folder; see :func:`dnrtrain.step1.run_step1` on resuming.
         weights: from :func:`dnrtrain.weights.load_weights`; None drops L_p with a note, and the record says
             ``"perceptual": false``.
+        preview: a view to show now and then while training goes on. It changes nothing of what is trained.
 
     Raises:
         ContractError: no finished step 1, of other model settings, or views without targets.
     """
     run = _Step2(views, val, coarse, model, settings, seed, device, checkpoints, fingerprint, weights)
+    run.previewer = None if preview is None else Previewer(preview, device)
     yield from run.events()
 
 
@@ -103,6 +107,7 @@ class _Step2:
         self.average = Averaged(self.dnr, settings.ema) if settings.ema else None
         self.watch = Watch()
         self.history: list[dict] = []
+        self.previewer: Previewer | None = None
 
     def _from_coarse(self, folder: Path, model: ModelSettings) -> DNR:
         """Step 1's renderer; where ``model`` has parts that the coarse one lacks, those start fresh."""
@@ -140,6 +145,8 @@ class _Step2:
         while epoch < self.settings.epochs:
             done = self._epoch(epoch)
             yield done
+            if self.previewer is not None and isinstance(done, EpochEnd):
+                yield from self.previewer.after(done, self.dnr, self.average)
             epoch += isinstance(done, EpochEnd)
         info = {
             "fingerprint": self.fingerprint,

@@ -95,6 +95,8 @@ class Worker:
             device=self.device,
             checkpoints=folder,
             fingerprint=task["key"],
+            active=settings.select.active,
+            coarse=settings.starts_coarse,
         )
 
     def _cell(self, task: dict[str, Any], settings: Settings, workspace: Workspace) -> dict[str, Any]:
@@ -268,6 +270,12 @@ def _history(folder: Path) -> list[dict[str, Any]]:
 
 
 def _training_cost(folder: Path) -> dict[str, Any]:
-    """Sums over all epochs, those of an interrupted run included."""
-    history = _history(folder)
-    return {key: sum(entry[key] for entry in history) for key in ("seconds", "cpu_seconds", "steps", "skipped")}
+    """Sums over all epochs, those of an interrupted run included, and what the choice at the end took."""
+    from dnrtrain.checkpoint import read_record
+
+    record = read_record(folder)
+    assert record is not None  # its step has just finished
+    cost = {key: sum(e[key] for e in record["history"]) for key in ("seconds", "cpu_seconds", "steps", "skipped")}
+    for key, value in record.get("choosing", {}).items():
+        cost[key] += value
+    return cost

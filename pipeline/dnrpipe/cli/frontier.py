@@ -16,7 +16,13 @@ from .options import CAMERA_OPTIONS, STRICT, camera_overrides, common, open_sess
 @click.option("--spp", metavar="A,B", help="Samples per pixel of training views (default 16 and the workspace's).")
 @click.option("--iterations", metavar="A,B", help="Optimiser steps (default 150,600).")
 @click.option("--frames", metavar="A,B", help="Numbers of frames to compare for (default 200,2000).")
-@click.option("--also", default="random,all,paper", show_default=True, metavar="A,B", help="Other ways to train; none.")
+@click.option(
+    "--also",
+    default="random,all,paper,cycles",
+    show_default=True,
+    metavar="A,B",
+    help="Other ways to train, and Cycles as a rival; none.",
+)
 @click.option("--ladder", metavar="A,B", help="Samples of path tracing, the rival (default 1,2,4,8,16,64).")
 @click.option("--seeds", type=int, default=1, show_default=True, metavar="N", help="Every point is trained N times.")
 @click.option("--jobs", type=int, default=0, metavar="N", help="Cells side by side (default: one per core).")
@@ -39,9 +45,9 @@ def frontier(
     """Sweep views, samples and steps, and draw quality against total seconds, rivals included.
 
     SCENE is a scene file or a workspace. Rivals on the same test views: path tracing at 1 to 64 samples, with and
-    without Open Image Denoise; random views; all candidates; the paper's model; the base image alone. Writes
-    results.json, results.csv, report.md and a plot per number of frames into the workspace's folder frontier/. Traced
-    views, references and light are shared; what is done is not done again.
+    without Open Image Denoise; Cycles likewise; random views; all candidates; the paper's model; the base image alone.
+    Writes results.json, results.csv, report.md and a plot per number of frames into the workspace's folder frontier/.
+    Traced views, references and light are shared; what is done is not done again.
 
     \b
     Examples:

@@ -57,7 +57,8 @@ SELECT_OPTIONS = [
     click.option(
         "--policy",
         type=click.Choice([*NAMES, *ALIASES]),
-        help="How to choose them; rl-paper (alias rl) and fisher train step 1 for it, the others take seconds.",
+        help="How to choose them; rl-paper (alias rl), fisher, ensemble and variance train for it, the others take"
+        " seconds.",
     ),
     click.option(
         "--rounds",

@@ -25,6 +25,8 @@ from ..errors import UserError
 @click.option("--job-hours", type=float, metavar="H", help="Longest job (default 24).")
 @click.option("--job-memory-mb", type=click.IntRange(64), metavar="N", help="Of a job's processes (default 80%).")
 @click.option("--job-disk-mb", type=click.IntRange(1), metavar="N", help="Of a job's workspace (default 51200).")
+@click.option("--keep-days", type=float, metavar="D", help="Logs and events of ended jobs (default 30 days).")
+@click.option("--keep-jobs", type=click.IntRange(1), metavar="N", help="Those of the last N ended jobs (default 1000).")
 def serve(
     host: str,
     port: int,
@@ -60,6 +62,9 @@ def serve(
             raise UserError(f"--devices {name}: neither cpu nor cuda:<number>")
     if len(set(chosen)) < len(chosen):
         raise UserError(f"--devices {devices}: names a device twice")
+    days = options["keep_days"]
+    if days is not None and not 0 < days <= 36_500:
+        raise UserError(f"--keep-days {days:g}: must be above 0, and 36500 at most")
     for name, value in (("--job-hours", job_hours), ("--rate", options["rate"])):
         if value is not None and value <= 0:
             raise UserError(f"{name} {value:g}: must be above 0")

@@ -219,6 +219,8 @@ def run_pilots(
                         raise UserError(f"{label}: {outcome.error}; see {log}")
                     else:
                         answers.append(outcome.result)
+                        if lost := outcome.result["masked"]:
+                            console.warn(f"repaired: {lost} pixels of {label} pictures were not finite and are black")
             finally:
                 outcomes.close()  # type: ignore[attr-defined]
             bar.advance()

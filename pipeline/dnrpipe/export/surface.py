@@ -53,6 +53,10 @@ def surface_maps(workspace: Workspace, console: Console) -> SurfaceMaps:
                 console.warn(f"surface maps: {outcome.reason}; trying once more")
             elif outcome.result is None:
                 raise UserError(f"surface maps failed twice: {outcome.error}")
+            elif outcome.result["lost"]:
+                console.warn(
+                    f"repaired: {outcome.result['lost']} samples of the surface maps were not finite and are left out"
+                )
         bar.advance(note=f"{size}² texels")
         with np.load(task["output"], allow_pickle=False) as data:
             maps = {name: data[name] for name in data.files}

@@ -22,6 +22,7 @@ import numpy as np
 from dnrtrain.contract import View
 
 from ..raytrace.denoise import Quality, denoise
+from ..raytrace.finite import masked
 from .scene import BenchScene, Clock
 
 SAMPLES = (1, 2, 4, 8, 16, 64)
@@ -55,12 +56,16 @@ METHODS: dict[str, Method] = {
 
 @dataclass
 class Rung:
-    """One way of rendering: milliseconds of its parts and display pictures, view by view."""
+    """One way of rendering: milliseconds of its parts and display pictures, view by view.
+
+    masked: pixels of them that were not finite, and are black.
+    """
 
     spp: int
     method: str
     parts: dict[str, list[float]] = field(default_factory=dict)
     pictures: list[Any] = field(default_factory=list)
+    masked: int = 0
 
     @property
     def name(self) -> str:
@@ -82,11 +87,10 @@ def climb(scene: BenchScene, view: View, seed: int, clock: Clock, rungs: dict[st
     Kernels and filters must be warm: call once and forget the result. Pictures are kept as float16, display over white.
     """
 
-    def traced(spp: int) -> np.ndarray:
-        image = scene.frames.path(view, spp, seed + spp)
-        return np.where(np.isfinite(image).all(axis=-1, keepdims=True), image, 0)
+    def traced(spp: int) -> tuple[np.ndarray, int]:
+        return masked(scene.frames.path(view, spp, seed + spp))
 
-    paths: dict[int, tuple[np.ndarray, float]] = {}
+    paths: dict[int, tuple[tuple[np.ndarray, int], float]] = {}
     guides: dict[int, tuple[Any, float]] = {0: (None, 0.0)}
     for rung in rungs.values():
         method = METHODS[rung.method]
@@ -95,7 +99,8 @@ def climb(scene: BenchScene, view: View, seed: int, clock: Clock, rungs: dict[st
         rays = rung.spp if method.rays < 0 else method.rays
         if rays not in guides:
             guides[rays] = clock.time(partial(scene.frames.auxiliary, view, rays, seed + 7919 * rays))
-        (image, path_ms), (guide, rays_ms), denoiser_ms = paths[rung.spp], guides[rays], 0.0
+        ((image, lost), path_ms), (guide, rays_ms), denoiser_ms = paths[rung.spp], guides[rays], 0.0
+        rung.masked += lost
         if method.denoise:
             image, denoiser_ms = clock.time(partial(_denoised, image, guide, method, rays))
         if guide is not None:

@@ -67,10 +67,15 @@ class BenchScene:
 
     def shown(self, image: np.ndarray) -> Any:
         """Premultiplied linear RGBA [H, W, 4] -> display RGB over white, torch [1, 3, H, W]."""
-        import torch
+        return shown(self.display, image)
 
-        planes = torch.from_numpy(np.ascontiguousarray(image, dtype=np.float32)).permute(2, 0, 1)[None]
-        return self.display.over_white(planes[:, :3], planes[:, 3:])
+
+def shown(display: DisplayTransform, image: np.ndarray) -> Any:
+    """Premultiplied linear RGBA [H, W, 4] -> display RGB over white, torch [1, 3, H, W]."""
+    import torch
+
+    planes = torch.from_numpy(np.ascontiguousarray(image, dtype=np.float32)).permute(2, 0, 1)[None]
+    return display.over_white(planes[:, :3], planes[:, 3:])
 
 
 def open_scene(root: Path, views: int | list[View], threads: int, settings: Settings | None = None) -> BenchScene:

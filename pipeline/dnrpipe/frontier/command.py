@@ -17,10 +17,12 @@ from ..ablation.crew import Crew, check_amounts
 from ..ablation.results import made_by, read_made
 from ..errors import UserError
 from ..prepare import split_views
+from ..scene_files import scene_fingerprint
 from ..settings import Settings
 from ..tasks import worker_count
 from ..workspace import digest
 from .account import break_evens, pareto, point_of, settle_frames
+from .cycles import PREFIX
 from .plot import plot
 from .run import RIVALS, Frontier, Sweep, make_frontier
 from .words import markdown
@@ -30,7 +32,8 @@ if TYPE_CHECKING:
 
     from ..session import Session
 
-SCHEMA, RIVAL_VERSION = 1, 1
+SCHEMA, RIVAL_VERSION, CYCLES_VERSION = 1, 1, 1
+CYCLES = "cycles"
 LADDER = (1, 2, 4, 8, 16, 64)
 COLUMNS = (
     "name", "kind", "seed", "views", "spp", "steps", "upfront", "frame_ms", "psnr", "ssim", "lpips_vgg", "flip",
@@ -73,11 +76,12 @@ def run_frontier(
     check_amounts(None, seeds, jobs)
     candidates = len(split_views(workspace)["train"])
     counts = numbers(frames, "--frames", (200, 2000))
+    also_names = _rivals(also)
     sweep = Sweep(
         budgets=numbers(budgets, "--budgets", (6, 12, settings.select.budget), candidates),
         samples=numbers(spp, "--spp", (16, settings.raytrace.spp)),
         steps=numbers(iterations, "--iterations", (150, 600)),
-        also=_rivals(also),
+        also=tuple(name for name in also_names if name != CYCLES),
     )
     rungs = numbers(ladder, "--ladder", LADDER)
     rows = sweep.rows(settings)
@@ -87,6 +91,8 @@ def run_frontier(
     run.run()
     cores = worker_count(0)
     rivals = _rival(run, settings, rungs, cores)
+    if CYCLES in also_names:
+        rivals["rungs"] += _cycles(run, settings, rungs, cores)
     points = [
         point
         for seed in range(seeds)
@@ -127,8 +133,8 @@ def _rivals(text: str) -> tuple[str, ...]:
     names = tuple(filter(None, (part.strip() for part in text.split(","))))
     if text.strip() == "none":
         return ()
-    if unknown := set(names) - set(RIVALS):
-        raise UserError(f"--also {', '.join(sorted(unknown))}: choose of {', '.join(RIVALS)}, or none")
+    if unknown := set(names) - {*RIVALS, CYCLES}:
+        raise UserError(f"--also {', '.join(sorted(unknown))}: choose of {', '.join((*RIVALS, CYCLES))}, or none")
     return names
 
 
@@ -148,7 +154,37 @@ def _rival(run: Frontier, settings: Settings, samples: tuple[int, ...], cores: i
     }
     crew: Crew = replace(run.crew, threads=cores, workers=1)
     crew.work("path tracing of the test views", "dnrpipe.frontier.rivals", [task])
-    return json.loads(output.read_text(encoding="utf-8"))
+    found = json.loads(output.read_text(encoding="utf-8"))
+    if lost := sum(rung.get("masked", 0) for rung in found["rungs"] if not rung["denoised"]):
+        crew.console.warn(f"repaired: {lost} pixels of the path-traced test views were not finite and are black")
+    return found
+
+
+def _cycles(run: Frontier, settings: Settings, samples: tuple[int, ...], cores: int) -> list[dict[str, Any]]:
+    """Rungs of Cycles on the test views, rendered where they are not on disk."""
+    workspace, views = run.scene.workspace, split_views(run.scene.workspace)["test"]
+    reference_spp = settings.raytrace.evaluation_spp
+    key = digest(
+        [CYCLES_VERSION, scene_fingerprint(workspace), [v.model_dump() for v in views], samples, reference_spp, cores]
+    )
+    folder = run.request.out / "rivals" / f"cycles-{key}"
+    task = {
+        "scene_dir": str(workspace.scene),
+        "views": [view.model_dump(mode="json") for view in views],
+        "samples": list(samples),
+        "reference_spp": reference_spp,
+        "folder": str(folder),
+        "output": str(folder / "frames.json"),
+        "label": "Cycles",
+    }
+    crew: Crew = replace(run.crew, threads=cores, workers=1)
+    crew.work("Cycles on the test views", "dnrpipe.blender.passes.cycles_frames", [task])
+    measured = digest([key, run.perceptual])
+    output = run.request.out / "rivals" / f"{measured}.json"
+    names = {"workspace": str(workspace.root), "views": [view.name for view in views], "label": "Cycles"}
+    task = {**names, "frames": task["output"], "folder": str(folder), "output": str(output)}
+    crew.work("measuring Cycles", "dnrpipe.frontier.cycles", [task])
+    return json.loads(output.read_text(encoding="utf-8"))["rungs"]
 
 
 def _write(results: dict[str, Any], out: Path) -> None:
@@ -159,7 +195,8 @@ def _write(results: dict[str, Any], out: Path) -> None:
         for one in results["points"]:
             writer.writerow(one)
         for rung in results["rungs"]:
-            kind = "path tracing + denoiser" if rung["denoised"] else "path tracing"
+            tracer = "Cycles" if rung["name"].startswith(PREFIX) else "path tracing"
+            kind = f"{tracer} + denoiser" if rung["denoised"] else tracer
             writer.writerow({**rung, "kind": kind, "frame_ms": rung["ms"], "upfront": 0.0})
     for count in results["frames"]:
         plot(results, count, out / f"frontier-{count}.png")

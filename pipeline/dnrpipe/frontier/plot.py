@@ -9,6 +9,7 @@ from typing import Any
 from dnrtrain.atomic import atomic_path
 
 from .account import pareto, total_seconds
+from .cycles import PREFIX
 
 # Okabe and Ito's palette; filled and hollow shapes differ in grey as well.
 LOOKS: dict[str, dict[str, Any]] = {
@@ -18,10 +19,13 @@ LOOKS: dict[str, dict[str, Any]] = {
     "paper": {"label": "the paper's model", "marker": "P", "color": "#CC79A7"},
     "base": {"label": "base image alone", "marker": "X", "color": "#000000"},
 }
-LADDERS = {
-    False: {"label": "path tracing", "marker": "v", "color": "#D55E00", "linestyle": ":", "fillstyle": "none"},
-    True: {"label": "path tracing + denoiser", "marker": "^", "color": "#D55E00", "linestyle": "--"},
+LADDERS: dict[tuple[bool, bool], dict[str, Any]] = {
+    (False, False): {"label": "path tracing", "marker": "v", "color": "#D55E00", "linestyle": ":", "fillstyle": "none"},
+    (False, True): {"label": "path tracing + denoiser", "marker": "^", "color": "#D55E00", "linestyle": "--"},
+    (True, False): {"label": "Cycles", "marker": "<", "color": "#E69F00", "linestyle": ":", "fillstyle": "none"},
+    (True, True): {"label": "Cycles + its denoiser", "marker": ">", "color": "#E69F00", "linestyle": "--"},
 }
+"""By (whether it is Cycles, whether denoised)."""
 TITLES = {
     "psnr": "PSNR, dB (higher is better)",
     "ssim": "SSIM (higher is better)",
@@ -66,8 +70,12 @@ def _panel(axis: Any, results: Mapping[str, Any], everything: list[dict[str, Any
         found = [(x, y) for x, y in found if y is not None]
         if found:
             axis.plot(*zip(*found, strict=True), linestyle="none", markersize=6, zorder=3, **look)
-    for denoised, look in LADDERS.items():
-        rungs = [rung for rung in results["rungs"] if rung["denoised"] == denoised and rung[metric] is not None]
+    for which, look in LADDERS.items():
+        rungs = [
+            rung
+            for rung in results["rungs"]
+            if (rung["name"].startswith(PREFIX), rung["denoised"]) == which and rung[metric] is not None
+        ]
         best = _best(rungs, frames, metric)
         if best:
             axis.plot(*zip(*best, strict=True), markersize=5, linewidth=1.2, zorder=2, **look)

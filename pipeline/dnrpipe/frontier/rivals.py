@@ -24,8 +24,9 @@ WARM = 2
 class Worker:
     """common: {"threads"}; task: {"workspace", "settings", "samples", "output", "key"} -> what its output file holds:
 
-    {"key", "threads", "rungs": [{"name", "spp", "denoised", "ms", metrics}], "base_ms"}; metrics as in cells, means
-    over the test views; base_ms: of a base image with its G-buffer, by the same clock, None where none is rendered.
+    {"key", "threads", "rungs": [{"name", "spp", "denoised", "ms", "masked", metrics}], "base_ms"}; metrics as in cells,
+    means over the test views; base_ms: of a base image with its G-buffer, by the same clock, None where none is
+    rendered.
     """
 
     def __init__(self, common: dict[str, Any]) -> None:
@@ -53,15 +54,18 @@ class Worker:
         rungs = make_rungs(samples, METHODS)
         for number, view in enumerate(views):
             climb(scene, view, 10_007 * (number + 1), clock, rungs)
-        truth, masks = self._references(scene, workspace, [view.name for view in views])
-        lpips = _lpips()
+        names = [view.name for view in views]
+        truth = [scene.shown(read_rgba(workspace.raytraced("test", name))) for name in names]
+        masks = masks_of(workspace, names)
+        lpips = load_lpips()
         found = [
             {
                 "name": rung.name,
                 "spp": rung.spp,
                 "denoised": ALL[rung.method].denoise,
                 "ms": rung.ms(),
-                **_quality([picture.float() for picture in rung.pictures], truth, masks, lpips),
+                "masked": rung.masked,
+                **quality_of([picture.float() for picture in rung.pictures], truth, masks, lpips),
             }
             for rung in rungs.values()
         ]
@@ -77,20 +81,23 @@ class Worker:
         write_json(Path(task["output"]), made)
         return made
 
-    def _references(self, scene: Any, workspace: Workspace, names: list[str]) -> tuple[list[Any], list[Any]]:
-        """Display pictures [1, 3, H, W] and masks [1, 1, H, W] of the test views."""
-        import torch
 
-        truth, masks = [], []
-        for name in names:
-            channels, _ = read_exr(workspace.raytraced("test", name))
-            truth.append(scene.shown(np.stack([channels[c] for c in "RGBA"], axis=-1)))
-            gbuffer, _ = read_exr(workspace.passes("test", name))
-            masks.append(torch.from_numpy(np.ascontiguousarray(gbuffer["mask"] > 0.5)).float()[None, None])
-        return truth, masks
+def read_rgba(path: Path) -> np.ndarray:
+    """RGBA of a picture's file, [H, W, 4]."""
+    channels, _ = read_exr(path)
+    return np.stack([channels[channel] for channel in "RGBA"], axis=-1)
 
 
-def _lpips() -> Any:
+def masks_of(workspace: Workspace, names: list[str]) -> list[Any]:
+    """Object masks of test views, torch [1, 1, H, W]."""
+    import torch
+
+    gbuffers = [read_exr(workspace.passes("test", name))[0] for name in names]
+    return [torch.from_numpy(np.ascontiguousarray(g["mask"] > 0.5)).float()[None, None] for g in gbuffers]
+
+
+def load_lpips() -> Any:
+    """LPIPS networks by name, None where there are no weights."""
     from dnrtrain.perceptual import build_lpips
     from dnrtrain.weights import WeightsMissing, load_weights
 
@@ -100,7 +107,7 @@ def _lpips() -> Any:
         return None
 
 
-def _quality(pictures: list[Any], truth: list[Any], masks: list[Any], lpips: Any) -> dict[str, float | None]:
+def quality_of(pictures: list[Any], truth: list[Any], masks: list[Any], lpips: Any) -> dict[str, float | None]:
     """Means over the views of the metrics that cells have."""
     from dnrtrain.metrics import image_metrics
 

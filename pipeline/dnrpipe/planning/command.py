@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from dnrtrain.atomic import write_json
-from dnrtrain.selector.names import TRAINED_NAMES
+from dnrtrain.selector.names import ACTIVE_NAMES, TRAINED_NAMES
 
 from ..base import light_is_baked, renderer_inputs
 from ..console import Console
@@ -19,7 +19,7 @@ from ..settings import Settings
 from ..workspace import Workspace
 from .choose import Predictor, best_within, budgets, cheapest_reaching
 from .pilot import FOLDER, run_pilot
-from .quality import Prior, load_prior, scene_gain, without_noise
+from .quality import Prior, load_prior, scene_gain
 from .records import Pilot, Prediction, Route
 from .routes import break_even, routes
 from .seconds import Costs, Work
@@ -104,8 +104,8 @@ def make_predictor(workspace: Workspace, settings: Settings, pilot: Pilot, prior
         tests=len(split_views(workspace).get("test", [])),
         evaluation_spp=settings.raytrace.evaluation_spp,
     )
-    base = without_noise(frames.base.psnr, frames.noise_rmse)
-    measured = without_noise(frames.neural.psnr, frames.noise_rmse) - base
+    base = frames.base.psnr
+    measured = frames.neural.psnr - base
     return Predictor(
         pilot=pilot,
         wall=Costs(pilot, work, "seconds"),
@@ -211,4 +211,11 @@ def _policy_seconds(workspace: Workspace, settings: Settings, step_seconds: floa
     trains = policy_of(workspace, settings) in TRAINED_NAMES or settings.finetune.step2.start == "coarse"
     if not trains:
         return RULE_SECONDS
-    return settings.select.step1.epochs * len(split_views(workspace)["train"]) * step_seconds
+    steps = settings.select.step1.epochs * len(split_views(workspace)["train"])
+    if policy_of(workspace, settings) in ACTIVE_NAMES:
+        from dnrtrain.selector.active import active_steps
+
+        select = settings.select
+        own = active_steps(select.policy, select.active, select.budget)
+        steps = own + (steps if settings.starts_coarse or not own else 0)
+    return steps * step_seconds

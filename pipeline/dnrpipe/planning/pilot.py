@@ -15,240 +15,31 @@ import os
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from pydantic import ValidationError
 
 from dnrtrain.atomic import write_json
-from dnrtrain.contract import View
 
 from ..base import RENDERED, light_is_baked, renderer_inputs
-from ..cameras import scaled_to
 from ..console import Console
 from ..costs import CostRecord
 from ..effects.plan import EffectPlan
-from ..effects.store import lenses, resolve_plan, trace_config, variant_for
+from ..effects.store import lenses, resolve_plan
 from ..errors import UserError
-from ..executors import Retry, run_tasks
-from ..prepare import split_views
 from ..scene_files import read_json, scene_fingerprint
 from ..settings import Settings
-from ..tasks import worker_count
-from ..trace import view_seed
 from ..workspace import Workspace, digest
-from .records import BasePart, FramePart, LightPart, LightPoint, Pilot, Record, Traced, TracePart, TrainingPart
+from .pilot_parts import FOLDER, HELD_OUT, REFERENCE_SPP, RESOLUTION, SPP, STEPS, VIEWS, Piloting
+from .records import Pilot, Record
 
-VERSION = 1
-RESOLUTION = 128
-VIEWS, SPP = 6, 16
-HELD_OUT, REFERENCE_SPP = 6, 64
-STEPS = 150
-RUNGS = (1, 4, 16, 64)
-METHODS = ("raw", "clean16-fast", "clean16")
-"""Path tracing's samples, and what the denoiser is given (:mod:`..frames.rival`)."""
-LIGHT_SHARE, LIGHT_SPP = 2, 32
-"""The pilot's light has a side of 1/LIGHT_SHARE of the real one's, and at most so many paths a texel."""
-TIMEOUT = 600.0
-"""Seconds after which a part counts as hung: ten times what the whole pilot should take."""
-FOLDER, FILE = "plan", "pilot.json"
+VERSION = 2
+FILE = "pilot.json"
 
 
 def pilot_path(workspace: Workspace) -> Path:
     """``plan/pilot.json``."""
     return workspace.root / FOLDER / FILE
-
-
-@dataclass
-class Piloting:
-    """One run of the pilot: the workspace with its settings, effect plan and views, and where pictures go."""
-
-    workspace: Workspace
-    settings: Settings
-    console: Console
-    run_id: str
-    plan: EffectPlan
-
-    def __post_init__(self) -> None:
-        self.folder = self.workspace.root / FOLDER / "pilot"
-        self.train, self.held_out = _views(self.workspace)
-
-    def trace(self) -> TracePart:
-        """Views at two numbers of samples. Each worker's first view compiles its kernels, which are of one size."""
-        choice = variant_for(self.plan, self.settings)
-        config = trace_config(self.workspace, self.plan, choice.variant)
-        workers = 1 if choice.variant.startswith("cuda") else worker_count(self.settings.raytrace.workers)
-        warm = [self._task(self.train[0], f"warm{i}", 1, config) for i in range(workers)]
-        tasks = [self._task(view, f"train-{view.name}", SPP, config) for view in self.train]
-        tasks += [self._task(view, f"held-{view.name}", REFERENCE_SPP, config) for view in self.held_out]
-        common = {"bundle": config["bundle"], "variant": choice.variant, "threads": 1}
-        started = time.monotonic()
-        answers = self._run(
-            "pilot: ray tracing", "dnrpipe.raytrace.tracer", common, [*warm, *tasks], workers, choice.environment
-        )
-        took = time.monotonic() - started
-        points = []
-        for task, result in answers:
-            if Path(task["output"]).name.startswith("warm"):
-                continue
-            pixels = task["view"]["width"] * task["view"]["height"]
-            points.append(
-                Traced(
-                    spp=result["spp"],
-                    pixels=pixels,
-                    seconds=result["seconds"],
-                    cpu_seconds=result["cpu_seconds"],
-                    noise_rmse=result.get("noise_rmse"),
-                )
-            )
-        startup = max(0.0, took - sum(point.seconds for point in points) / workers)
-        return TracePart(points=points, workers=workers, startup=startup)
-
-    def light(self) -> LightPart | None:
-        """Small bakes, unless there is no light to bake or it is on disk."""
-        common, environment, task, _ = renderer_inputs(self.workspace, self.settings, self.plan)
-        if task is None or light_is_baked(task):
-            return None
-        size, spp = max(16, task["size"] // LIGHT_SHARE), min(LIGHT_SPP, task["spp"])
-        tasks = [
-            task | {"size": 16, "spp": 1, "output": str(self.folder / "warm.npz")},
-            task | {"size": size, "spp": spp, "output": str(self.folder / "light.npz")},
-        ]
-        shared = {"bundle": common["bundle"], "variant": common["variant"]}
-        started = time.monotonic()
-        answers = self._run("pilot: baking light", "dnrpipe.raytrace.light_worker", shared, tasks, 1, environment)
-        took = time.monotonic() - started
-        points = [
-            LightPoint(size=task["size"], spp=task["spp"], seconds=result["seconds"], cpu_seconds=result["cpu_seconds"])
-            for task, result in answers
-        ]
-        return LightPart(points=points, startup=max(0.0, took - sum(point.seconds for point in points)))
-
-    def base(self) -> BasePart:
-        """Base images of all views of the pilot."""
-        common, environment, task, _ = renderer_inputs(self.workspace, self.settings, self.plan)
-        if task is not None:
-            common |= {"light": str(self._light(task))}
-        tasks = [
-            {
-                "view": view.model_dump(mode="json"),
-                "output": str(self._base_file(kind, view)),
-                "fingerprint": self.run_id,
-            }
-            for kind, views in (("train", self.train), ("held", self.held_out))
-            for view in views
-        ]
-        started = time.monotonic()
-        answers = self._run("pilot: base images", "dnrpipe.raytrace.base_worker", common, tasks, 1, environment)
-        took = time.monotonic() - started
-        seconds = [result["seconds"] for _, result in answers]
-        return BasePart(
-            pixels=self.train[0].width * self.train[0].height,
-            seconds=float(np.median(seconds)),
-            cpu_seconds=float(np.median([result["cpu_seconds"] for _, result in answers])),
-            startup=max(0.0, took - sum(seconds)),
-        )
-
-    def training(self) -> TrainingPart:
-        """A short step 2."""
-        view = self.train[0]
-        task = {
-            "kind": "train",
-            "views": [view.model_dump(mode="json") for view in self.train],
-            "base_files": [str(self._base_file("train", view)) for view in self.train],
-            "images": [str(self._image(f"train-{view.name}")) for view in self.train],
-            "folder": str(self.folder / "model"),
-            "fingerprint": self.run_id,
-            "epochs": max(2, round(STEPS * self.settings.finetune.step2.batch / len(self.train))),
-        }
-        ((_, result),) = self._run("pilot: training", "dnrpipe.planning.worker", self._common(), [task], 1, {})
-        patch = self.settings.finetune.step2.patch or max(view.width, view.height)
-        return TrainingPart(
-            views=len(self.train),
-            spp=SPP,
-            steps=result["steps"],
-            pixels=min(patch, view.width) * min(patch, view.height),
-            seconds=result["seconds"],
-            cpu_seconds=result["cpu_seconds"],
-            startup=result["startup"],
-            threads=result["threads"],
-        )
-
-    def frames(self) -> FramePart:
-        """The held-out views, by all renderers."""
-        _, environment, light, _ = renderer_inputs(self.workspace, self.settings, self.plan)
-        task = {
-            "kind": "frames",
-            "views": [view.model_dump(mode="json") for view in self.held_out],
-            "images": [str(self._image(f"held-{view.name}")) for view in self.held_out],
-            "folder": str(self.folder / "model"),
-            "light": str(self._light(light)) if light is not None else None,
-            "samples": list(RUNGS),
-            "methods": list(METHODS),
-        }
-        ((_, result),) = self._run("pilot: frames", "dnrpipe.planning.worker", self._common(), [task], 1, environment)
-        return FramePart.model_validate(result | {"views": len(self.held_out)})
-
-    # -- what the parts share --------------------------------------------------------------------------
-
-    def _run(
-        self,
-        label: str,
-        module: str,
-        common: dict[str, Any],
-        tasks: list[dict[str, Any]],
-        workers: int,
-        environment: dict[str, str],
-    ) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-        """(task, result) of each. Raises UserError where one failed twice."""
-        log = self.workspace.log("plan")
-        found = []
-        with self.console.bar(label, len(tasks)) as bar:
-            outcomes = run_tasks(
-                module, common, tasks, workers=workers, log=log, timeout=TIMEOUT, environment=environment
-            )
-            try:
-                for outcome in outcomes:
-                    if isinstance(outcome, Retry):
-                        self.console.warn(f"{label}: {outcome.reason}; trying once more")
-                    elif outcome.result is None:
-                        raise UserError(f"{label}: {outcome.error}; see {log}")
-                    else:
-                        found.append((outcome.task, outcome.result))
-                        bar.advance()
-            finally:
-                outcomes.close()  # type: ignore[attr-defined]
-        return found
-
-    def _task(self, view: View, name: str, spp: int, config: dict[str, Any]) -> dict[str, Any]:
-        task: dict[str, Any] = {
-            "view": view.model_dump(mode="json"),
-            "output": str(self._image(name)),
-            "spp": spp,
-            "integrator": self.plan.integrator,
-            "max_depth": self.plan.max_depth,
-            "lens": None,
-            "seed": view_seed(self.settings.raytrace.seed, "pilot", name),
-            "fingerprint": self.run_id,
-        }
-        return task | ({"denoise": True} if self.settings.raytrace.denoise else {})
-
-    def _common(self) -> dict[str, Any]:
-        model = self.plan.model(self.settings.model)
-        settings = self.settings.model_copy(update={"model": model}).model_dump(mode="json")
-        return {"workspace": str(self.workspace.root), "settings": settings, "threads": 0}
-
-    def _image(self, name: str) -> Path:
-        return self.folder / f"{name}.exr"
-
-    def _base_file(self, kind: str, view: View) -> Path:
-        return self.folder / f"base-{kind}-{view.name}.exr"
-
-    def _light(self, task: dict[str, Any]) -> Path:
-        """The real light where it is on disk, else the pilot's."""
-        return Path(task["output"]) if light_is_baked(task) else self.folder / "light.npz"
 
 
 def run_pilot(workspace: Workspace, settings: Settings, console: Console) -> Pilot:
@@ -306,27 +97,6 @@ def read_pilot(workspace: Workspace) -> Pilot | None:
         return Pilot.model_validate(read_json(path))
     except (ValidationError, UserError):  # of another version, or torn: it is run again
         return None
-
-
-def _views(workspace: Workspace) -> tuple[list[View], list[View]]:
-    """(a few candidates, the farthest from each other; a few others) at the pilot's size.
-
-    Others: validation views, else candidates that were not taken.
-    """
-    from dnrtrain.selector.policies import untrained
-    from dnrtrain.selector.protocol import Candidates
-
-    splits = split_views(workspace)
-    views = splits["train"]
-    rule = untrained("farthest")
-    assert rule is not None
-    positions = np.stack([view.position for view in views])
-    directions = np.stack([-view.matrix[:3, 2] for view in views])
-    chosen = rule.choose(Candidates(positions, directions), min(VIEWS, len(views)), 0).views
-    left = splits.get("val") or [view for i, view in enumerate(views) if i not in set(chosen)] or views
-    step = max(1, len(left) // HELD_OUT)
-    pick = left[::step][:HELD_OUT]
-    return [scaled_to(views[i], RESOLUTION) for i in chosen], [scaled_to(view, RESOLUTION) for view in pick]
 
 
 def _stamp(workspace: Workspace, settings: Settings, plan: EffectPlan) -> str:

@@ -55,12 +55,6 @@ def share(prior: Prior, views: float, steps: float) -> float:
     return 1 - prior.a * (25 / views) ** prior.alpha - prior.b * (500 / steps) ** prior.beta
 
 
-def without_noise(psnr: float, noise_rmse: float) -> float:
-    """PSNR against a reference without its own noise (of that RMSE), dB; at most 10 dB more."""
-    mse = 10 ** (-psnr / 10)
-    return -10 * math.log10(max(mse - noise_rmse**2, mse / 10))
-
-
 def scene_gain(prior: Prior, measured: float, views: int, steps: int) -> tuple[float, float]:
     """(G, its standard deviation) of a scene whose pilot gained ``measured`` dB with so many views and steps."""
     part = max(share(prior, views, steps), LEAST_SHARE)

@@ -75,7 +75,8 @@ class TrainingPart(Record):
 
 
 class FramePoint(Record):
-    """One way to render a frame: milliseconds (processor time over the threads) and mean PSNR."""
+    """One way to render a frame: milliseconds (processor time over the threads) and mean PSNR, the
+    references' noise not counted."""
 
     name: str
     ms: float
@@ -83,12 +84,11 @@ class FramePoint(Record):
 
 
 class FramePart(Record):
-    """Frames of the pilot's held-out views. noise_rmse: of their references."""
+    """Frames of the pilot's held-out views."""
 
     base: FramePoint
     neural: FramePoint
     rival: list[FramePoint]
-    noise_rmse: float
     views: int
 
 

@@ -15,7 +15,6 @@ from collections.abc import Sequence
 
 from ..costs import break_even_frames
 from ..frames.ladder import crossover, frontier
-from .quality import without_noise
 from .records import FramePart, FramePoint, Prediction, Route
 
 FURTHEST = 64.0
@@ -23,12 +22,12 @@ FURTHEST = 64.0
 
 
 def rival_line(part: FramePart, only: str | None = None) -> list[tuple[str, float, float]]:
-    """(name, seconds, PSNR without the reference's noise) of the rungs that nothing beats, cheapest first.
+    """(name, seconds, PSNR) of the rungs that nothing beats, cheapest first.
 
     only: the end of a method's name (``raw``), else all methods.
     """
     rungs = {p.name: p for p in part.rival if only is None or p.name.endswith(only)}
-    points = {name: (p.ms / 1000, without_noise(p.psnr, part.noise_rmse)) for name, p in rungs.items()}
+    points = {name: (p.ms / 1000, p.psnr) for name, p in rungs.items()}
     return [(name, *points[name]) for name in frontier(points)]
 
 
@@ -64,7 +63,7 @@ def routes(
         seconds, beyond = answer
         what = "beyond the pilot's ladder, extrapolated" if beyond else _between(line, seconds)
         found.append(_route("path tracing + denoiser", what, 0.0, seconds * scale, frames, psnr, True))
-    base = without_noise(part.base.psnr, part.noise_rmse)
+    base = part.base.psnr
     alone = part.base.ms / 1000 * scale
     found.append(
         _route("base image alone", "baked light, no network", light_seconds, alone, frames, base, base >= psnr)

@@ -1,7 +1,14 @@
-"""The pilot's worker: a short training, and frames of ours and of path tracing with a denoiser."""
+"""The pilot's worker: a short training, and frames of ours and of path tracing with a denoiser.
+
+Notation
+    A, B      two independent path-traced pictures of a held-out view in display space, as they were traced
+    D         a picture to be judged, made without their samples
+    mse(D)    mean of (D - A)(D - B): the noise of A and that of B cancel in the product (:func:`without_reference`)
+"""
 
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dnrtrain.contract import View
-from dnrtrain.exr import read_exr, read_metadata
 
 from ..scene_files import read_frame
 from ..settings import Settings
@@ -18,7 +24,14 @@ from ..workspace import Workspace
 if TYPE_CHECKING:
     from dnrtrain.dataset import ViewSet
 
+    from ..frames.scene import BenchScene
+
 WARM = 2
+HALVES, REFERENCE_SPP = 2, 64
+"""A and B are means of so many pictures of so many samples: a kernel that the ladder has anyway."""
+SEED = 0x5EED0000
+"""Far from the ladder's seeds, so that A and B share no samples with what they judge."""
+LEAST_MSE = 1e-6
 
 
 class Worker:
@@ -27,8 +40,9 @@ class Worker:
     common: {"workspace", "settings", "threads"}
     task "train": {"views", "base_files", "images", "folder", "fingerprint", "epochs"}
         -> {"seconds", "cpu_seconds": of a step, "startup", "steps", "threads"}
-    task "frames": {"views", "images", "folder": of the model, "light", "samples", "methods": the ladder}
-        -> {"base", "neural", "rival": rows {"name", "ms", "psnr"}, "noise_rmse"}
+    task "frames": {"views", "folder": of the model, "light", "samples", "methods": the ladder}
+        -> {"base", "neural", "rival": rows {"name", "ms", "psnr"}, "unknown": pixels that no reference knows}; PSNR
+        by :func:`without_reference`
     """
 
     def __init__(self, common: dict[str, Any]) -> None:
@@ -112,8 +126,7 @@ class Worker:
         scene = open_scene(self.workspace.root, views, self.threads, self.settings)
         light = Path(task["light"]) if task["light"] else None
         ours = Ours(scene, (), Path(task["folder"]), light)
-        truth = [scene.shown(_picture(Path(path))) for path in task["images"]]
-        noises = [(read_metadata(Path(path)) or {}).get("noise_rmse") or 0.0 for path in task["images"]]
+        truth = [_references(scene, view, number) for number, view in enumerate(views)]
         clock, samples, methods = Clock("cpu", self.threads), tuple(task["samples"]), tuple(task["methods"])
         for _ in range(WARM):
             climb(scene, views[0], 1, clock, make_rungs(samples, methods))
@@ -136,7 +149,7 @@ class Worker:
             "base": {"name": BASE, **rows[BASE].summary()},
             "neural": {"name": NEURAL, **rows[NEURAL].summary()},
             "rival": rival,
-            "noise_rmse": float(np.sqrt(np.mean(np.square(noises)))),
+            "unknown": sum(int((~known).sum()) for _, _, known in truth),
         }
 
 
@@ -145,16 +158,41 @@ class _Row:
         self.ms: list[float] = []
         self.psnr: list[float] = []
 
-    def add(self, picture: Any, truth: Any, parts: dict[str, float]) -> None:
-        from dnrtrain.metrics import psnr
-
+    def add(self, picture: Any, truth: tuple[Any, Any, Any], parts: dict[str, float]) -> None:
         self.ms.append(sum(parts.values()))
-        self.psnr.append(float(psnr(picture, truth).mean()))
+        mean, error = without_reference(picture, *truth)
+        self.psnr.append(-10 * math.log10(max(mean, error, LEAST_MSE)))
 
     def summary(self) -> dict[str, float]:
         return {"ms": float(np.median(self.ms)), "psnr": float(np.mean(self.psnr))}
 
 
-def _picture(path: Path) -> np.ndarray:
-    channels, _ = read_exr(path)
-    return np.stack([channels[channel] for channel in "RGBA"], axis=-1)
+def without_reference(picture: Any, first: Any, second: Any, known: Any) -> tuple[float, float]:
+    """(mean square error of D = ``picture`` in display space, its standard error) without a noise-free reference.
+
+    picture, first = A, second = B: [1, 3, H, W]; known: bool [H, W], pixels that count. For independent A and B whose
+    mean is the truth T, E (D - A)(D - B) = (D - T)²: neither noise nor a denoiser's bias counts against D. The mean may
+    come out below 0 where D is better than the noise lets tell. (The display curve bends the mean of A and B by half
+    its curvature times their variance: a hundredth of a dark pixel's value at 30 % noise.)
+    """
+    products = ((picture - first) * (picture - second)).double().mean(dim=(0, 1))[known]
+    return float(products.mean()), float(products.std() / math.sqrt(products.numel()))
+
+
+def _references(scene: BenchScene, view: View, number: int) -> tuple[Any, Any, Any]:
+    """(A, B, pixels that are finite in both), each the mean of HALVES pictures of REFERENCE_SPP samples.
+
+    A sample picture counts where it is finite; a pixel that is so in none of a half is not known, and takes no part.
+    """
+    import torch
+
+    shown, known = [], np.ones((view.height, view.width), bool)
+    for half in range(2):
+        seeds = [SEED + 1009 * number + 2 * part + half for part in range(HALVES)]
+        images = np.stack([scene.frames.path(view, REFERENCE_SPP, seed) for seed in seeds])
+        finite = np.isfinite(images).all(axis=-1, keepdims=True)
+        count = finite.sum(axis=0)
+        known &= count[..., 0] > 0
+        mean = np.where(finite, images, 0).sum(axis=0) / np.maximum(count, 1)
+        shown.append(scene.shown(mean))
+    return shown[0], shown[1], torch.from_numpy(known)

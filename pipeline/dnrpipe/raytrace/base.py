@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from .finite import masked_channels
 from .frames_rays import lets_through
 from .lobes import (
     bsdfs_of,
@@ -40,6 +41,8 @@ from .visibility import LAMP_PREFIX, UNSEEN_PREFIX, is_one_of
 MAX_VERTICES = 8
 NUMBERS = 5
 """Random numbers per vertex: two for the direction, one for the lobe, two for the emitter."""
+MAX_RAYS = 1 << 24
+"""Of a launch: bounds its memory (about 4 GiB). Larger pictures are rendered in bands of rows."""
 MIRRORED = 0.25
 """Share of the samples that the first glass reflects. By Fresnel's share, a lamp in the water would be a few specks."""
 LEAST_THROUGHPUT = 1e-3
@@ -51,6 +54,8 @@ CENTRES = (
     *("chain.U", "chain.V", "chain.mask", "chain.weight"),
     *("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z", "mask"),
 )
+LOST = "lost"
+"""Whether a part of the sample was not finite and is left out; of a pixel, the share of such samples."""
 GBUFFER = ("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z")
 
 
@@ -60,12 +65,16 @@ class BaseRenderer:
     Args:
         light: E and S of the front and of the back, float32 [2, 2, size, size, 3], row 0 at V = 0.
         samples: S, rays per pixel.
+
+    Of the last frame: ``repaired`` pixels had samples that were not finite, of which that part was left out; ``masked``
+    pixels were not finite all the same, and are 0.
     """
 
     def __init__(self, mi: Any, scene: Any, light: np.ndarray, samples: int) -> None:
         import drjit as dr
 
         self.mi, self.scene, self.samples = mi, scene, samples
+        self.repaired = self.masked = 0
         sides = [np.concatenate([light[0, i], light[1, i]], axis=-1) for i in range(2)]
         self.light = [mi.Texture2f(mi.TensorXf(side), wrap_mode=dr.WrapMode.Clamp) for side in sides]
         shapes = scene.shapes()
@@ -98,18 +107,30 @@ class BaseRenderer:
         mi, m = self.mi, view.matrix
         axes = [mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in m[:3, i])) for i in range(4)]
         film = [dr.opaque(mi.Float, float(v)) for v in (view.fl_x, view.fl_y, view.cx, view.cy)]
-        values = self.kernel(self.scene, self.light, self.tables, axes, film, view.width, view.height)
-        dr.eval(values)
-        names = MEANS + CENTRES
+        names = (LOST, *MEANS, *CENTRES)
+        rows = max(1, min(view.height, MAX_RAYS // (view.width * self.samples)))
+        bands: list[list[np.ndarray]] = []
+        for first in range(0, view.height, rows):
+            start, count = dr.opaque(mi.UInt32, first), min(rows, view.height - first)
+            values = self.kernel(self.scene, self.light, self.tables, axes, film, start, view.width, count)
+            dr.eval(values)
+            bands.append([np.array(value) for value in values])
+        shape = (view.height, view.width)
         channels = {
-            name: np.array(value).reshape(view.height, view.width) for name, value in zip(names, values, strict=True)
+            name: (parts[0] if len(parts) == 1 else np.concatenate(parts)).reshape(shape)
+            for name, parts in zip(names, zip(*bands, strict=True), strict=True)
         }
+        self.repaired = int(np.count_nonzero(channels.pop(LOST)))
+        channels, self.masked = masked_channels(channels)
         for name in GBUFFER:
             channels[name] = channels[name] * channels["mask"]
         return channels | {"coverage": np.minimum(channels["base.A"], 1)}
 
-    def _kernel(self, scene: Any, light: Any, tables: Any, axes: Any, film: Any, width: int, height: int) -> list[Any]:
-        """The frame. All that varies comes in as data: recorded once, replayed for every view of that size.
+    def _kernel(
+        self, scene: Any, light: Any, tables: Any, axes: Any, film: Any, start: Any, width: int, height: int
+    ) -> list[Any]:
+        """``height`` rows from row ``start`` on. All that varies comes in as data: recorded once, replayed for every
+        view of that size.
 
         A pixel's samples lie side by side; the first goes through the pixel's centre.
         """
@@ -118,7 +139,7 @@ class BaseRenderer:
         mi, samples = self.mi, self.samples
         index = dr.arange(mi.UInt32, width * height * samples)
         pixel, sample = index // samples, index % samples
-        x, y = pixel % width, pixel // width
+        x, y = pixel % width, start + pixel // width
         tile = dr.gather(mi.UInt32, tables[0], (y % TILE) * TILE + x % TILE)
         number, place = mi.Float(sample * (TILE * TILE) + tile), mi.Float(sample)
         right = mi.Float(x) + fraction(0.5 + place * GOLDEN[0]) - film[2]
@@ -129,9 +150,9 @@ class BaseRenderer:
         if samples == 1:
             return values
         dr.eval(values)  # together: each sum alone would run it all again
-        means = [dr.block_sum(value, samples) / samples for value in values[: len(MEANS)]]
+        means = [dr.block_sum(value, samples) / samples for value in values[: 1 + len(MEANS)]]
         first = dr.arange(mi.UInt32, width * height) * samples
-        return [*means, *(dr.gather(mi.Float, value, first) for value in values[len(MEANS) :])]
+        return [*means, *(dr.gather(mi.Float, value, first) for value in values[1 + len(MEANS) :])]
 
     def _baked(self, light: Any, si: Any, active: Any) -> tuple[Any, Any, Any]:
         """(E, S, atlas coordinates) at the surface point, on the side that is seen."""
@@ -164,7 +185,7 @@ class BaseRenderer:
         return dr.select(inside, dr.exp((scattered - lost) * si.t), 1)
 
     def _follow(self, scene: Any, light: Any, table: Any, ray: Any, forward: Any, number: Any) -> list[Any]:
-        """One sample along each ray: the values named by MEANS and CENTRES.
+        """One sample along each ray: the values named by LOST, MEANS and CENTRES.
 
         forward: where the camera looks. number: the sample's place in the sequence.
         """
@@ -210,7 +231,7 @@ class BaseRenderer:
             baked, around, uv = self._baked(light, si, met)
             here = emitted + dr.select(met, s["throughput"] * rho * baked, 0)
             primary = straight
-            total = s["total"] + here
+            total, lost = s["total"] + here, s["lost"]
             diffuse = s["diffuse"] + dr.select(primary, here, 0)
             albedo = s["albedo"] + dr.select(primary & met, s["throughput"] * rho, 0)
             turned = dr.select(si.wi.z < 0, -si.sh_frame.n, si.sh_frame.n)
@@ -231,7 +252,8 @@ class BaseRenderer:
                 value, other = bsdf.eval_pdf(glossy, si, si.to_local(toward.d), rough & (toward.pdf > 0))
                 share = dr.select(toward.delta, 1, power_heuristic(toward.pdf, other))
                 direct = dr.select(rough & (toward.pdf > 0), s["throughput"] * value * arriving * share, 0)
-                total += dr.select(dr.all(dr.isfinite(direct)), direct, 0)
+                fine = dr.all(dr.isfinite(direct))
+                total, lost = total + dr.select(fine, direct, 0), lost | ~fine
             # The mirror-like rest
             pair = mi.Point2f(uniform(s["vertex"], 0), uniform(s["vertex"], 1))
             bounce, factor = bsdf.sample(rest, si, uniform(s["vertex"], 2), pair, onwards)
@@ -252,7 +274,8 @@ class BaseRenderer:
             null = mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Null)
             delta = mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Delta)
             throughput = dr.select(onwards, s["throughput"] * factor, s["throughput"])
-            throughput = dr.select(dr.all(dr.isfinite(throughput)), throughput, 0)
+            fine = dr.all(dr.isfinite(throughput))
+            throughput, lost = dr.select(fine, throughput, 0), lost | (~fine & (bounce.pdf > 0))
             total += dr.select(wide, throughput * around, 0)
             next_ray = si.spawn_ray(dr.select(passed, s["ray"].d, si.to_world(bounce.wo)))
             alive = onwards & (bounce.pdf > 0) & (dr.max(throughput) > LEAST_THROUGHPUT)
@@ -268,6 +291,7 @@ class BaseRenderer:
                 "straight": straight & (passed | (null & onwards)),
                 "throughput": throughput,
                 "total": total,
+                "lost": lost,
                 "diffuse": diffuse,
                 "albedo": albedo,
                 "normal": normal,
@@ -292,6 +316,7 @@ class BaseRenderer:
             "straight": mi.Mask(True) & (number >= 0),
             "throughput": mi.Spectrum(1.0),
             "total": mi.Spectrum(0.0),
+            "lost": mi.Mask(False),
             "diffuse": mi.Spectrum(0.0),
             "albedo": mi.Spectrum(0.0),
             "normal": mi.Vector3f(0.0),
@@ -321,7 +346,7 @@ class BaseRenderer:
 
         done = dr.while_loop(tuple(state.values()), lambda *values: values[0], unpacked)
         s = dict(zip(names, done, strict=True))
-        covered, ended = (dr.select(s[name], mi.Float(1), 0) for name in ("covered", "ended"))
+        covered, ended, lost = (dr.select(s[name], mi.Float(1), 0) for name in ("covered", "ended", "lost"))
         chain = [*s["chain_uv"], ended, s["chain_weight"]]
         means = [*s["total"], s["opacity"], *s["diffuse"], *s["albedo"]]
-        return [*means, *chain, *s["normal"], *s["uv"], s["depth"], covered]
+        return [lost, *means, *chain, *s["normal"], *s["uv"], s["depth"], covered]

@@ -16,6 +16,7 @@ from dnrtrain.exr import write_exr
 from .base import BaseRenderer
 from .denoise import denoise
 from .engine import Engine
+from .finite import masked
 from .frames import Frames
 from .light_worker import read_light
 from .units import scaled_view
@@ -45,14 +46,14 @@ class Worker:
         self.renderer = BaseRenderer(self.engine.mi, scene, light, int(common["samples"]))
         self.silhouettes: dict[tuple[int, int], Frames] = {}
         self.warm = False
-        self.masked = 0  # pixels of the view at hand that were not finite
+        self.repaired = self.masked = 0  # pixels of the view at hand: samples left out, set to zero
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
         view = View.model_validate(task["view"])
         if not self.warm:
             self.channels(view)  # compiles the kernel, which is no cost of a frame
             self.warm = True
-        self.masked = 0
+        self.repaired = self.masked = 0
         started, cpu = time.monotonic(), time.process_time()
         channels = self.channels(view)
         numbers = {
@@ -61,6 +62,7 @@ class Worker:
             "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
             "kind": self.common["kind"],
             "samples": self.common["samples"],
+            "repaired": self.repaired,
             "masked": self.masked,
         }
         write_exr(
@@ -72,7 +74,9 @@ class Worker:
 
     def channels(self, view: View, renderer: BaseRenderer | None = None) -> dict[str, np.ndarray]:
         """Base image and G-buffer of a view in scene units, float32 [H, W] each. renderer: one of other samples."""
-        channels = (renderer or self.renderer).frame(scaled_view(view, self.engine.unit_scale))
+        renderer = renderer or self.renderer
+        channels = renderer.frame(scaled_view(view, self.engine.unit_scale))
+        self.repaired, self.masked = self.repaired + renderer.repaired, self.masked + renderer.masked
         channels["depth.Z"] = channels["depth.Z"] / self.engine.unit_scale
         channels["coverage"] = self._frames(view).coverage(view, channels["mask"] > 0.5)
         if self.common["kind"] != "baked":
@@ -92,9 +96,8 @@ class Worker:
         integrator, _ = self.engine.integrator(self.bundle, common["integrator"], int(common["max_depth"]))
         sensor = self.engine.sensor(view)
         picture, _ = self.engine.frame(self.bundle, integrator, sensor, view, int(common["spp"]), int(common["seed"]))
-        fine = np.isfinite(picture).all(axis=-1, keepdims=True)
-        self.masked = int((~fine).sum())
-        picture = np.where(fine, picture, 0).astype(np.float32)
+        picture, lost = masked(picture.astype(np.float32))
+        self.masked += lost
         found = channels | {name: picture[..., i] for i, name in enumerate(COLOUR)}
         clean = denoised(found)
         return clean | {"base.A": found["base.A"]} | {f"diffuse.{c}": clean[f"base.{c}"] for c in "RGB"}

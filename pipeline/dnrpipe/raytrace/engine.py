@@ -14,12 +14,15 @@ from dnrtrain.contract import View
 
 from . import paths, plugins
 from .auxiliary import auxiliary_integrator
+from .finite import masked
 from .sensors import sensor_dict
 from .units import scaled_lens, scaled_view, unit_scale
 from .visibility import camera_integrator
 
 # Samples per kernel launch x pixels: bounds the wavefront's memory (about 1 GiB on the CPU).
 MAX_WAVEFRONT = 4_000_000
+MAX_AUXILIARY = 1 << 24
+"""The same of auxiliary images, whose rays carry less."""
 PASSES = "albedo:albedo,depth:depth,position:position,normal:sh_normal,geometric:geo_normal,uv:uv"
 
 
@@ -73,16 +76,26 @@ class Engine:
         view, lens = scaled_view(view, self.unit_scale), scaled_lens(lens, self.unit_scale)
         return self.mi.load_dict(sensor_dict(self.mi, view, lens))
 
-    def auxiliary(self, bundle: Path, view: View, spp: int) -> tuple[np.ndarray, np.ndarray]:
-        """(albedo, shading normal in world space), [H, W, 3] each, for the denoiser: see :mod:`.auxiliary`."""
+    def auxiliary(self, bundle: Path, view: View, spp: int) -> tuple[np.ndarray, np.ndarray, int]:
+        """(albedo, shading normal in world space), [H, W, 3] each, for the denoiser: see :mod:`.auxiliary`; and how
+        many pixels of them were not finite and are 0."""
         scene = self.scenes[str(bundle)]
         if self.compiled:
             integrator = auxiliary_integrator(self.mi, scene)
         else:  # scalar variants, one ray at a time: the first surface, whatever it is
             integrator = self.mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
-        part = self.mi.render(scene, sensor=self.sensor(view), integrator=integrator, spp=spp, seed=0)
-        channels = np.nan_to_num(np.array(part, dtype=np.float32)[..., -6:], posinf=0.0, neginf=0.0)
-        return channels[..., :3].clip(0, 1), channels[..., 3:].clip(-1, 1)
+        sensor, total, done = self.sensor(view), None, 0
+        chunk = max(1, min(spp, MAX_AUXILIARY // (view.width * view.height)))
+        for launch, start in enumerate(range(0, spp, chunk)):
+            samples = min(chunk, spp - start)
+            part = self.mi.render(scene, sensor=sensor, integrator=integrator, spp=samples, seed=launch)
+            image = np.array(part, dtype=np.float32)[..., -6:]
+            if samples < spp:
+                image *= samples / spp
+            total, done = (image if total is None else total + image), done + samples
+        assert total is not None and done == spp
+        channels, lost = masked(total)
+        return channels[..., :3].clip(0, 1), channels[..., 3:].clip(-1, 1), lost
 
     def frame(
         self, bundle: Path, integrator: Any, sensor: Any, view: View, spp: int, seed: int

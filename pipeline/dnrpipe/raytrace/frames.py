@@ -27,6 +27,8 @@ from .recorded import Recorded, prepare_emitters
 from .texels import ATTRIBUTE
 from .units import scaled_view
 
+MAX_EDGE_RAYS = 1 << 24
+"""Of a launch that looks at silhouettes: bounds its memory."""
 WARM_FRAMES = 3
 """Calls until nothing is recorded any more: the first ones teach Dr.Jit which inputs change."""
 
@@ -105,28 +107,46 @@ class Frames:
         mask: bool [H, W], whether the ray through the pixel's centre meets a surface. Only pixels that differ from a
         neighbour are looked at (a tenth, as a rule); where surfaces let light straight through, all are, at random.
         """
-        if rays not in self._cover:
-            self._cover[rays] = (
-                self._warmed(self._cover_kernel(rays), view, rays) if self.passing else self._edge_kernel(rays)
-            )
-        kernel = self._cover[rays]
         if self.passing:
-            return self._image(kernel(*self._inputs(view, 0, rays)))[..., 0]
+            return self._cover_everywhere(view, rays)
+        if rays not in self._cover:
+            self._cover[rays] = self._edge_kernel(rays)
+        kernel = self._cover[rays]
         edges = np.flatnonzero(_differs(mask))
         result = mask.astype(np.float32)
         if len(edges):
             import drjit as dr
 
-            camera = self._inputs(view, 0, rays)[0]
-            # Memory of Dr.Jit's own: where numpy's is aligned otherwise, the kernel would be recorded once more.
-            lanes = self.mi.UInt32(edges.repeat(rays).astype(np.uint32)) + dr.opaque(self.mi.UInt32, 0)
-            places = self.mi.UInt32(np.tile(np.arange(rays, dtype=np.uint32), len(edges))) + dr.opaque(
-                self.mi.UInt32, 0
-            )
-            dr.eval(lanes, places)
-            (hits,) = kernel(camera, lanes, places)
-            result.ravel()[edges] = np.array(hits).reshape(-1, rays).mean(axis=1)
+            camera, most = self._inputs(view, 0, rays)[0], max(1, MAX_EDGE_RAYS // rays)
+            for part in np.split(edges, range(most, len(edges), most)):
+                # Memory of Dr.Jit's own: where numpy's is aligned otherwise, the kernel would be recorded once more.
+                lanes = self.mi.UInt32(part.astype(np.uint32).repeat(rays)) + dr.opaque(self.mi.UInt32, 0)
+                places = self.mi.UInt32(np.tile(np.arange(rays, dtype=np.uint32), len(part))) + dr.opaque(
+                    self.mi.UInt32, 0
+                )
+                dr.eval(lanes, places)
+                (hits,) = kernel(camera, lanes, places)
+                result.ravel()[part] = np.array(hits).reshape(-1, rays).mean(axis=1)
         return result
+
+    def _cover_everywhere(self, view: View, rays: int) -> np.ndarray:
+        """:meth:`coverage` where surfaces let light through; large pictures in launches of some of the cells."""
+        import drjit as dr
+
+        each = rays
+        while each % 2 == 0 and each * view.width * view.height > MAX_EDGE_RAYS:
+            each //= 2
+        if rays not in self._cover:
+            kernel = self._cover_kernel(rays, each)
+            start = dr.opaque(self.mi.UInt32, 0)
+            self._warmed(lambda *inputs: kernel(*inputs, start), view, each)
+            self._cover[rays] = kernel
+        parts = [
+            self._image(self._cover[rays](*self._inputs(view, launch, each), dr.opaque(self.mi.UInt32, launch * each)))
+            for launch in range(rays // each)
+        ]
+        image = parts[0] if len(parts) == 1 else np.stack(parts).mean(axis=0, dtype=np.float32)
+        return image[..., 0]
 
     def _edge_kernel(self, count: int) -> Any:
         import drjit as dr
@@ -166,7 +186,8 @@ class Frames:
 
         return kernel
 
-    def _cover_kernel(self, count: int) -> Any:
+    def _cover_kernel(self, count: int, each: int) -> Any:
+        """``each`` of ``count`` rays a pixel, from the given one on."""
         import drjit as dr
 
         mi, scene, seen = self.mi, self.scene, seen_first(self.mi, self.scene)
@@ -174,10 +195,10 @@ class Frames:
         cells = math.isqrt(count) if math.isqrt(count) ** 2 == count else 1
 
         @Recorded
-        def kernel(camera: list[Any], seed: Any, samples: Any) -> list[Any]:
+        def kernel(camera: list[Any], seed: Any, samples: Any, start: Any) -> list[Any]:
             sampler = prototype.fork()
-            hit = seen(scene, rays(sampler, camera, seed, samples, count, cells), sampler)
-            return means([dr.select(hit.is_valid(), mi.Float(1), mi.Float(0))], count)
+            hit = seen(scene, rays(sampler, camera, seed, samples, each, cells, start), sampler)
+            return means([dr.select(hit.is_valid(), mi.Float(1), mi.Float(0))], each)
 
         return kernel
 
@@ -213,8 +234,13 @@ class Frames:
 
         return kernel
 
-    def _rays(self, sampler: Any, camera: list[Any], seed: Any, samples: Any, count: int, cells: int) -> Any:
-        """Rays through random points of the pixels, one in each of ``cells``² cells; 0 cells: through the centres."""
+    def _rays(
+        self, sampler: Any, camera: list[Any], seed: Any, samples: Any, count: int, cells: int, start: Any = 0
+    ) -> Any:
+        """Rays through random points of the pixels, one in each of ``cells``² cells; 0 cells: through the centres.
+
+        start: the cell of the first of ``count`` rays.
+        """
         import drjit as dr
 
         mi, (width, height) = self.mi, self.size
@@ -226,7 +252,7 @@ class Frames:
         if cells == 0:
             offset = mi.Point2f(0.5, 0.5)
         elif cells > 1:
-            cell = index - pixel * samples
+            cell = index - pixel * samples + start
             offset = (mi.Point2f(cell % cells, cell // cells) + offset) / cells
         return pinhole(self.mi, camera, pixel, offset, self.size[0])
 

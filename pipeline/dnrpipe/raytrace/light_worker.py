@@ -24,7 +24,8 @@ class Worker:
 
     common: {"bundle", "variant"}
     task: {"output", "size", "spp", "integrator", "max_depth", "seed", "fingerprint"}; the file is an ``npz`` with
-    ``light`` (float32 [2, 2, size, size, 3]: E and G of front and back, row 0 at V = 0) and ``fingerprint``.
+    ``light`` (float32 [2, 2, size, size, 3]: E and G of front and back, row 0 at V = 0) and ``fingerprint``. ``lost``
+    of the answer: samples that were not finite.
     """
 
     def __init__(self, common: dict[str, Any]) -> None:
@@ -46,6 +47,7 @@ class Worker:
             "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
             "texels": int((light[0, 0].sum(axis=-1) > 0).sum()),
             "spp": int(task["spp"]),
+            "lost": baker.lost,
         }
 
     def _onwards(self, task: dict[str, Any]) -> Any:

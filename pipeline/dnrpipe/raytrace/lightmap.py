@@ -41,7 +41,8 @@ class LightBaker:
     """Bakes E of one scene.
 
     integrator: continues paths from their first bounce on; emitters that it meets first must be hidden. None: direct
-    light alone. groups: see :class:`.texels.AtlasSurface`.
+    light alone. groups: see :class:`.texels.AtlasSurface`. ``lost``: samples of the last bake that were not finite;
+    each is left out of its texel's mean.
     """
 
     def __init__(self, mi: Any, scene: Any, integrator: Any, groups: Sequence[tuple[Path, np.ndarray]] = ()) -> None:
@@ -54,6 +55,7 @@ class LightBaker:
         self.glossy = any(mi.has_flag(b.flags(), mi.BSDFFlags.Glossy) for b in bsdfs)
         inner = [shape.interior_medium() for shape in scene.shapes() if shape.is_medium_transition()]
         self.media = list({id(medium): medium for medium in inner if medium is not None}.values())
+        self.lost = 0
 
     def bake(self, size: int, spp: int, seed: int) -> np.ndarray:
         """E and S of the front and of the back, float32 [2, 2, size, size, 3], row 0 at V = 0; denoised, gaps filled.
@@ -61,7 +63,7 @@ class LightBaker:
         The denoiser is shown where in space each texel lies and where it faces, so that charts that are neighbours in
         the atlas alone stay apart. The back is traced where it can be seen: of surfaces with a rim.
         """
-        whole = np.zeros((2, 2, size, size, 3), np.float32)
+        whole, self.lost = np.zeros((2, 2, size, size, 3), np.float32), 0
         if not self.surface.count:
             return whole
         texels, position, normal, thin = self.occupied(size)
@@ -74,14 +76,22 @@ class LightBaker:
             if not wanted.any():
                 continue
             guides = place[wanted], normal[wanted] * side
-            sums = self._traced(self._light, texels[wanted], size, spp, seed * 4 + number, side)
-            found = sums[:, 3:].max(axis=1) > LEAST_RHO * spp
-            whole[0, number] = self._smooth(sums[:, :3], sums[:, 3:], 1e-6 * spp, texels[wanted], found, guides, size)
+            light, rho = self._sums(self._light, texels[wanted], size, spp, seed * 4 + number, side)
+            found = rho.max(axis=1) > LEAST_RHO * spp
+            whole[0, number] = self._smooth(light, rho, 1e-6 * spp, texels[wanted], found, guides, size)
             if self.glossy:
-                sums = self._traced(self._gloss, texels[wanted], size, spp, seed * 4 + 2 + number, side)
-                found = sums[:, 3:].max(axis=1) > 0
-                whole[1, number] = self._smooth(sums[:, :3], sums[:, 3:], 0, texels[wanted], found, guides, size)
+                light, weight = self._sums(self._gloss, texels[wanted], size, spp, seed * 4 + 2 + number, side)
+                found = weight.max(axis=1) > 0
+                whole[1, number] = self._smooth(light, weight, 0, texels[wanted], found, guides, size)
         return whole
+
+    def _sums(
+        self, sample: Any, texels: np.ndarray, size: int, spp: int, seed: int, side: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Numerator and denominator, [T, 3] each, of :meth:`_traced`; books what was lost."""
+        sums = self._traced(sample, texels, size, spp, seed, side)
+        self.lost += round(float(sums[:, 6].sum(dtype=np.float64)))
+        return sums[:, :3], sums[:, 3:6]
 
     @staticmethod
     def _smooth(
@@ -164,7 +174,7 @@ class LightBaker:
         return si, found & si.is_valid() & (dr.norm(si.p - place) < 2 * self.lift)
 
     def _gloss(self, sampler: Any, uv: Any, side: int) -> list[Any]:
-        """One sample of S's numerator and of its denominator at each (U, V)."""
+        """One sample of S's numerator and of its denominator at each (U, V), and 1 where it is not finite."""
         import drjit as dr
 
         mi = self.mi
@@ -175,22 +185,25 @@ class LightBaker:
         seen.z = dr.select(si.wi.z < 0, -seen.z, seen.z)
         si.wi = seen
         bounce, weight = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), found)
-        found &= (bounce.pdf > 0) & dr.all(dr.isfinite(weight))
+        found &= bounce.pdf > 0
+        wanted = mi.Mask(found)
+        found &= dr.all(dr.isfinite(weight))
         onwards = si.spawn_ray(si.to_world(bounce.wo))
         light = mi.Spectrum(0.0)
         if self.integrator is not None:
             light = self._arriving(sampler, onwards, found)
         found &= dr.all(dr.isfinite(light))
-        return [*dr.select(found, weight * light, 0), *dr.select(found, weight, 0)]
+        return [*dr.select(found, weight * light, 0), *dr.select(found, weight, 0), self._one(wanted & ~found)]
 
     def _light(self, sampler: Any, uv: Any, side: int) -> list[Any]:
-        """One sample of B and of rho at each (U, V)."""
+        """One sample of B and of rho at each (U, V), and 1 where it is not finite."""
         import drjit as dr
 
         mi, scene = self.mi, self.scene
         si, found = self._surface(sampler, uv, side)
         context, bsdf = diffuse_context(mi), si.bsdf()
         rho = reflectance(mi, bsdf, context, si, found)
+        wanted = mi.Mask(found)
         found &= dr.all(dr.isfinite(rho))
 
         toward, arriving = scene.sample_emitter_direction(si, sampler.next_2d(), not self.passing, found)
@@ -203,7 +216,13 @@ class LightBaker:
         if self.integrator is not None:
             b += self._bounced(sampler, si, bsdf, context, found)
         fine = found & dr.all(dr.isfinite(b))
-        return [*dr.select(fine, b, 0), *dr.select(fine, rho, 0)]
+        return [*dr.select(fine, b, 0), *dr.select(fine, rho, 0), self._one(wanted & ~fine)]
+
+    def _one(self, where: Any) -> Any:
+        """1 there, else 0."""
+        import drjit as dr
+
+        return dr.select(where, self.mi.Float(1), 0)
 
     def _bounced(self, sampler: Any, si: Any, bsdf: Any, context: Any, active: Any) -> Any:
         """One sample of what comes by way of other surfaces."""

@@ -53,17 +53,19 @@ def finished(
     """(channels of the view's file, its figures of noise).
 
     image: [H, W, 4]; halves: two independent ones whose mean it is; raw: its noise, both None for a single sample.
-    smooth: R G B are denoised, and what was traced is in raw.R, raw.G, raw.B. Figures: ``noise``, ``noise_error``,
+    smooth: R G B are denoised, and what was traced is in raw.R, raw.G, raw.B; ``guides_masked`` of the figures are the
+    pixels whose albedo and normal the denoiser had to do without. Figures: ``noise``, ``noise_error``,
     ``noise_rmse`` (see :class:`.noise.Noise`) of R G B, ``raw_noise``, ``raw_noise_error`` of what was traced; None
     where nothing is known. With groups [G, H, W, 4], of which the even and the odd make the halves, also
     ``denoised_error``: relative RMSE of a denoised half against the truth, the denoiser's bias included, and
     ``denoiser_bias``: the part of it that is not noise; None where noise hides them (below two standard errors).
     """
     channels = {channel: image[..., i] for i, channel in enumerate("RGBA")}
-    left, more = raw, {}
+    left = raw
+    more: dict[str, Any] = {}
     if smooth:
         channels |= {f"raw.{channel}": image[..., i] for i, channel in enumerate("RGB")}
-        albedo, normal = engine.auxiliary(bundle, view, AUXILIARY_SPP)
+        albedo, normal, more["guides_masked"] = engine.auxiliary(bundle, view, AUXILIARY_SPP)
 
         def clean(noisy: np.ndarray) -> np.ndarray:
             return denoise(noisy, albedo, normal, threads=1).astype(np.float64)  # one thread, so that bits repeat
@@ -73,7 +75,7 @@ def finished(
         smooth_halves = [clean(half) for half in halves] if halves is not None else []
         left = half_noise(*smooth_halves) if smooth_halves else None
         if left is not None and groups is not None:
-            more = _bias(smooth_halves, groups, left)
+            more |= _bias(smooth_halves, groups, left)
     return channels, {
         "noise": left.relative if left else None,
         "noise_error": left.error if left else None,

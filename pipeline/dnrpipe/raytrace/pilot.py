@@ -13,6 +13,7 @@ from dnrpipe.effects.statistics import cost, difference, display, enough, remain
 from dnrtrain.contract import View
 
 from .engine import Engine
+from .finite import masked
 
 DEPTHS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48)
 MAX_DOUBLINGS = 2
@@ -26,6 +27,7 @@ class Worker:
     task "compare": {"with", "without": configs, "views", "spp"} -> :meth:`compare`
     config: {"bundle": scene.xml, "integrator", "max_depth", "variant", "lenses", "passes"}
     view: {"view": View as JSON, "lens"}
+    Answers also hold ``masked``: pixels of all pictures that were not finite, and count as black.
     """
 
     def __init__(self, common: dict[str, Any]) -> None:
@@ -34,10 +36,13 @@ class Worker:
             bundles.setdefault(config["variant"], []).append(Path(config["bundle"]))
         # One thread would stop the loader of a second variant.
         threads = 1 if len(bundles) == 1 else 0
+        self.masked = 0  # pixels of the task at hand that were not finite
         self.engines = {name: Engine(name, threads, list(dict.fromkeys(paths))) for name, paths in bundles.items()}
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
-        return self.path_depth(task) if task["kind"] == "depth" else self.compare(task)
+        self.masked = 0
+        answer = self.path_depth(task) if task["kind"] == "depth" else self.compare(task)
+        return answer | {"masked": self.masked}
 
     def path_depth(self, task: dict[str, Any]) -> dict[str, Any]:
         """Smallest depth within the tolerances, by bisection; more samples where noise is what decides.
@@ -143,7 +148,9 @@ class Worker:
         )
         sensor = engine.sensor(view, entry.get("lens") if config.get("lenses", True) else None)
         picture, _ = engine.frame(bundle, integrator, sensor, view, spp, seed)
-        return np.where(np.isfinite(picture).all(axis=-1, keepdims=True), picture, 0.0)
+        picture, lost = masked(picture)
+        self.masked += lost
+        return picture
 
 
 def _noise(pictures: np.ndarray) -> float:

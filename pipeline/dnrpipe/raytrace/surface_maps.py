@@ -28,7 +28,8 @@ class Worker:
     common: {"bundle", "variant"}
     task: {"output", "size", "samples", "seed"}; the file is an ``npz``, row 0 at V = 0, gaps between charts filled:
     ``albedo`` and ``emission`` float32 [2, n, n, 3] (front, back), ``opacity`` [n, n], ``normal`` [n, n, 3] (the
-    triangles', world space), ``thin`` bool: whether any surface's back can be seen.
+    triangles', world space), ``thin`` bool: whether any surface's back can be seen. ``lost`` of the answer: samples
+    that were not finite; each is left out of its texel's mean.
     """
 
     def __init__(self, common: dict[str, Any]) -> None:
@@ -40,10 +41,11 @@ class Worker:
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
         scene = self.engine.scenes[str(self.bundle)]
         size, samples = int(task["size"]), int(task["samples"])
-        maps = SurfaceMapper(self.engine.mi, scene, grouped_meshes(self.bundle)).maps(size, samples, int(task["seed"]))
+        mapper = SurfaceMapper(self.engine.mi, scene, grouped_meshes(self.bundle))
+        maps = mapper.maps(size, samples, int(task["seed"]))
         with atomic_path(task["output"]) as temporary, temporary.open("wb") as file:
             np.savez(file, **maps)  # pyright: ignore[reportArgumentType]
-        return {"texels": size * size}
+        return {"texels": size * size, "lost": mapper.lost}
 
 
 class SurfaceMapper(LightBaker):
@@ -55,6 +57,7 @@ class SurfaceMapper(LightBaker):
 
     def maps(self, size: int, samples: int, seed: int) -> dict[str, np.ndarray]:
         """See :class:`Worker`. samples: points per texel."""
+        self.lost = 0
         found = {
             "albedo": np.zeros((2, size, size, 3), np.float32),
             "emission": np.zeros((2, size, size, 3), np.float32),
@@ -77,6 +80,7 @@ class SurfaceMapper(LightBaker):
                 continue
             sums = self._traced(self._properties, chosen, size, samples, seed * 4 + number, side)
             count = sums[:, 7:8]
+            self.lost += round(float(sums[:, 8].sum(dtype=np.float64)))
             mean = np.divide(sums[:, :7], count, out=np.zeros_like(sums[:, :7]), where=count > 0)
             met = count[:, 0] > 0
             valid = np.zeros(size * size, bool)
@@ -92,7 +96,7 @@ class SurfaceMapper(LightBaker):
         return found
 
     def _properties(self, sampler: Any, uv: Any, side: int) -> list[Any]:
-        """Reflectance, emission, opacity at each (U, V), and 1 where there is a surface."""
+        """Reflectance, emission, opacity at each (U, V), 1 where there is a surface, 1 where it is not finite."""
         import drjit as dr
 
         mi = self.mi
@@ -104,6 +108,6 @@ class SurfaceMapper(LightBaker):
         opacity = mi.Float(1.0)
         if self.holes:
             opacity = 1 - dr.mean(bsdf.eval_null_transmission(si, found))
-        found &= dr.all(dr.isfinite(rho)) & dr.all(dr.isfinite(emission)) & dr.isfinite(opacity)
+        fine = found & dr.all(dr.isfinite(rho)) & dr.all(dr.isfinite(emission)) & dr.isfinite(opacity)
         one = mi.Float(1.0)
-        return [*(dr.select(found, value, 0) for value in (*rho, *emission, opacity, one))]
+        return [*(dr.select(fine, value, 0) for value in (*rho, *emission, opacity, one)), self._one(found & ~fine)]

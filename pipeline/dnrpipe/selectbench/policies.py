@@ -52,6 +52,8 @@ _CONTENDERS = (
     Contender("auto-2", "auto in two rounds: half is traced, the rest goes where that shows errors", "auto", rounds=2),
     Contender("dqn", "learned on a surrogate of texture training, other scenes; never worse by it than rules", "dqn"),
     Contender("fisher", "Fisher information of the coarse renderer, redundancy controlled", "fisher", rule=False),
+    Contender("ensemble", "active: where coarse renderers of the views so far disagree", "ensemble", rule=False),
+    Contender("variance", "active: where a coarse renderer of the views so far is least sure", "variance", rule=False),
     _paper("rl-paper", "-loss (the paper's)", "neg-loss"),
     _paper("rl-hard", "+loss", "pos-loss"),
     _paper("rl-decrease", "decrease of the error on probe views", "improvement"),

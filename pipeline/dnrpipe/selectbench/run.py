@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from dnrtrain.exr import read_metadata
+from dnrtrain.selector.names import ACTIVE_NAMES
 
 from .. import __version__
 from ..ablation.crew import Crew
@@ -156,6 +157,7 @@ class Bench:
             [
                 *(CELL_VERSION, __version__, pool.data.inputs, model.model_dump(), step1.model_dump()),
                 *(policy, budget, seed, self.crew.device, self.crew.threads),
+                *([settings.select.active.model_dump(), settings.starts_coarse] if policy in ACTIVE_NAMES else []),
             ]
         )
         folder = self.request.out / "step1" / pool.folder / key

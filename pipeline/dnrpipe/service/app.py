@@ -17,6 +17,7 @@ from ..errors import UserError
 from . import routes_jobs, routes_live, routes_server, routes_workspaces
 from .config import LOOPBACK, ServerConfig
 from .guard import Guard
+from .pruning import keep_pruned
 from .queue import QueueFull, WrongState
 from .root import UnknownName
 from .state import State
@@ -29,7 +30,8 @@ def create_app(state: State, token: str | None) -> FastAPI:
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        tasks = [asyncio.create_task(state.feed.watch()), asyncio.create_task(state.live.tend())]
+        chores = (state.feed.watch(), state.live.tend(), keep_pruned(state.queue, state.root, state.config))
+        tasks = [asyncio.create_task(chore) for chore in chores]
         yield
         for task in tasks:
             task.cancel()

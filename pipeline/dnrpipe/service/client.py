@@ -22,7 +22,19 @@ import httpx
 from pydantic import BaseModel, TypeAdapter
 
 from ..errors import UserError
-from .models import Health, Job, JobEvent, JobPage, JobRequest, LogPage, Scene, State, WorkspaceDetail, WorkspaceSummary
+from .models import (
+    Health,
+    Job,
+    JobEvent,
+    JobPage,
+    JobRequest,
+    LogPage,
+    PreviewState,
+    Scene,
+    State,
+    WorkspaceDetail,
+    WorkspaceSummary,
+)
 
 DEFAULT_SERVER = "http://127.0.0.1:8420"
 PATIENCE = 4.0
@@ -148,6 +160,10 @@ class Client:
 
     def workspace(self, name: str) -> WorkspaceDetail:
         return self._get(f"/workspaces/{name}", WorkspaceDetail)
+
+    def preview(self, workspace: str) -> PreviewState:
+        """What the last picture of a fine-tuning shows. Raises Refused (404) before there is one."""
+        return self._get(f"/workspaces/{workspace}/preview", PreviewState)
 
     def _stream(self, job: int, after: int) -> Iterator[JobEvent | None]:
         """Events; None at the end of the job."""

@@ -17,7 +17,8 @@ class ServerConfig(BaseModel):
 
     devices: one worker each, "cpu" or "cuda:<n>". rate, burst: requests per second and at once, per client address.
     streams: event streams and viewers open at once. viewers: workspaces viewed live at once; idle_seconds: when the
-    frame process of one that nobody looks at ends. limits: of every job, where it asks for no less.
+    frame process of one that nobody looks at ends. keep_days, keep_jobs: logs and events of a job that has ended are
+    kept for so long, and of the so many that ended last. limits: of every job, where it asks for no less.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -35,6 +36,8 @@ class ServerConfig(BaseModel):
     streams: int = Field(default=500, ge=1)
     viewers: int = Field(default=2, ge=1)
     idle_seconds: float = Field(default=300.0, gt=0)
+    keep_days: float = Field(default=30.0, gt=0, le=36_500)
+    keep_jobs: int = Field(default=1000, ge=1)
     free_disk_mb: int = Field(default=1024, ge=0, description="uploads and jobs are refused below this")
     limits: Limits = Limits(seconds=24 * 3600.0, disk_mb=50 * 1024)
 

@@ -25,6 +25,7 @@ from dnrpipe.evaluate import flip_error
 from dnrpipe.raytrace.base import BaseRenderer
 from dnrpipe.raytrace.base_worker import Worker as BaseWorker
 from dnrpipe.raytrace.engine import Engine
+from dnrpipe.raytrace.finite import masked, masked_channels
 from dnrpipe.raytrace.frames import Frames
 from dnrpipe.raytrace.light_worker import read_light
 from dnrpipe.settings import Settings
@@ -46,7 +47,7 @@ class Worker:
     "integrator", "max_depth", "base": common of the base image worker or None}.
     task: {"view" as JSON, "mode", "samples": rays per pixel of a base image, None for the model's own, "spp": to add to
     a reference, "fine": best quality, "file": for nearest}; the answer is {"picture": base64, "type", "ms": {stage:
-    milliseconds}, "spp", "width", "height"}.
+    milliseconds}, "spp", "repaired": pixels traced for this picture that were not finite, "width", "height"}.
     """
 
     def __init__(self, common: dict[str, Any]) -> None:
@@ -67,13 +68,14 @@ class Worker:
         self.kernels: dict[tuple[int, int], Frames] = {}
         self.renderers: dict[int, BaseRenderer] = {}
         self.traced: tuple[str, np.ndarray, int] | None = None
+        self.repaired = 0  # pixels of the picture at hand that were not finite
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
         view, mode = View.model_validate(task["view"]), task["mode"]
         if mode in BASE_ONLY and self.base is None:
             raise UserError(f"{mode}: this model corrects no base image")
         ms: dict[str, float] = {}
-        spp = None
+        spp, self.repaired = None, 0
         if mode == "nearest":
             picture = self._timed(ms, "file", self._file, Path(task["file"]))
         elif mode == "reference":
@@ -93,6 +95,7 @@ class Worker:
             "type": kind,
             "ms": {name: round(value, 2) for name, value in ms.items()},
             "spp": spp,
+            "repaired": self.repaired,
             "width": picture.shape[1],
             "height": picture.shape[0],
         }
@@ -107,14 +110,22 @@ class Worker:
     def _channels(self, view: View, samples: int | None) -> dict[str, np.ndarray]:
         """Base image and G-buffer, or the G-buffer alone."""
         if self.base is None:
-            return self._frames(view).gbuffer(view)
-        if samples is None or samples >= self.base.renderer.samples or self.kind != "baked":
-            return self.base.channels(view)
+            channels, lost = masked_channels(self._frames(view).gbuffer(view))
+            self.repaired += lost
+            return channels
+        self.base.repaired = self.base.masked = 0
+        channels = self._base(self.base, view, samples)
+        self.repaired += self.base.repaired + self.base.masked
+        return channels
+
+    def _base(self, base: BaseWorker, view: View, samples: int | None) -> dict[str, np.ndarray]:
+        if samples is None or samples >= base.renderer.samples or self.kind != "baked":
+            return base.channels(view)
         if samples not in self.renderers:
             light = read_light(Path(self.common["base"]["light"]))
             scene = self.engine.scenes[str(self.bundle)]
             self.renderers[samples] = BaseRenderer(self.engine.mi, scene, light, samples)
-        return self.base.channels(view, self.renderers[samples])
+        return base.channels(view, self.renderers[samples])
 
     def _neural(self, view: View, channels: dict[str, np.ndarray]) -> np.ndarray:
         """Display RGB over white, float32 [H, W, 3] in [0, 1]."""
@@ -146,7 +157,8 @@ class Worker:
         key = view.model_copy(update={"name": "reference"}).model_dump_json()
         known = self.traced if self.traced is not None and self.traced[0] == key else None
         total, count = (known[1], known[2]) if known else (np.zeros((view.height, view.width, 4), np.float64), 0)
-        sample = np.nan_to_num(self._frames(view).path(view, spp, seed=1 + count), posinf=0.0, neginf=0.0)
+        sample, lost = masked(self._frames(view).path(view, spp, seed=1 + count))
+        self.repaired += lost
         total, count = total + np.asarray(sample, np.float64) * spp, count + spp
         self.traced = (key, total, count)
         return self._over_white((total / count).astype(np.float32)), count

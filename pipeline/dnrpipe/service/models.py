@@ -173,10 +173,55 @@ class CostState(_Wire):
     tracing_all_seconds: float | None
 
 
+class PlannedStage(_Wire):
+    """A stage's wall seconds: as `dnrpipe plan` predicted them, and spent since then (None: it was done before)."""
+
+    stage: str
+    predicted: float
+    spent: float | None
+    done: bool
+
+
+class PlanState(_Wire):
+    """The last plan against what its stages have cost since.
+
+    views, spp, epochs: what it reckons with; fits: whether the settings in force are these. total, low, high: seconds
+    of the stages until the renderer is there (evaluation is none of them), expected and nine times in ten; spent: on
+    the same.
+    """
+
+    made: float
+    views: int
+    spp: int
+    epochs: int
+    fits: bool
+    stages: list[PlannedStage]
+    total: float
+    low: float
+    high: float
+    spent: float
+
+
+class PreviewState(_Wire):
+    """The picture of a fine-tuning under way. split: test (held out), or train where nothing is.
+
+    psnr: dB, None without a reference; truth: whether there is one. time: unix seconds.
+    """
+
+    split: Literal["test", "train"]
+    view: str
+    epoch: int
+    epochs: int
+    psnr: float | None
+    truth: bool
+    time: float
+
+
 class WorkspaceDetail(_Wire):
     """What the dashboard shows of a workspace.
 
     sphere: the cameras as SVG, seen from ``eye`` (azimuth, elevation in radians); None before there are any.
+    plan: None where `dnrpipe plan` has not been.
     """
 
     name: str
@@ -187,6 +232,7 @@ class WorkspaceDetail(_Wire):
     training: list[Curve]
     tests: list[TestPicture]
     costs: CostState
+    plan: PlanState | None
     viewable: bool
     report: bool
 

@@ -14,7 +14,7 @@ import json
 import sqlite3
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,8 @@ from .models import FINAL, STATES, Job, JobEvent, JobRequest, State
 SCHEMA = 1
 MAX_STARTS = 6
 """A job whose process or server died this often, without ending by itself, is given up."""
+BATCH = 50
+"""Jobs that are forgotten in one transaction; others wait for it."""
 _TABLES = """
 CREATE TABLE IF NOT EXISTS jobs (
     id INTEGER PRIMARY KEY AUTOINCREMENT,
@@ -256,6 +258,40 @@ class Queue:
         return [
             JobEvent(id=r["id"], job=r["job"], time=r["time"], kind=r["kind"], data=json.loads(r["data"])) for r in rows
         ]
+
+    def forget(
+        self, *, before: float, beyond: int, has_files: Collection[int], remove_files: Callable[[int], None]
+    ) -> list[int]:
+        """Drop what was told of jobs that have ended: before the time ``before``, or longer ago than the ``beyond``
+        that ended last. Jobs themselves and their changes of state are kept. Returns the jobs, by number.
+
+        has_files: jobs that may have files of their own, for which ``remove_files`` is called. All of it happens while
+        nothing else can write, so that no job is tried again meanwhile.
+        """
+        forgotten: list[int] = []
+        for batch in self._told_of(before, beyond, has_files):
+            with self._writing() as db:
+                for job in batch:
+                    row = db.execute("SELECT state FROM jobs WHERE id = ?", (job,)).fetchone()
+                    if row["state"] in FINAL:  # still
+                        db.execute("DELETE FROM events WHERE job = ? AND kind != 'state'", (job,))
+                        remove_files(job)
+                        forgotten.append(job)
+        return forgotten
+
+    def _told_of(self, before: float, beyond: int, has_files: Collection[int]) -> list[list[int]]:
+        """Ended jobs past the limits that still have events or files, in batches of BATCH."""
+        final = ", ".join(f"'{state}'" for state in FINAL)
+        rows = self._db().execute(
+            "SELECT id, finished, EXISTS (SELECT 1 FROM events WHERE job = jobs.id AND kind != 'state') AS told"
+            f" FROM jobs WHERE state IN ({final}) ORDER BY finished DESC, id DESC"
+        )
+        due = [
+            row["id"]
+            for place, row in enumerate(rows)
+            if (row["finished"] < before or place >= beyond) and (row["told"] or row["id"] in has_files)
+        ]
+        return [due[start : start + BATCH] for start in range(0, len(due), BATCH)]
 
     def last_event(self) -> int:
         """Id of the newest event of any job."""

@@ -3,7 +3,7 @@
 server  {"kind": "hello", center, radius, distance, size, modes}                  text
 client  a LiveRequest as JSON, as often as it likes; only the newest one counts   text
 server  4 bytes length of the header, little endian; header as JSON; the picture  binary
-        header: type, width, height, mode, moving, samples, spp, ms by stage, total_ms, nearest
+        header: type, width, height, mode, moving, samples, spp, repaired, ms by stage, total_ms, nearest
 server  {"kind": "problem", "detail": one line}                                   text
 
 After the last request of a moving camera the view is rendered once more at full quality; a reference gets better for as

@@ -25,12 +25,14 @@ from .models import (
     CostState,
     Curve,
     PlacedView,
+    PreviewState,
     Scene,
     StageState,
     TestPicture,
     WorkspaceDetail,
     WorkspaceSummary,
 )
+from .planned import plan_state
 from .routes_jobs import CONFLICT, FULL, NOT_FOUND, REFUSED
 from .state import Shared, State
 
@@ -77,7 +79,9 @@ def get_workspace(name: NamePath, service: Shared) -> WorkspaceDetail:
     path = service.root.workspace(name)
     try:
         workspace = Workspace.open(path)
-        rows = status(workspace, resolve_settings(workspace, {}, None))
+        settings = resolve_settings(workspace, {}, None)
+        rows = status(workspace, settings)
+        plan = plan_state(workspace, settings, {row["stage"]: row["state"] for row in rows})
         known = outline(path)
     except UserError as error:
         raise HTTPException(409, str(error)) from None
@@ -99,9 +103,31 @@ def get_workspace(name: NamePath, service: Shared) -> WorkspaceDetail:
             tracing_seconds=tracing["actual_seconds"] if tracing else None,
             tracing_all_seconds=tracing["all_seconds"] if tracing else None,
         ),
+        plan=plan,
         viewable="finetune" in workspace.manifest.stages,
         report=(path / "report" / "report.html").is_file(),
     )
+
+
+@router.get("/workspaces/{name}/preview", responses=NOT_FOUND | CONFLICT)
+def preview(name: NamePath, service: Shared) -> PreviewState:
+    """What the last picture of fine-tuning shows. 409: its file is damaged."""
+    path = service.root.workspace(name) / "preview" / "preview.json"
+    try:
+        return PreviewState.model_validate_json(path.read_bytes())
+    except FileNotFoundError:
+        raise HTTPException(404, f"{name} has no picture of a training") from None
+    except ValueError:
+        raise HTTPException(409, f"{name}: preview.json is damaged; the next training replaces it") from None
+
+
+@router.get("/workspaces/{name}/preview/{kind}", response_class=FileResponse, responses=NOT_FOUND | PNG)
+def preview_picture(name: NamePath, kind: Literal["truth", "prediction"], service: Shared) -> FileResponse:
+    """The view as fine-tuning last rendered it, or its ray-traced reference."""
+    path = service.root.workspace(name) / "preview" / f"{kind}.png"
+    if not path.is_file() or not path.resolve().is_relative_to(service.root.folder):
+        raise HTTPException(404, f"{name} has no picture {kind} of a training")
+    return FileResponse(path, media_type="image/png")
 
 
 @router.get("/workspaces/{name}/pictures/{view}/{kind}", response_class=FileResponse, responses=NOT_FOUND | PNG)

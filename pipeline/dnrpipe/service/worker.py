@@ -22,7 +22,7 @@ from filelock import FileLock, Timeout
 
 from ..errors import UserError
 from ..event_stream import VARIABLE
-from ..executors import die_with_parent
+from ..executors import TIMEOUT_VARIABLE, die_with_parent
 from ..workspace import LOCK_FILES
 from .config import ServerConfig, tightest
 from .models import Job, Limits
@@ -33,6 +33,8 @@ from .root import ServiceRoot
 IDLE = 0.3
 WATCH = 0.2
 DISK_INTERVAL = 5.0
+MACHINE_VARIABLES = ("DNRPIPE_CACHE", TIMEOUT_VARIABLE)
+"""Of the server's environment: they hold for its jobs, too."""
 UNLOCK_SECONDS = 10.0
 """How long a workspace may still be held by the processes of a worker that was killed."""
 INTERRUPTED = 130
@@ -176,7 +178,7 @@ def job_command(job: Job, root: ServiceRoot) -> list[str]:
 
 def job_environment(device: str, events: Path) -> dict[str, str]:
     """The worker's environment without settings of whoever started the server, on the worker's device."""
-    kept = {k: v for k, v in os.environ.items() if not k.startswith("DNRPIPE_") or k == "DNRPIPE_CACHE"}
+    kept = {k: v for k, v in os.environ.items() if not k.startswith("DNRPIPE_") or k in MACHINE_VARIABLES}
     if device.startswith("cuda:"):
         kept |= {"CUDA_VISIBLE_DEVICES": device.removeprefix("cuda:"), "DNRPIPE_DEVICE": "cuda"}
     else:
@@ -188,9 +190,7 @@ def _die_with(parent: int) -> Callable[[], None]:
     """What a job's process does before it becomes the command; ``parent`` may be dead already, and tell no more."""
 
     def prepare() -> None:
-        die_with_parent()
-        if os.getppid() != parent:
-            os._exit(1)
+        die_with_parent(parent)
 
     return prepare
 
@@ -225,9 +225,7 @@ def _signal_name(number: int) -> str:
 
 
 def main() -> int:
-    die_with_parent()
-    if os.getppid() != int(sys.argv[2]):  # the server was killed while this process started
-        return 1
+    die_with_parent(int(sys.argv[2]))
     config = ServerConfig.model_validate_json(sys.stdin.read())
     worker = Worker(config, sys.argv[1])
     signal.signal(signal.SIGTERM, worker.stop)

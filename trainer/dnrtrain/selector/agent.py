@@ -81,7 +81,7 @@ class RewardScale:
 
     def reward(self, loss: float) -> float:
         """(mean − loss) / mean with the mean before this loss; then takes it in. Non-finite losses are 0."""
-        if not np.isfinite(loss):
+        if not np.isfinite(loss):  # its step is skipped, counted and said by the epoch
             return 0.0
         if self.raw:
             return -loss

@@ -14,13 +14,12 @@ from .environment import Environment, exchange, in_order
 from .explain import explained
 from .geometry import camera_features, farthest_first
 from .kmedoids import KMedoidsPolicy
+from .names import SHIPPED_WEIGHTS
 from .pool import choose_useful
 from .protocol import Candidates, Choice, Tick
 
 POOL = 300
 """Of larger pools this many candidates, far from each other, are looked at, and what the rules chose."""
-SHIPPED = Path(__file__).with_name("dqn.safetensors")
-"""Trained on this repository's scenes by `dnrpipe train-selector`."""
 
 
 class DqnPolicy:
@@ -32,7 +31,7 @@ class DqnPolicy:
     looks: ClassVar[bool] = True
     effort: ClassVar[int] = 28
 
-    def __init__(self, weights: Path = SHIPPED) -> None:
+    def __init__(self, weights: Path = SHIPPED_WEIGHTS) -> None:
         self.weights = weights
 
     def choose(self, candidates: Candidates, budget: int, seed: int, tick: Tick | None = None) -> Choice:

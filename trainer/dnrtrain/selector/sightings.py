@@ -11,10 +11,14 @@ import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..contract import RASTER_CHANNELS, ContractError, View, require_channels
+
+if TYPE_CHECKING:
+    from ..dataset import ViewSet
 
 GRID = 64
 """Cells per side of the atlas."""
@@ -135,6 +139,21 @@ def collect(looks: Iterable[Sighting], grid: int = GRID) -> Sightings:
 
 def look_at(channels: dict[str, np.ndarray], view: View, grid: int = GRID) -> Sighting:
     """One view's sightings. channels: those of its pass file, [H, W] each."""
+    return _look(channels, -view.ray_directions(), grid)
+
+
+def sightings_of(views: ViewSet, grid: int = GRID) -> Sightings:
+    """Sightings of views in memory; without colours and detail."""
+    maps = views.tensors
+    u, v = (0.5 * maps.uv[:, k].cpu().numpy() + 0.5 for k in range(2))
+    mask, toward = maps.mask[:, 0].cpu().numpy(), maps.view_dir.permute(0, 2, 3, 1).cpu().numpy()
+    return collect(
+        (_look({"uv.U": u[i], "uv.V": v[i], "mask": mask[i]}, toward[i], grid) for i in range(len(views))), grid
+    )
+
+
+def _look(channels: dict[str, np.ndarray], toward: np.ndarray, grid: int) -> Sighting:
+    """One view's sightings. toward: unit vectors from the surface to the camera, world space, [H, W, 3]."""
     height, width = channels["mask"].shape
     step = max(1, min(height, width) // LOOK_SIDE)
     part = (slice(step // 2, None, step), slice(step // 2, None, step))
@@ -142,7 +161,7 @@ def look_at(channels: dict[str, np.ndarray], view: View, grid: int = GRID) -> Si
     u, v = (channels[name][part][mask] for name in ("uv.U", "uv.V"))
     column, row = (np.clip((value * grid).astype(np.int32), 0, grid - 1) for value in (u, v))
     cells, place = np.unique(row * grid + column, return_inverse=True)
-    toward = -view.ray_directions()[part][mask]
+    toward = toward[part][mask]
     sums = np.stack([np.bincount(place, toward[:, k], len(cells)) for k in range(3)], axis=1)
     length = np.linalg.norm(sums, axis=1, keepdims=True)
     counts = np.bincount(place, minlength=len(cells))

@@ -34,7 +34,8 @@ class Worker:
     """Bakes one layer per task: ``layer`` (list of {material, taps: [{kind, groups, node, socket, key}]}).
 
     common: source (scene file), frame, geometry (npz), size (texels), folder (results: ``KEY.npy``, float16 or
-    float32 [N, C], a row per texel of the material's region, see :mod:`.regions`), threads.
+    float32 [N, C], a row per texel of the material's region, see :mod:`.regions`), threads. ``repaired`` of the
+    answer: texels that were not finite, by material.
     """
 
     def __init__(self, common: dict[str, Any]) -> None:
@@ -52,12 +53,15 @@ class Worker:
             for entry in task["layer"]
         }
         pixels = bake_layer(self.meshes, layer, self.atlas.size, self.threads)
+        repaired: dict[str, int] = {}
         for entry in task["layer"]:
-            values = _complete(pixels, self.atlas.region(entry["material"]).texels, self.atlas.size)
+            values, lost = _complete(pixels, self.atlas.region(entry["material"]).texels, self.atlas.size)
+            if lost:
+                repaired[entry["material"]] = lost
             for index, tap in enumerate(entry["taps"]):
                 kept = values[:, index : index + 1] if tap["kind"] == "scalar" else values
                 _save(self.folder / f"{tap['key']}.npy", kept)
-        return {"seconds": time.monotonic() - started}
+        return {"seconds": time.monotonic() - started, "repaired": repaired}
 
 
 def bake_layer(meshes: Sequence[FrozenMesh], layer: dict[str, list[Tap]], size: int, threads: int) -> np.ndarray:
@@ -130,14 +134,17 @@ def _looks_around(layer: dict[str, list[Tap]]) -> bool:
     return any(node.type == "AMBIENT_OCCLUSION" for name in layer for node in walk(_material(name).node_tree))
 
 
-def _complete(pixels: np.ndarray, texels: np.ndarray, size: int) -> np.ndarray:
-    """The region's values [N, 3]; texels that Cycles did not reach (rims, slivers) take a neighbour's."""
+def _complete(pixels: np.ndarray, texels: np.ndarray, size: int) -> tuple[np.ndarray, int]:
+    """(the region's values [N, 3], how many were not finite). These, and texels that Cycles did not reach (rims,
+    slivers), take a neighbour's."""
     values = pixels[texels].copy()
     # Shader graphs can yield NaN; Cycles hands it through.
-    values[~np.isfinite(values)] = EMPTY
+    bad = ~np.isfinite(values)
+    values[bad] = EMPTY
+    repaired = int(bad.any(1).sum())
     reached = np.asarray((values > EMPTY / 2).all(1))
     if reached.all() or not len(values):
-        return values
+        return values, repaired
     where = np.full(size * size, -1, np.int64)
     where[texels] = np.arange(len(texels))
     lost = np.flatnonzero(~reached)
@@ -149,9 +156,9 @@ def _complete(pixels: np.ndarray, texels: np.ndarray, size: int) -> np.ndarray:
             values[lost[usable]] = values[row[usable]]
             lost = lost[~usable]
         if not len(lost):
-            return values
+            return values, repaired
     values[lost] = values[reached].mean(0) if reached.any() else 0.0
-    return values
+    return values, repaired
 
 
 def _save(path: Path, values: np.ndarray) -> None:

@@ -61,7 +61,7 @@ class Lane:
     def _start(self) -> None:
         context = multiprocessing.get_context("spawn")  # bpy does not survive a fork
         self.connection, theirs = context.Pipe()
-        self.process = context.Process(target=_serve, args=(theirs, self.kind, self.common), daemon=True)
+        self.process = context.Process(target=_serve, args=(theirs, self.kind, self.common, os.getpid()), daemon=True)
         self.process.start()
         theirs.close()  # so that its end is seen here
 
@@ -74,9 +74,9 @@ class Lane:
         return f"ended with exit code {code}"
 
 
-def _serve(connection: Connection, kind: Kind, common: dict[str, Any]) -> None:
+def _serve(connection: Connection, kind: Kind, common: dict[str, Any], parent: int) -> None:
     """Body of the process: a renderer is made at the first task, so that its errors reach the parent."""
-    die_with_parent()
+    die_with_parent(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     draw: Callable[[View, Path], None] | None = None
     while True:

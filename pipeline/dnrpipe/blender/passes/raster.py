@@ -13,7 +13,8 @@ WORKBENCH_AA = ((1, "OFF"), (5, "5"), (8, "8"), (11, "11"), (16, "16"), (32, "32
 
 
 def configure_raster(scene: bpy.types.Scene, engine: str, samples: int) -> None:
-    """Set the original scene up for ``engine`` ("eevee", "workbench", "cycles-direct").
+    """Set the original scene up for ``engine`` ("eevee", "workbench", "cycles-direct"; "cycles": light paths as in the
+    file, for frames that are compared with ours).
 
     Lights, world and materials stay as in the file. Compositor, sequencer, stamp, border, simplify,
     motion blur, freestyle, depth of field, multi-view, camera markers, dithering and film exposure are
@@ -36,8 +37,10 @@ def configure_raster(scene: bpy.types.Scene, engine: str, samples: int) -> None:
         _eevee(scene, samples)
     elif engine == "workbench":
         _workbench(scene, samples)
-    elif engine == "cycles-direct":
-        _cycles_direct(scene, samples)
+    elif engine in ("cycles", "cycles-direct"):
+        _cycles(scene, samples)
+        if engine == "cycles-direct":
+            scene.cycles.max_bounces = 0
     else:
         raise UserError(f"unknown raster engine '{engine}'; choose eevee, workbench or cycles-direct")
 
@@ -63,13 +66,12 @@ def _workbench(scene: bpy.types.Scene, samples: int) -> None:
     scene.display.render_aa = next((name for count, name in WORKBENCH_AA if count >= samples), "32")
 
 
-def _cycles_direct(scene: bpy.types.Scene, samples: int) -> None:
+def _cycles(scene: bpy.types.Scene, samples: int) -> None:
     scene.render.engine = "CYCLES"
     cycles = scene.cycles
     cycles.device = "CPU"
     cycles.samples = samples
     cycles.use_adaptive_sampling = cycles.use_denoising = False
-    cycles.max_bounces = 0
     cycles.time_limit = 0
     cycles.film_exposure = 1.0
     cycles.pixel_filter_type = "BOX"

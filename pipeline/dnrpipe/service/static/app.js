@@ -74,7 +74,9 @@
     $("job").hidden = false;
     $("job-title").textContent = "Job " + entry.id + ": " + entry.request.command + " " + entry.request.workspace;
     $("bar").value = 0; $("note").textContent = entry.state; $("log").textContent = ""; $("curves").replaceChildren();
-    let drawn = 0, due = false, looked = Date.now();
+    $("live").hidden = true;
+    const mine = watching;
+    let drawn = 0, due = false, looked = Date.now(), shown = null;
     function draw() {
       due = false; drawn = Date.now();
       const series = Object.keys(losses).map(function (name) { return { name: name, points: losses[name] }; });
@@ -96,6 +98,13 @@
         Object.keys(data.losses).forEach(function (name) { (losses[name] = losses[name] || []).push([data.epoch, data.losses[name]]); });
         if (data.val && data.val.psnr) quality.push([data.epoch, data.val.psnr]);
         if (!due) { due = true; setTimeout(draw, Math.max(0, 300 - (Date.now() - drawn))); }
+      } else if (kind === "preview") {
+        if (shown === null) setTimeout(function () {  // of many from the past, the last one
+          const last = shown;
+          shown = null;
+          live(entry.request.workspace, last, mine).catch(problem);
+        }, 200);
+        shown = data;
       } else if (kind === "picture" && workspace === entry.request.workspace) {
         open(workspace, data.view).catch(problem);
       } else if (kind === "state") {
@@ -108,6 +117,42 @@
     }).catch(problem);
     open(entry.request.workspace).catch(function () { $("detail").hidden = true; });
     refresh();
+  }
+
+  /* The picture that the event `told` tells of, unless another training has replaced it. */
+  async function live(name, told, mine) {
+    const base = "/workspaces/" + name + "/preview", found = await api.get(base);
+    if (Math.abs(found.time - told.time) > 5) return;
+    const pictures = { prediction: await api.picture(base + "/prediction") };
+    if (found.truth) pictures.truth = await api.picture(base + "/truth");
+    if (mine !== watching) return;  // another job was chosen meanwhile
+    Object.keys(pictures).forEach(function (kind) {
+      URL.revokeObjectURL($("live-" + kind).src);
+      $("live-" + kind).src = pictures[kind];
+    });
+    $("live-beside").hidden = !found.truth;
+    $("live-caption").textContent = (found.split === "test" ? "Test view " + found.view + ", which training never sees" : "Training view " + found.view + "; none is held out") +
+      ": epoch " + found.epoch + " of " + found.epochs +
+      (found.psnr === null ? ". evaluate will ray-trace its reference." : ", " + found.psnr.toFixed(2) + " dB");
+    $("live").dataset.epoch = found.epoch;
+    $("live").hidden = false;
+  }
+
+  function showPlan(plan) {
+    $("plan").hidden = !plan;
+    if (!plan) return;
+    $("plan").caption.textContent = "Plan: " + plan.views + " views, " + plan.spp + " spp, " + plan.epochs + " epochs" + (plan.fits ? "" : "; the settings are others now");
+    const rows = plan.stages.map(function (s) {
+      return [s.stage, clock(s.predicted), s.spent === null ? "done before" : clock(s.spent) + (s.done || !s.spent ? "" : " so far"), s.spent > s.predicted * plan.high / plan.total];
+    });
+    rows.splice(3, 0, ["until the renderer is there", clock(plan.total) + " (" + clock(plan.low) + " to " + clock(plan.high) + ")", clock(plan.spent), plan.spent > plan.high]);
+    $("plan").tBodies[0].replaceChildren.apply($("plan").tBodies[0], rows.map(function (row, i) {
+      const line = document.createElement("tr"), spent = cell(row[2]);
+      spent.classList.toggle("over", row[3]);
+      line.classList.toggle("sum", i === 3);
+      line.append(cell(row[0], "th"), cell(row[1]), spent);
+      return line;
+    }));
   }
 
   async function open(name, view) {
@@ -128,6 +173,7 @@
     const costs = found.costs, spent = Object.keys(costs.spent).map(function (k) { return k + " " + clock(costs.spent[k]); });
     $("cost").textContent = "Cost so far " + clock(costs.total) + " (" + spent.join(", ") + ")." + (costs.traced_views === null ? "" :
       " Ray-traced " + costs.traced_views + " of " + costs.candidates + " candidates in " + clock(costs.tracing_seconds) + "; all would have cost " + clock(costs.tracing_all_seconds) + ".");
+    showPlan(found.plan);
     $("sphere").hidden = !found.sphere;
     if (found.sphere && found.sphere !== sphere) {  // else it stays as it was turned
       sphere = found.sphere;

@@ -1,0 +1,74 @@
+"""What the last plan predicted against what its stages have cost since it was made."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict
+
+from ..costs import total
+from ..errors import UserError
+from ..planning.pilot_parts import FOLDER
+from ..planning.records import Choice, Prediction
+from ..settings import Settings
+from ..workspace import Workspace
+from .models import PlannedStage, PlanState
+
+UNTIL_THE_RENDERER = ("select", "raytrace", "finetune")
+
+
+class _Plan(BaseModel):
+    """The part of ``plan/plan.json`` that is read here."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    made: float
+    chosen: Prediction | None
+    settings_default: Prediction
+
+
+def plan_state(workspace: Workspace, settings: Settings, states: Mapping[str, str]) -> PlanState | None:
+    """states: of the stages, by name. None: there is no plan. Raises UserError: its file is damaged.
+
+    A stage that has ended has cost the wall seconds of its last run, or what its parts are booked with where it was
+    interrupted; one under way what its parts so far are booked with, which leaves out the start of processes.
+    """
+    path = workspace.root / FOLDER / "plan.json"
+    try:
+        plan = _Plan.model_validate(json.loads(path.read_bytes()))
+    except FileNotFoundError:
+        return None
+    except (ValueError, RecursionError):
+        raise UserError(f"{path}: damaged; run `dnrpipe plan` again") from None
+    known = [found for found in (plan.chosen, plan.settings_default) if found is not None]
+    prediction = next((found for found in known if _fits(found.choice, settings)), known[0])
+    seconds, choice = prediction.seconds, prediction.choice
+    since = [record for record in workspace.ledger.read() if record.time >= plan.made]
+    stages = []
+    for stage in (*UNTIL_THE_RENDERER, "evaluate"):
+        record = workspace.manifest.stages.get(stage)
+        done = states.get(stage) == "done"
+        spent: float | None = total(r for r in since if r.stage == stage).wall_seconds
+        if record is not None and record.finished >= plan.made:
+            spent = max(spent, record.seconds)
+        elif done and not spent:
+            spent = None
+        stages.append(PlannedStage(stage=stage, predicted=getattr(seconds, stage), spent=spent, done=done))
+    return PlanState(
+        made=plan.made,
+        **choice.model_dump(include={"views", "spp", "epochs"}),
+        fits=_fits(choice, settings),
+        stages=stages,
+        total=seconds.total.expected,
+        low=seconds.total.low,
+        high=seconds.total.high,
+        spent=sum(stage.spent or 0.0 for stage in stages if stage.stage in UNTIL_THE_RENDERER),
+    )
+
+
+def _fits(choice: Choice, settings: Settings) -> bool:
+    wanted: tuple[Any, ...] = (settings.select.budget, settings.raytrace.spp, settings.finetune.step2.epochs)
+    targets = settings.raytrace.noise is not None or settings.raytrace.time is not None
+    return not targets and wanted == (choice.views, choice.spp, choice.epochs)

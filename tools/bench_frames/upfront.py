@@ -1,0 +1,108 @@
+"""What a workspace cost before its first frame, and what that means for N frames.
+
+    total(N) = upfront + N * frame
+    N*       = upfront / (frame of the rival at our PSNR - our frame)
+
+Processor seconds of the ledger, which other work on the machine does not stretch: passes, tracing, baked light and base
+images over the threads, which they keep busy; training undivided, as its steps keep hardly more than one thread busy.
+All epochs do the same work and other work on the machine only ever adds to them, so each counts as much as the quarter
+that was disturbed least. The conversion of the scene, which both sides need, is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from dnrpipe.costs import CostRecord, break_even_frames
+from dnrpipe.frames.ladder import quality_at
+from dnrpipe.frames.ours import NEURAL
+
+COUNTS = (200, 2000)
+"""Numbers of frames that the tables speak of."""
+
+
+def upfront(records: Sequence[CostRecord], threads: int) -> dict[str, float]:
+    """Seconds by kind of work, ``total`` among them; each unit at its last cost."""
+    latest = {
+        (r.stage, r.unit, r.name): r
+        for r in records
+        if r.purpose == "training" and not r.cache_hit and r.stage in ("prepare", "select", "raytrace", "finetune")
+    }
+    found = {"passes": 0.0, "tracing": 0.0, "training": 0.0}
+    epochs = []
+    for (stage, unit, _), record in latest.items():
+        if unit == "epoch":
+            epochs.append(record.cpu_seconds)
+        elif (stage, unit) != ("prepare", "scene"):
+            found["passes" if stage == "prepare" else "tracing"] += record.cpu_seconds / threads
+    if epochs:
+        found["training"] = len(epochs) * float(np.quantile(epochs, 0.25))
+    return {**found, "total": sum(found.values())}
+
+
+def at_equal_time(scene: Mapping[str, Any], frames: int) -> dict[str, Any]:
+    """The best of our numbers of rays for so many frames: its name, dB, ms per frame all told, and the rival's dB in
+    that time."""
+    line = _line(scene)
+    found = []
+    for name in scene["standing"]:
+        if name.startswith(NEURAL):
+            row = scene["rows"][name]
+            ms = row["ms"] + 1000 * scene["upfront"]["total"] / frames
+            rival = quality_at(line, ms)
+            found.append({"name": name, "psnr": row["psnr"], "ms": ms, "rival": line[0][1] if rival is None else rival})
+    return max(found, key=lambda one: one["psnr"] - one["rival"])
+
+
+def break_even(scene: Mapping[str, Any]) -> tuple[str, int, bool] | None:
+    """(our number of rays, frames from which on ours is cheaper than the rival at equal PSNR, whether the ladder ends
+    below us, so that it is that many at most); the fewest frames of all numbers of rays. None: never."""
+    found = []
+    for name, standing in scene["standing"].items():
+        if not name.startswith(NEURAL):
+            continue
+        level = standing["crossover_ms"]
+        rival = standing["ladder_end_ms"] if level is None else level
+        frames = break_even_frames(scene["upfront"]["total"], rival / 1000, scene["rows"][name]["ms"] / 1000)
+        if frames is not None:
+            found.append((name, frames, level is None))
+    return min(found, key=lambda one: one[1]) if found else None
+
+
+def lines(scenes: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The table of all scenes whose ledger was read; empty where there is none."""
+    known = [scene for scene in scenes if "upfront" in scene]
+    if not known:
+        return []
+    heads = [f"{count} frames: ours, rival, lead | a frame, ms" for count in COUNTS]
+    table = [
+        f"| scene | before the first frame, s | of which training | {' | '.join(heads)} | cheaper from |",
+        "|---|---|---|" + "---|---|" * len(COUNTS) + "---|",
+    ]
+    for scene in known:
+        cells = [scene["scene"], f"{scene['upfront']['total']:.0f}", f"{scene['upfront']['training']:.0f}"]
+        for count in COUNTS:
+            one = at_equal_time(scene, count)
+            lead = one["psnr"] - one["rival"]
+            cells += [f"{one['psnr']:.1f}, {one['rival']:.1f}, {lead:+.1f} dB ({_rays(one['name'])})"]
+            cells += [f"{one['ms']:.0f}"]
+        even = break_even(scene)
+        if even is None:
+            cells.append("never")
+        else:
+            name, frames, bound = even
+            cells.append(f"{'at most ' if bound else ''}{frames} frames ({_rays(name)})")
+        table.append(f"| {' | '.join(cells)} |")
+    return table
+
+
+def _line(scene: Mapping[str, Any]) -> list[tuple[float, float]]:
+    rows = scene["rows"]
+    return [(rows[name]["ms"], rows[name]["psnr"]) for name in scene["frontier"]]
+
+
+def _rays(name: str) -> str:
+    return name.partition(", ")[2] or name

@@ -1,0 +1,105 @@
+"""Active learning on rasterised images: train on the views chosen so far, look where that leaves doubts, choose on.
+
+What ``ensemble`` and ``variance`` have in common. The first third of the budget is chosen by k-medoids of poses. Then
+views are added in batches: before each, small coarse renderers are trained from new weights on the rasterised images of
+the views so far, and all candidates are judged by them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from typing import Any
+
+import numpy as np
+
+from ..dataset import ViewSet
+from ..events import Event
+from ..model import DNR
+from ..settings import ActiveSettings
+from .ensemble import Disagreement, Spread
+from .explain import explained
+from .greedy import lazy_greedy
+from .kmedoids import KMedoidsPolicy
+from .pieces import Pieces, pieces_of
+from .pool import canonical_order, complete_useful
+from .protocol import Candidates, Choice
+from .sightings import sightings_of
+from .variance import PredictedVariance, Reduction
+
+Train = Callable[[list[int], int, int], Generator[Event, None, DNR]]
+"""train(views, round, member): a new coarse renderer, trained on these candidates."""
+
+
+KINDS: dict[str, type[Disagreement] | type[PredictedVariance]] = {
+    "ensemble": Disagreement,
+    "variance": PredictedVariance,
+}
+"""What is unsure, and what one more view would make of it, by policy."""
+
+
+def sizes(budget: int, rounds: int) -> list[int]:
+    """How many views are chosen after the start, a third, and after each batch; the last is ``budget``."""
+    start = -(-budget // 3)
+    return sorted({start, *(start + -(-(budget - start) * done // rounds) for done in range(1, rounds + 1))})
+
+
+def active_epochs(policy: str, settings: ActiveSettings, budget: int) -> int:
+    """Epochs of all models together."""
+    return (len(sizes(budget, settings.rounds)) - 1) * KINDS[policy].models(settings) * settings.epochs
+
+
+def active_steps(policy: str, settings: ActiveSettings, budget: int) -> int:
+    """Training steps of all models together: one for each view chosen so far, in each epoch."""
+    return sum(sizes(budget, settings.rounds)[:-1]) * KINDS[policy].models(settings) * settings.epochs
+
+
+def choose_actively(
+    policy: str,
+    views: ViewSet,
+    candidates: Candidates,
+    budget: int,
+    seed: int,
+    settings: ActiveSettings,
+    train: Train,
+) -> Generator[Event, None, Choice]:
+    """The choice of ``budget`` views; yields what training tells. Without sightings they are made from ``views``.
+
+    Gains of the first third are 0: k-medoids counts in another measure.
+    """
+    kind, count = KINDS[policy], KINDS[policy].models(settings)
+    sightings = candidates.sightings or sightings_of(views)
+    # Their places in ``views`` travel with the candidates: the pool's rules put them in another order.
+    known = Candidates(candidates.positions, candidates.directions, sightings, np.arange(len(candidates)))
+    order = canonical_order(known)  # sums over all views are the same to the last bit whatever order they came in
+    start, *wanted = sizes(budget, settings.rounds)
+    first = KMedoidsPolicy().choose(known, start, seed)
+    chosen, gains, why = list(first.views), [0.0] * start, ["k-medoids of poses, as a start"] * start
+    batches: list[dict[str, Any]] = []
+    left = first.details
+    for number, size in enumerate(wanted, start=1):
+        models = []
+        for member in range(count):
+            models.append((yield from train(chosen, number, member)))
+        doubt = kind(models, views, chosen, seed + number)
+        table = [pieces_of(views, view, doubt.unsure(view)) for view in range(len(views))]
+        more = complete_useful(known, chosen, size, _by(kind.batch([table[i] for i in order]), table))
+        batches.append({"trained_on": len(chosen), "chosen": len(more.views), **doubt.facts()})
+        for gain, reason in zip(more.gains, more.why, strict=True):
+            why.append(f"batch {number}: {reason or kind.WORD.format(gain)}")
+        chosen, gains, left = [*chosen, *more.views], [*gains, *more.gains], more.details
+    why, facts = explained(sightings, chosen, why)
+    trained = {"models": count, "epochs": settings.epochs}
+    unused = {name: left[name] for name in ("duplicates", "see_nothing") if name in left}
+    details = {"measure": kind.MEASURE, "start": start, "trained": trained, "batches": batches, **unused, **facts}
+    return Choice(chosen, gains, why, details)
+
+
+def _by(batch: Reduction | Spread, table: list[Pieces]) -> Callable[[Candidates, list[int], int], Choice]:
+    def choose(some: Candidates, kept: list[int], count: int) -> Choice:
+        assert some.facts is not None  # given above
+        others = [i for i in range(len(some)) if i not in set(kept)]
+        pieces = [table[int(some.facts[i])] for i in others]
+        order, gains = lazy_greedy(len(others), count, lambda i: batch.gain(pieces[i]), lambda i: batch.take(pieces[i]))
+        return Choice([others[i] for i in order], gains, [""] * count)
+
+    return choose

@@ -1,0 +1,75 @@
+"""Disagreement of several small renderers, and surface that none of them has seen.
+
+After density-aware NeRF ensembles (Sünderhauf, Abou-Chakra and Miller 2023, "Density-aware NeRF Ensembles: Quantifying
+Predictive Uncertainty in Neural Radiance Fields"): the uncertainty of a ray is the members' variance of its colour plus
+(1 − q)², where q is how sure they are that the ray ends at all. Here geometry is known, and what a renderer may lack is
+a texture: q is 1 where a view that it was trained on sees the piece of surface, else 0.
+
+    u(pixel) = mean over channels of Var over members of display RGB  +  (1 − q)²
+
+They take the view of largest u. The first view of a batch is that one; for further ones, u of a piece of surface from
+a direction that the batch has is divided by 1 + its sightings there, so that a batch is not one view many times.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+import torch
+
+from ..aggregator import Inside
+from ..dataset import ViewSet
+from ..model import DNR
+from ..settings import ActiveSettings
+from .pieces import COUNT, Pieces, cells_of, seen_cells, usual_pixels
+
+
+class Disagreement:
+    """Of members on all views. ``kept`` are the views of their training."""
+
+    MEASURE: ClassVar[str] = (
+        "mean over the picture of the members' variance (display RGB) + 1 on unseen surface, less what its batch has"
+    )
+    WORD: ClassVar[str] = "adds {:.2e} of disagreement and unseen surface"
+
+    def __init__(self, members: list[DNR], views: ViewSet, kept: list[int], seed: int) -> None:
+        self.members, self.views, self.seen = members, views, seen_cells(views, kept)
+        self.pixels, self.variance, self.unseen = 0, 0.0, 0
+
+    @staticmethod
+    def models(settings: ActiveSettings) -> int:
+        return settings.members
+
+    @torch.no_grad()
+    def unsure(self, view: int) -> np.ndarray:
+        batch = self.views.batch([view])
+        pictures = torch.cat([member(batch).rgb.clamp(0.0, 1.0) for member in self.members])
+        spread = pictures.var(dim=0, correction=0, keepdim=True).mean(dim=1, keepdim=True)
+        varies = Inside(batch.mask).gather(spread)[:, 0].cpu().numpy().astype(np.float64)
+        unseen = ~self.seen[cells_of(self.views, view)]
+        self.pixels += len(varies)
+        self.variance += float(varies.sum())
+        self.unseen += int(unseen.sum())
+        return varies + unseen
+
+    def facts(self) -> dict[str, float]:
+        count = max(1, self.pixels)
+        return {"disagreement": float(np.sqrt(self.variance / count)), "unseen": self.unseen / count}
+
+    @staticmethod
+    def batch(table: list[Pieces]) -> Spread:
+        return Spread(table)
+
+
+class Spread:
+    """Σ over the view's pieces of what is unsure there / (1 + the batch's sightings of it)."""
+
+    def __init__(self, table: list[Pieces]) -> None:
+        self.usual, self.sighted = usual_pixels(table), np.zeros(COUNT)
+
+    def gain(self, pieces: Pieces) -> float:
+        return float((pieces.unsure / (1.0 + self.sighted[pieces.keys])).sum())
+
+    def take(self, pieces: Pieces) -> None:
+        self.sighted[pieces.keys] += pieces.pixels / self.usual[pieces.keys]

@@ -1,0 +1,73 @@
+"""What is unsure in a view's pixels, summed up over pieces of surface seen from about one direction.
+
+A piece is a cell of the atlas (:mod:`.sightings`) from one of the bins of directions (:mod:`.demand`). Two pictures of
+one piece tell about the same: that is how policies that look at pixels keep from choosing alike views.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..dataset import ViewSet
+from .demand import BINS, directions
+from .sightings import GRID
+
+COUNT = GRID * GRID * BINS
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """What one view sees: E pieces, ascending.
+
+    keys    int64 [E] cell · BINS + bin of direction
+    pixels  float64 [E] pixels that show it, as a share of the view's pixels
+    unsure  float64 [E] what is unsure in these pixels, summed up, over the view's pixels
+    """
+
+    keys: np.ndarray
+    pixels: np.ndarray
+    unsure: np.ndarray
+
+
+def cells_of(views: ViewSet, view: int) -> np.ndarray:
+    """Cell of each pixel inside the view's mask, in the order of its rows: int64 [P]."""
+    maps = views.batch([view])
+    inside = maps.mask[0, 0].cpu().numpy() > 0.5
+    u, v = (0.5 * maps.uv[0, k].cpu().numpy()[inside] + 0.5 for k in range(2))
+    column, row = (np.clip((value * GRID).astype(np.int64), 0, GRID - 1) for value in (u, v))
+    return row * GRID + column
+
+
+def pieces_of(views: ViewSet, view: int, unsure: np.ndarray) -> Pieces:
+    """The view's pieces. unsure: [P], of each pixel inside its mask."""
+    maps = views.batch([view])
+    inside = maps.mask[0, 0].cpu().numpy() > 0.5
+    toward = maps.view_dir[0].cpu().numpy()[:, inside]
+    bins = (directions() @ toward).argmax(axis=0)
+    keys, place = np.unique(cells_of(views, view) * BINS + bins, return_inverse=True)
+    share = 1.0 / inside.size
+    return Pieces(
+        keys,
+        np.bincount(place, minlength=len(keys)) * share,
+        np.bincount(place, np.asarray(unsure, np.float64), len(keys)) * share,
+    )
+
+
+def seen_cells(views: ViewSet, some: Iterable[int]) -> np.ndarray:
+    """Which cells any of ``some`` sees: bool [GRID²]."""
+    seen = np.zeros(GRID * GRID, bool)
+    for view in some:
+        seen[cells_of(views, view)] = True
+    return seen
+
+
+def usual_pixels(table: list[Pieces]) -> np.ndarray:
+    """Mean pixels of a sighting of each piece, [COUNT]; 1 where nobody sees it."""
+    pixels, number = np.zeros(COUNT), np.zeros(COUNT)
+    for one in table:
+        pixels[one.keys] += one.pixels
+        number[one.keys] += 1.0
+    return np.where(number > 0, pixels / np.maximum(number, 1.0), 1.0)
