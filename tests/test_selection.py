@@ -61,7 +61,7 @@ def choose(workspace: Workspace, settings: Settings, capsys: pytest.CaptureFixtu
     return read_selection(workspace), capsys.readouterr().out
 
 
-@pytest.mark.parametrize("policy", ["auto", "kmedoids", "coverage", "d-optimal", "dqn", "farthest", "random"])
+@pytest.mark.parametrize("policy", ["auto", "coverage", "exchange", "kmedoids", "d-optimal", "dqn", "farthest", "random"])
 def test_a_choice_without_training(workspace: Workspace, capsys: pytest.CaptureFixture[str], policy: str) -> None:
     left = workspace.checkpoints("step1") / "model.json"
     left.parent.mkdir(parents=True)
@@ -280,7 +280,7 @@ def test_too_large_a_budget_is_refused(workspace: Workspace) -> None:
 def test_an_unknown_policy_is_refused() -> None:
     from dnrpipe.errors import UserError
 
-    with pytest.raises(UserError, match=r"select\.policy.*'auto', 'kmedoids'"):
+    with pytest.raises(UserError, match=r"select\.policy.*'auto', 'coverage'"):
         told("best")
 
 

@@ -51,7 +51,7 @@ def trace_round(workspace: Workspace, settings: Settings, console: Console, run_
 
 def go_on(candidates: Candidates, chosen: Choice, traced: ViewSet, budget: int, tick: Tick | None = None) -> Choice:
     """``chosen`` completed to ``budget`` by a second look at ``traced``: its views with ray-traced targets."""
-    from dnrtrain.selector.auto import second_look
+    from dnrtrain.selector.exchange import second_look
     from dnrtrain.selector.protocol import Choice
     from dnrtrain.selector.remaining import cell_errors
 

@@ -139,7 +139,7 @@ def test_exchanges_never_hurt(pool: Candidates) -> None:
 def test_the_guard_answers_the_best(pool: Candidates) -> None:
     details = DqnPolicy().choose(pool, 4, 0).details
     errors = details["guard"]["errors"]
-    assert set(errors) == {"auto", "auto, exchanged", "kmedoids", "coverage", "learned"}
+    assert set(errors) == {"exchange", "exchange, improved", "kmedoids", "coverage", "learned"}
     assert errors[details["guard"]["chosen"]] == min(errors.values())
     assert details["remaining_error"][-1] == pytest.approx(min(errors.values()), rel=1e-6)
 

@@ -215,7 +215,7 @@ def choose(folder: Path, count: int) -> None:
     sightings = read_sightings(files, views)
     positions = np.stack([view.position for view in views])
     candidates = Candidates(positions, np.stack([-view.matrix[:3, 2] for view in views]), sightings)
-    for policy in ("auto", "kmedoids", "coverage", "d-optimal", "farthest", "random"):
+    for policy in ("coverage", "exchange", "kmedoids", "d-optimal", "farthest", "random"):
         rule = untrained(policy)
         assert rule is not None
         started = time.monotonic()

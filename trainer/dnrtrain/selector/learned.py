@@ -8,9 +8,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..contract import ContractError
-from .auto import AutoPolicy
 from .coverage import CoveragePolicy
 from .environment import Environment, exchange, in_order
+from .exchange import ExchangePolicy
 from .explain import explained
 from .geometry import camera_features, farthest_first
 from .kmedoids import KMedoidsPolicy
@@ -43,7 +43,7 @@ class DqnPolicy:
         network, info = load_network(self.weights)
         if candidates.sightings is None:
             raise ContractError("policy 'dqn' needs the candidates' sightings (selector.sightings.read_sightings)")
-        rules = {"auto": AutoPolicy(), "kmedoids": KMedoidsPolicy(), "coverage": CoveragePolicy()}
+        rules = {"exchange": ExchangePolicy(), "kmedoids": KMedoidsPolicy(), "coverage": CoveragePolicy()}
         chosen = {name: rule.choose(candidates, budget, 0, tick).views for name, rule in rules.items()}
         looked_at = np.arange(len(candidates))
         if len(candidates) > POOL:
@@ -54,7 +54,7 @@ class DqnPolicy:
         if tick is not None:
             tick(len(candidates))
         options = {name: [place[view] for view in views] for name, views in chosen.items()}
-        options["auto, exchanged"] = exchange(environment, options["auto"])
+        options["exchange, improved"] = exchange(environment, options["exchange"])
         options["learned"] = exchange(environment, rollout(environment, network))
         errors = {name: environment.surrogate.run(views) / environment.start for name, views in options.items()}
         best = min(errors, key=lambda name: (errors[name], name))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal, get_args
 
-UntrainedName = Literal["auto", "kmedoids", "coverage", "d-optimal", "dqn", "farthest", "random"]
+UntrainedName = Literal["auto", "coverage", "exchange", "kmedoids", "d-optimal", "dqn", "farthest", "random"]
 TrainedName = Literal["rl-paper", "fisher", "ensemble", "variance"]
 PolicyName = Literal[UntrainedName, TrainedName]
 

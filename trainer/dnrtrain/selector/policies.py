@@ -7,6 +7,7 @@ from .auto import AutoPolicy
 from .baselines import FarthestPolicy, RandomPolicy
 from .coverage import CoveragePolicy
 from .doptimal import DOptimalPolicy
+from .exchange import ExchangePolicy
 from .kmedoids import KMedoidsPolicy
 from .learned import DqnPolicy
 from .names import NAMES, full_name
@@ -14,8 +15,9 @@ from .protocol import Policy
 
 UNTRAINED: dict[str, Policy] = {
     "auto": AutoPolicy(),
-    "kmedoids": KMedoidsPolicy(),
     "coverage": CoveragePolicy(),
+    "exchange": ExchangePolicy(),
+    "kmedoids": KMedoidsPolicy(),
     "d-optimal": DOptimalPolicy(),
     "dqn": DqnPolicy(),
     "farthest": FarthestPolicy(),
