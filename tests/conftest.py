@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,29 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     from xdist.scheduler import LoadScopeScheduling
 
     class ByFile(LoadScopeScheduling):
+        """xdist's, which after the crash of a worker assigns what that had done again: units with nothing to do, on
+        which the others wait for ever."""
+
+        def remove_node(self, node: Any) -> str | None:
+            units = self.assigned_work.pop(node)
+            crashed = next((test for unit in units.values() for test, done in unit.items() if not done), None)
+            if crashed is None:
+                return None
+            for scope, unit in units.items():
+                left = {test: False for test, done in unit.items() if not done and test != crashed}
+                if left:
+                    self.workqueue[scope] = left
+            for other in self.assigned_work:
+                self._reschedule(other)
+            return crashed
+
+        def _reschedule(self, node: Any) -> None:
+            # A worker begins its last test only when it knows that none follows, so one test is not enough.
+            while self.workqueue and not node.shutting_down and self._pending_of(self.assigned_work[node]) <= 2:
+                self._assign_work_unit(node)
+            if not self.workqueue and not node.shutting_down:
+                node.shutdown()
+
         def _split_scope(self, nodeid: str) -> str:
             file = nodeid.split("::", 1)[0]
             folder, name = file.rsplit("/", 1)
@@ -48,6 +73,26 @@ def shared_assets() -> Path:
     if not SHARED.is_dir():
         pytest.skip("../shared/assets is not here; the same check runs on the demo scene")
     return SHARED
+
+
+@pytest.fixture(scope="module")
+def mitsuba_variant() -> Iterator[str]:
+    """The best variant of Mitsuba, set in this process, with the plugins; the collector rests meanwhile.
+
+    (Freeing another test's scene while plugins are being recorded kills the process: dnrpipe.raytrace.recorded.)
+    """
+    mi = pytest.importorskip("mitsuba")
+    from dnrpipe.raytrace import plugins
+    from dnrpipe.raytrace.recorded import without_collection
+    from dnrpipe.raytrace.variants import choose_variant
+
+    chosen = choose_variant("auto")
+    os.environ.update(chosen.environment)
+    mi.set_variant(chosen.variant)
+    plugins.register(mi)
+    gc.collect()
+    with without_collection():
+        yield chosen.variant
 
 
 @pytest.fixture(autouse=True)

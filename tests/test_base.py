@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 
 from dnrpipe.blender.bundle.ply import weld, write_ply
-from dnrpipe.raytrace import plugins
 from dnrpipe.raytrace.base import CENTRES, MEANS, BaseRenderer
 from dnrpipe.raytrace.engine import Engine
 from dnrpipe.raytrace.lightmap import LightBaker
@@ -18,7 +16,6 @@ from dnrpipe.raytrace.lobes import diffuse_context
 from dnrpipe.raytrace.sensors import sensor_dict
 from dnrpipe.raytrace.surface_maps import SurfaceMapper
 from dnrpipe.raytrace.texels import grouped_meshes
-from dnrpipe.raytrace.variants import choose_variant
 from dnrtrain.contract import BASE_CHANNELS, View
 
 mi = pytest.importorskip("mitsuba")
@@ -26,13 +23,9 @@ SIZE = 48
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _variant() -> None:
-    chosen = choose_variant("auto")
-    if chosen.variant.startswith("scalar"):
+def _variant(mitsuba_variant: str) -> None:
+    if mitsuba_variant.startswith("scalar"):
         pytest.skip("base images need a jit variant of Mitsuba; this machine has none")
-    os.environ.update(chosen.environment)
-    mi.set_variant(chosen.variant)
-    plugins.register(mi)
 
 
 def rgb(*value: float) -> dict[str, Any]:

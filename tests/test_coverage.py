@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import numpy as np
 import pytest
 
-from dnrpipe.raytrace import plugins
-from dnrpipe.raytrace.variants import choose_variant
 from dnrpipe.raytrace.visibility import camera_integrator
 
 mi = pytest.importorskip("mitsuba")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _variant() -> None:
-    chosen = choose_variant("auto")
-    os.environ.update(chosen.environment)
-    mi.set_variant(chosen.variant)
-    plugins.register(mi)
+pytestmark = pytest.mark.usefixtures("mitsuba_variant")
 
 
 def rgb(*value: float) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import shutil
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
@@ -29,8 +28,6 @@ from dnrpipe.blender.bundle.shapes import closure  # noqa: E402
 from dnrpipe.blender.findings import Findings  # noqa: E402
 from dnrpipe.blender.geometry.freeze import freeze_scene  # noqa: E402
 from dnrpipe.blender.shading.textures import linear_to_srgb  # noqa: E402
-from dnrpipe.raytrace import plugins  # noqa: E402
-from dnrpipe.raytrace.variants import choose_variant  # noqa: E402
 from dnrpipe.raytrace.visibility import camera_integrator  # noqa: E402
 
 SIZE, SPP = 64, 256
@@ -202,11 +199,6 @@ def cycles(path: Path) -> np.ndarray:
 def mitsuba(folder: Path) -> np.ndarray:
     """The bundle's picture from the scene's camera, linear RGBA [SIZE, SIZE, 4]."""
     mi = pytest.importorskip("mitsuba")
-    if not mi.variant():
-        chosen = choose_variant("auto")
-        os.environ.update(chosen.environment)
-        mi.set_variant(chosen.variant)
-    plugins.register(mi)
     scene = mi.load_file(str(folder / "scene.xml"))
     camera = bpy.context.scene.camera
     pose = np.array(camera.matrix_world)
@@ -493,6 +485,7 @@ CASES: list[tuple[Callable[[], None], float, float]] = [
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("mitsuba_variant")
 @pytest.mark.parametrize(("build", "energy", "rmse"), CASES, ids=lambda v: getattr(v, "__name__", None))
 def test_matches_cycles(build: Callable[[], None], energy: float, rmse: float, tmp_path: Path) -> None:
     build()

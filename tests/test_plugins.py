@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import numpy as np
 import pytest
 
 from dnrpipe.raytrace import plugins
-from dnrpipe.raytrace.variants import choose_variant
 
 mi = pytest.importorskip("mitsuba")
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _variant() -> None:
-    chosen = choose_variant("auto")
-    os.environ.update(chosen.environment)
-    mi.set_variant(chosen.variant)
-    plugins.register(mi)
+def _variant(mitsuba_variant: str) -> None:
     plugins.register(mi)  # twice is harmless
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -123,6 +124,57 @@ def test_the_noise_estimate_is_the_error_of_the_mean() -> None:
     estimated = half_noise(*halves).rmse
     slope = 1.055 / 2.4 * 0.3 ** (1 / 2.4 - 1)
     assert estimated == pytest.approx(slope * 0.02 / np.sqrt(2), rel=0.03)
+
+
+def test_the_collector_does_not_free_a_scene_while_another_is_rendered() -> None:
+    """Dr.Jit ends the process when it does. Here the collector comes at the worst moment if it comes at all."""
+    code = """
+import gc
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+from dnrpipe.raytrace import plugins
+from dnrpipe.raytrace.engine import Engine
+from dnrpipe.raytrace.visibility import camera_integrator
+plugins.register(mi)
+
+tint = {"type": "rgb", "value": [0.2, 0.5, 0.8]}
+glass = {"type": "dnr_transparent", "transmittance": tint}
+Glass = type(mi.load_dict(glass))
+
+def collecting(method):
+    def call(*arguments):
+        if gc.isenabled():
+            gc.collect()
+        return method(*arguments)
+    return call
+
+for name in ("sample", "eval", "pdf", "eval_pdf", "eval_null_transmission"):
+    setattr(Glass, name, collecting(getattr(Glass, name)))
+engine = Engine.__new__(Engine)
+engine.mi = mi
+for number in range(6):
+    sheets = {
+        f"sheet{at}": {
+            "type": "rectangle", "bsdf": glass, "to_world": mi.ScalarTransform4f().translate([0, 0, 2 + at]).scale(9),
+        } for at in range(1 + number % 3)
+    }
+    scene = mi.load_dict({"type": "scene", "light": {"type": "constant"}, **sheets})
+    sensor = mi.load_dict({"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}})
+    integrator, _ = camera_integrator(mi, scene, 8, "path")
+    engine.render(scene, sensor=sensor, integrator=integrator, spp=4).numpy()
+    kept = [scene]
+    kept.append(kept)  # a cycle: only the collector frees it
+    del scene, kept
+assert gc.isenabled()
+print("rendered")
+"""
+    chosen = choose_variant("auto")
+    if not chosen.variant.startswith("llvm"):
+        pytest.skip(f"{chosen.variant}: about LLVM")
+    environment = {**os.environ, **chosen.environment}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert done.stdout.split() == ["rendered"], f"exit code {done.returncode}: {done.stderr[-500:]}"
 
 
 def test_an_unusable_variant_is_refused_and_llvm_15_is_not_tried() -> None:

@@ -61,7 +61,9 @@ def choose(workspace: Workspace, settings: Settings, capsys: pytest.CaptureFixtu
     return read_selection(workspace), capsys.readouterr().out
 
 
-@pytest.mark.parametrize("policy", ["auto", "coverage", "exchange", "kmedoids", "d-optimal", "dqn", "farthest", "random"])
+@pytest.mark.parametrize(
+    "policy", ["auto", "coverage", "exchange", "kmedoids", "d-optimal", "dqn", "farthest", "random"]
+)
 def test_a_choice_without_training(workspace: Workspace, capsys: pytest.CaptureFixture[str], policy: str) -> None:
     left = workspace.checkpoints("step1") / "model.json"
     left.parent.mkdir(parents=True)

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from conftest import Scene
 from dnrtrain.contract import ContractError
 from dnrtrain.dataset import ViewSet
-from dnrtrain.selector.exchange import second_look
 from dnrtrain.selector.demand import demand_of, service
+from dnrtrain.selector.exchange import second_look
 from dnrtrain.selector.protocol import Candidates
 from dnrtrain.selector.remaining import CellErrors, cell_errors, cells_of, residuals
 from dnrtrain.selector.sightings import collect, look_at

@@ -15,6 +15,7 @@ from dnrtrain.contract import View
 from . import paths, plugins
 from .auxiliary import auxiliary_integrator
 from .finite import masked
+from .recorded import without_collection
 from .sensors import sensor_dict
 from .units import scaled_lens, scaled_view, unit_scale
 from .visibility import camera_integrator
@@ -76,6 +77,11 @@ class Engine:
         view, lens = scaled_view(view, self.unit_scale), scaled_lens(lens, self.unit_scale)
         return self.mi.load_dict(sensor_dict(self.mi, view, lens))
 
+    def render(self, scene: Any, **options: Any) -> Any:
+        """``mi.render`` with no garbage collection meanwhile."""
+        with without_collection():
+            return self.mi.render(scene, **options)
+
     def auxiliary(self, bundle: Path, view: View, spp: int) -> tuple[np.ndarray, np.ndarray, int]:
         """(albedo, shading normal in world space), [H, W, 3] each, for the denoiser: see :mod:`.auxiliary`; and how
         many pixels of them were not finite and are 0."""
@@ -88,7 +94,7 @@ class Engine:
         chunk = max(1, min(spp, MAX_AUXILIARY // (view.width * view.height)))
         for launch, start in enumerate(range(0, spp, chunk)):
             samples = min(chunk, spp - start)
-            part = self.mi.render(scene, sensor=sensor, integrator=integrator, spp=samples, seed=launch)
+            part = self.render(scene, sensor=sensor, integrator=integrator, spp=samples, seed=launch)
             image = np.array(part, dtype=np.float32)[..., -6:]
             if samples < spp:
                 image *= samples / spp
@@ -106,12 +112,12 @@ class Engine:
         done = launch = 0
         while done < spp:
             samples = min(chunk, spp - done)
-            part = self.mi.render(
+            part = self.render(
                 self.scenes[str(bundle)],
                 sensor=sensor,
                 integrator=integrator,
                 spp=samples,
-                seed=((seed & 0xFFFFF) << 12) + launch,  # pyright: ignore[reportArgumentType]
+                seed=((seed & 0xFFFFF) << 12) + launch,
             )
             total += np.array(part, dtype=np.float64)[..., :4] * samples
             done += samples

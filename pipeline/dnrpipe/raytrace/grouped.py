@@ -54,12 +54,12 @@ class GroupedSensor:
         for start in range(0, GROUPS, self.together):
             for size in launch_sizes(samples, self.largest):
                 number = (seed << LAUNCH_BITS) + (first + launches) % (1 << LAUNCH_BITS)
-                part = self.engine.mi.render(
+                part = self.engine.render(
                     self.scene,
                     sensor=self.sensor,
                     integrator=integrator,
                     spp=size,
-                    seed=number,  # pyright: ignore[reportArgumentType]
+                    seed=number,
                 )
                 image = np.array(part, dtype=np.float64)[..., :4].reshape(self.height, self.together, self.width, 4)
                 result[start : start + self.together] += image.transpose(1, 0, 2, 3) * size

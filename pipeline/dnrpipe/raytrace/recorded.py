@@ -1,18 +1,31 @@
-"""``dr.freeze`` that Python's garbage collector does not disturb."""
+"""Rendering, and ``dr.freeze``, that Python's garbage collector does not disturb."""
 
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 
-class Recorded:
-    """A function of Dr.Jit arrays, recorded at its first call and replayed afterwards.
+@contextmanager
+def without_collection() -> Iterator[None]:
+    """No garbage collection within.
 
     Dr.Jit 1.x aborts the process, or reads freed memory, when the collector happens to free an older scene or kernel
-    while a function is being recorded. So there is no collection during a call.
+    while calls of plugins are being recorded, which `mi.render` does and a frozen function's first call.
     """
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collecting:
+            gc.enable()
+
+
+class Recorded:
+    """A function of Dr.Jit arrays, recorded at its first call and replayed afterwards."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         import drjit as dr
@@ -25,13 +38,8 @@ class Recorded:
         return self.frozen.n_recordings
 
     def __call__(self, *arguments: Any) -> Any:
-        collecting = gc.isenabled()
-        gc.disable()
-        try:
+        with without_collection():
             return self.frozen(*arguments)
-        finally:
-            if collecting:
-                gc.enable()
 
 
 def prepare_emitters(mi: Any, scene: Any) -> None:

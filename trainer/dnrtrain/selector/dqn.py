@@ -3,8 +3,8 @@
 One network values any view of any pool: it sees what a view would add now (:data:`.environment.FEATURES`), not which
 one it is, so its weights fit thousands of candidates and other scenes. It is trained where truth is cheap and exact, in
 :mod:`.surrogate`: reward of a view is the decrease of the error on *all* rasterised candidates, as a share of the error
-with no view, plus γ Φ(s') − Φ(s) of the ``exchange`` cost: potential shaping, which leaves the best policy as it is (Ng et
-al. 1999). Double Q-learning (van Hasselt et al. 2016), masked actions, replay, an averaged target network.
+with no view, plus γ Φ(s') − Φ(s) of the cost of ``exchange``: potential shaping, which leaves the best policy as it is
+(Ng et al. 1999). Double Q-learning (van Hasselt et al. 2016), masked actions, replay, an averaged target network.
 
 :mod:`.learned` makes a policy of it: single views are exchanged while the surrogate's error falls, and whatever the
 surrogate says is best is answered: learned, ``exchange`` (as it is, or with the same exchanges), ``kmedoids`` or
