@@ -75,9 +75,9 @@ def shared_assets() -> Path:
     return SHARED
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def mitsuba_variant() -> Iterator[str]:
-    """The best variant of Mitsuba, set in this process, with the plugins; the collector rests meanwhile.
+    """The best variant of Mitsuba, set in this process, with the plugins; the collector rests during the test.
 
     (Freeing another test's scene while plugins are being recorded kills the process: dnrpipe.raytrace.recorded.)
     """

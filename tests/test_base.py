@@ -22,7 +22,7 @@ mi = pytest.importorskip("mitsuba")
 SIZE = 48
 
 
-@pytest.fixture(scope="module", autouse=True)
+@pytest.fixture(autouse=True)
 def _variant(mitsuba_variant: str) -> None:
     if mitsuba_variant.startswith("scalar"):
         pytest.skip("base images need a jit variant of Mitsuba; this machine has none")

@@ -12,7 +12,7 @@ from dnrpipe.raytrace import plugins
 mi = pytest.importorskip("mitsuba")
 
 
-@pytest.fixture(scope="module", autouse=True)
+@pytest.fixture(autouse=True)
 def _variant(mitsuba_variant: str) -> None:
     plugins.register(mi)  # twice is harmless
 
