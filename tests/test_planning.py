@@ -12,9 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dnrpipe.errors import UserError
 from dnrpipe.planning.choose import Predictor, best_within, budgets, cheapest_reaching
-from dnrpipe.planning.command import parse_duration
 from dnrpipe.planning.quality import LEAST_SHARE, load_prior, predict, scene_gain, share
 from dnrpipe.planning.records import (
     BasePart,
@@ -230,17 +228,6 @@ def test_the_base_image_alone_is_enough_where_it_is_enough() -> None:
     assert found[0].name == "base image alone"
 
 
-@pytest.mark.parametrize(("text", "seconds"), [("90", 90), ("90s", 90), ("15m", 900), ("1.5h", 5400)])
-def test_durations(text: str, seconds: float) -> None:
-    assert parse_duration(text) == seconds
-
-
-@pytest.mark.parametrize("text", ["", "0", "-3m", "m", "soon", "nan", "1e30"])
-def test_what_is_no_duration_is_refused(text: str) -> None:
-    with pytest.raises(UserError, match="--time"):
-        parse_duration(text)
-
-
 SMALL: dict[str, Any] = {
     "cameras": {"train": 8, "val": 0, "test": 2, "width": 48, "height": 48},
     "passes": {"raster": "cycles-direct", "coverage_samples": 16, "bake_size": 64},
@@ -306,7 +293,12 @@ def _toml(values: dict[str, Any]) -> str:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"), [(["--apply"], "--time or --target-psnr"), (["--frames", "0"], "at least 1")]
+    ("arguments", "said"),
+    [
+        (["--apply"], "--time or --target-psnr"),
+        (["--frames", "0"], "at least 1"),
+        (["--time", "soon"], "--time soon: expected a time"),
+    ],
 )
 def test_bad_requests_are_refused_in_one_line(
     arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]

@@ -144,8 +144,8 @@ def tracing_overrides(noise: str | None, time: str | None, spp: int | None, deno
     raytrace: dict[str, Any] = {}
     if noise is not None or time is not None:
         raytrace = {
-            "noise": _amount("--noise", noise, parse_share),
-            "time": _amount("--time", time, parse_seconds),
+            "noise": amount("--noise", noise, parse_share),
+            "time": amount("--time", time, parse_seconds),
         }
         if spp is not None:
             if spp < SAMPLES_AT_ONCE:
@@ -160,7 +160,8 @@ def tracing_overrides(noise: str | None, time: str | None, spp: int | None, deno
     return {"raytrace": raytrace} if raytrace else {}
 
 
-def _amount(flag: str, text: str | None, parse: Callable[[str], float]) -> float | None:
+def amount(flag: str, text: str | None, parse: Callable[[str], float]) -> float | None:
+    """What ``parse`` reads; None stays None. Raises UserError that names the flag."""
     try:
         return None if text is None else parse(text)
     except ValueError as error:

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from ..errors import UserError
-from .options import CAMERA_OPTIONS, STRICT, camera_overrides, common, open_session, options, strict_override
+from .options import CAMERA_OPTIONS, STRICT, amount, camera_overrides, common, open_session, options, strict_override
 
 
 @click.command()
@@ -46,12 +46,13 @@ def plan(
         raise UserError(f"--frames {frames}: at least 1")
     if carry_out and duration is None and target_psnr is None:
         raise UserError("--apply: what shall be carried out? give --time or --target-psnr")
-    from ..planning.command import Wanted, apply, make_plan, parse_duration
+    from ..amounts import parse_seconds
+    from ..planning.command import Wanted, apply, make_plan
     from ..planning.pilot import pilot_path
     from ..planning.words import actual_lines, lines
     from ..tasks import worker_count
 
-    wanted = Wanted(parse_duration(duration) if duration else None, target_psnr, frames)
+    wanted = Wanted(amount("--time", duration, parse_seconds), target_psnr, frames)
     if scene is not None and (scene / "manifest.json").exists():
         options["workspace"], scene = str(scene), None
     overrides = {**camera_overrides(options), **strict_override(strict)}

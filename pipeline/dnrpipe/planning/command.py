@@ -42,19 +42,6 @@ class Wanted:
     frames: int | None = None
 
 
-def parse_duration(text: str) -> float:
-    """``90``, ``90s``, ``15m``, ``1.5h`` -> seconds. Raises UserError."""
-    units = {"s": 1.0, "m": 60.0, "h": 3600.0}
-    number, unit = (text[:-1], units[text[-1]]) if text[-1:] in units else (text, 1.0)
-    try:
-        seconds = float(number) * unit
-    except ValueError:
-        seconds = 0.0
-    if not 0 < seconds < 1e8:
-        raise UserError(f"--time {text}: expected a duration such as 90s, 15m or 1.5h")
-    return seconds
-
-
 def make_plan(workspace: Workspace, settings: Settings, console: Console, wanted: Wanted) -> dict[str, Any]:
     """Run the pilot where it is missing and write ``plan/plan.json`` -> its content.
 
