@@ -130,6 +130,16 @@ def load_state(folder: Path) -> Saved | None:
     return load(folder / STATE)
 
 
+def interrupted(folder: Path, key: str, notes: list[str]) -> Saved | None:
+    """The state that the run ``key`` was interrupted in, or None. A damaged one is no state; ``notes`` then says so."""
+    try:
+        saved = load_state(folder)
+    except DamagedFile as damage:
+        notes.append(f"{damage.path}: damaged; training starts afresh")
+        return None
+    return saved if saved is not None and saved.info.get("run") == key else None
+
+
 def require_state(folder: Path, key: str) -> Saved:
     """The state that the run ``key`` wrote last. Raises ContractError when it is gone, or another run's."""
     saved = load_state(folder)

@@ -24,7 +24,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from . import checkpoint
-from .contract import ContractError, DamagedFile
+from .contract import ContractError
 from .dataset import ViewSet
 from .events import Diverged, EpochEnd, Event, Note, Selected
 from .model import DNR
@@ -348,12 +348,8 @@ class _Step1:
 
     def _restore(self) -> int:
         """Load the state of an interrupted run of the same key; -> epochs done. Else start afresh."""
-        try:
-            saved = checkpoint.load_state(self.folder)
-        except DamagedFile as damage:
-            self.notes.append(f"{damage.path}: damaged; training starts afresh")
-            saved = None
-        if saved is None or saved.info.get("run") != self.key:
+        saved = checkpoint.interrupted(self.folder, self.key, self.notes)
+        if saved is None:
             self.dnr.use_bfloat16 = decide_bfloat16(self.settings.precision, self.device)
             self._save(0)
             return 0

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from . import checkpoint
-from .contract import ContractError, DamagedFile
+from .contract import ContractError
 from .dataset import DIHEDRAL_ORDER, Batch, ViewSet
 from .events import Diverged, EpochEnd, Event, Note
 from .losses import Step2Loss
@@ -241,12 +241,8 @@ class _Step2:
 
     def _restore(self) -> int:
         """Load the state of an interrupted run of the same key; -> epochs done. Else start afresh."""
-        try:
-            saved = checkpoint.load_state(self.folder)
-        except DamagedFile as damage:
-            self.notes.append(f"{damage.path}: damaged; training starts afresh")
-            saved = None
-        if saved is None or saved.info.get("run") != self.key:
+        saved = checkpoint.interrupted(self.folder, self.key, self.notes)
+        if saved is None:
             if self.settings.precision != "auto" or self.settings.start == "fresh":  # else as step 1 decided
                 self.dnr.use_bfloat16 = decide_bfloat16(self.settings.precision, self.device)
             self._save(0)
