@@ -10,6 +10,9 @@ Whether to train at all is asked for each scene at the PSNR of its best measured
 costs is read off the frontier: path tracing on its measured ladder, the base image where it is good enough, the
 cheapest measured neural point that is. The answer counts as right where the route it names costs at most 15 % more
 than the cheapest.
+
+What planning buys is asked at the price of each measured point of the preset's own views and samples: of the measured
+points that it expects to cost no more, the plan takes the one it expects to be best.
 """
 
 from __future__ import annotations
@@ -39,15 +42,20 @@ FRAMES = (200, 2000)
 NEAR = 1.15
 
 
-def opened(root: Path, scene: str, cells: Path) -> tuple[dict[str, Any], Predictor]:
-    """(what the frontier measured, what the plan predicts with). Raises UserError: no pilot, or no frontier."""
+def opened(root: Path, scene: str, cells: Path) -> tuple[dict[str, Any], Predictor, Choice]:
+    """(what the frontier measured, what the plan predicts with, the settings' own views and samples).
+
+    Raises UserError: no pilot, or no frontier.
+    """
     workspace = Workspace.open(root)
     pilot = read_pilot(workspace)
     if pilot is None:
         raise UserError(f"{root}: has no pilot; run `dnrpipe plan -w {root}`")
     results = read_frontier(root / "frontier" / "results.json")
     prior = without(read_cells(cells), scene, str(cells))
-    return results, make_predictor(workspace, resolve_settings(workspace, {}, None), pilot, prior)
+    settings = resolve_settings(workspace, {}, None)
+    default = Choice(views=settings.select.budget, spp=settings.raytrace.spp, epochs=0, steps=0)
+    return results, make_predictor(workspace, settings, pilot, prior), default
 
 
 def check(scene: str, results: dict[str, Any], predictor: Predictor) -> list[dict[str, Any]]:
@@ -123,6 +131,36 @@ def _expected(predictor: Predictor, results: dict[str, Any], wanted: float, fram
     return routes(predictor.pilot.frames, neural, light, scale, wanted, frames)
 
 
+def against_default(scene: str, results: dict[str, Any], predictor: Predictor, default: Choice) -> list[dict[str, Any]]:
+    """Per measured point of ``default``'s views and samples: what the plan takes at its price, measured of both."""
+    neural = [point for point in results["points"] if point["kind"] == "ours"]
+
+    def predicted(point: dict[str, Any]) -> tuple[float, float]:
+        choice = predictor.choice(point["views"], point["spp"], point["steps"])
+        costs = predictor.processor
+        seconds = costs.raytrace(choice.views, choice.spp) / results["cores"] + (
+            costs.finetune(choice.steps) / results["threads"]
+        )
+        return seconds, predictor.predict(choice).psnr.expected
+
+    found = []
+    for usual in neural:
+        if (usual["views"], usual["spp"]) != (default.views, default.spp):
+            continue
+        within = [point for point in neural if predicted(point)[0] <= predicted(usual)[0]]
+        taken = max(within, key=lambda point: predicted(point)[1])
+        found.append(
+            {
+                "scene": scene,
+                "default": usual["name"],
+                "taken": taken["name"],
+                "seconds": [round(point["upfront"] - point["parts"]["passes"], 1) for point in (usual, taken)],
+                "psnr": [round(point["psnr"], 2) for point in (usual, taken)],
+            }
+        )
+    return found
+
+
 def _actual(results: dict[str, Any], neural: list[dict[str, Any]], wanted: float, frames: int) -> dict[str, float]:
     """Seconds of each route that reaches ``wanted``, without the candidates' passes, which the plan takes as given."""
 
@@ -163,6 +201,8 @@ def markdown(record: dict[str, Any]) -> str:
     ]
     if record.get("routes"):
         lines += ["", *_routes_table(record["routes"])]
+    if record.get("default"):
+        lines += ["", *_default_table(record["default"])]
     return "\n".join(lines)
 
 
@@ -185,6 +225,19 @@ def _routes_table(found: list[dict[str, Any]]) -> list[str]:
     return [*lines, "", f"Right in {right} of {len(found)} cases."]
 
 
+def _default_table(found: list[dict[str, Any]]) -> list[str]:
+    lines = [
+        "| scene | the preset's views and samples | s | PSNR, dB | the plan takes | s | PSNR, dB |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for one in found:
+        (usual, taken), (before, after) = one["seconds"], one["psnr"]
+        points = f"{one['default']} | {usual:.0f} | {before:.2f} | {one['taken']} | {taken:.0f} | {after:.2f}"
+        lines.append(f"| {one['scene']} | {points} |")
+    won = statistics.mean(one["psnr"][1] - one["psnr"][0] for one in found)
+    return [*lines, "", f"On average {won:+.2f} dB."]
+
+
 def main() -> int:
     """Exit code 2 where a workspace cannot be checked."""
     parser = argparse.ArgumentParser(prog="python -m tools.plan_check", description=__doc__)
@@ -194,14 +247,16 @@ def main() -> int:
     options = parser.parse_args()
     rows: list[dict[str, Any]] = []
     asked: list[dict[str, Any]] = []
+    usual: list[dict[str, Any]] = []
     try:
         for text in options.workspaces:
             scene, _, root = text.rpartition("=")
             path = Path(root)
             name = scene or path.name.removesuffix(".dnr")
-            results, predictor = opened(path, name, options.cells)
+            results, predictor, default = opened(path, name, options.cells)
             rows += check(name, results, predictor)
             asked += routes_of(name, results, predictor)
+            usual += against_default(name, results, predictor, default)
     except UserError as error:
         print(error, file=sys.stderr)
         return 2
@@ -210,6 +265,7 @@ def main() -> int:
         "command": "python -m tools.plan_check " + " ".join(sys.argv[1:]),
         "rows": rows,
         "routes": asked,
+        "default": usual,
     }
     if options.out:
         write_json(options.out, record)
