@@ -25,7 +25,7 @@ from dnrpipe.selectbench.intervals import half_width, summarise, t_distribution,
 from dnrpipe.selectbench.policies import CONTENDERS, GROUPS, SIMPLE, choose_policies, settings_of
 from dnrpipe.selectbench.pools import POOLS, choose_pools, write_rig
 from dnrpipe.selectbench.rigs import inside, surface_points, walk, winding
-from dnrpipe.selectbench.tables import difference, markdown
+from dnrpipe.selectbench.tables import difference, markdown, together
 from dnrpipe.settings import CameraSettings, resolve
 from dnrtrain.contract import View
 from dnrtrain.selector.names import NAMES, TRAINED_NAMES
@@ -237,6 +237,17 @@ def test_every_pool_has_its_own_rival_and_differences_are_paired() -> None:
     assert "| 29.12 ± 0.18 |" in line and "| **+4.12 [+2.54, +5.71]** |" in line and "| +1.00 (a) |" in line
     assert "| 1.50 | 32 |" in line  # selection and total seconds
     assert "bench-select" in text and "commit abc" in text and "Student's t over scenes" in text
+
+
+def test_runs_on_several_scenes_make_one_table() -> None:
+    def run(scene: str, gains: dict[str, float]) -> dict[str, Any]:
+        pairs = ((pool, policy, gain) for pool in ("dome", "path") for policy, gain in gains.items())
+        return results({(scene, pool, 10, policy, 0): 20.0 + gain for pool, policy, gain in pairs})
+
+    runs = [run("a", {"random": 0, "farthest": 1, "auto": 2}), run("b", {"random": 0, "farthest": 1})]
+    text = together([*runs, runs[1]])  # a cell in two runs counts once
+    assert "| `farthest` | **+1.00 [+1.00, +1.00]** |" in text and "`auto`" not in text
+    assert "| a | 20.00 | 21.00 |" in text and text.count("| b | 20.00 | 21.00 |") == 2
 
 
 def test_one_scene_in_several_pools_is_still_one_unit_per_seed() -> None:

@@ -2,7 +2,8 @@
 
 A part stands between ``<!-- rows -->`` or ``<!-- KIND FILE -->``, FILE in docs/, and ``<!-- end -->``.
 Kinds: results (of `dnrpipe ablate`), frames (of tools.bench_frames), noise (of tools.bench_noise),
-frontier (of `dnrpipe frontier`), plan-check (of tools.plan_check), selection (of `dnrpipe bench-select`).
+frontier (of `dnrpipe frontier`), plan-check (of tools.plan_check), selection (of `dnrpipe bench-select`),
+selections (of several of its runs together: FILE,FILE).
 
 python -m tools.result_tables [--check] docs/ablation.md docs/*.md
 """
@@ -25,8 +26,9 @@ from dnrpipe.frontier.command import read_frontier
 from dnrpipe.frontier.words import markdown as frontier_markdown
 from dnrpipe.selectbench.results import read_results as selection_results
 from dnrpipe.selectbench.tables import markdown as selection_markdown
+from dnrpipe.selectbench.tables import together as selections_markdown
 
-KINDS = "rows|results|frames|noise|frontier|plan-check|selection"
+KINDS = "rows|results|frames|noise|frontier|plan-check|selections?"
 PART = re.compile(rf"(<!-- ({KINDS})(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -53,6 +55,9 @@ def generate(text: str, folder: Path) -> str:
             body = lowered(frontier_markdown(read_frontier(folder / match[3])))
         elif match[2] == "selection":
             body = lowered(selection_markdown(selection_results(folder / match[3]), pictures=False))
+        elif match[2] == "selections":
+            runs = [selection_results(folder / name) for name in match[3].split(",")]
+            body = lowered(selections_markdown(runs))
         elif match[2] == "plan-check":
             body = check_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
         else:

@@ -1,4 +1,7 @@
-"""The report of a benchmark from its ``results.json``: ``python -m dnrpipe.selectbench.tables results.json``."""
+"""The report of a benchmark from its ``results.json``: ``python -m dnrpipe.selectbench.tables results.json``.
+
+With several files, runs on other scenes with the same pools, one table of all of them.
+"""
 
 from __future__ import annotations
 
@@ -30,6 +33,25 @@ def markdown(results: Mapping[str, Any], *, pictures: bool = True) -> str:
         parts.append(f"## Pool `{pool}`: {POOLS[pool]}")
         for budget in figures.budgets:
             parts += [_pool(figures, pool, budget), _per_scene(figures, pool, budget)]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def together(runs: Sequence[Mapping[str, Any]]) -> str:
+    """Differences over the scenes of several runs: the policies that all have. A cell in two runs counts once.
+
+    Differences are paired within a scene, so runs may differ in machine, number of candidates and samples.
+    """
+    shared = set.intersection(*({cell["policy"] for cell in run["cells"]} for run in runs))
+    names = ("scene", "pool", "budget", "policy", "seed")
+    cells = {
+        tuple(cell[name] for name in names): cell for run in runs for cell in run["cells"] if cell["policy"] in shared
+    }
+    scenes = list(dict.fromkeys(scene for run in runs for scene in run["scenes"]))
+    figures = Figures({"cells": list(cells.values()), "scenes": scenes})
+    parts = [f"# {len(runs)} runs together", _how(figures)]
+    for budget in figures.budgets:
+        parts.append(_overall(figures, budget))
+        parts += [_per_scene(figures, pool, budget) for pool in figures.pools]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
@@ -119,17 +141,17 @@ def _per_scene(figures: Figures, pool: str, budget: int) -> str:
         return ""
     rows = []
     for scene in figures.scenes:
-        line = [scene]
-        for policy in present:
-            values = figures.values(pool, budget, policy, "psnr")
-            line.append(spread([value for place, value in values.items() if place[0] == scene], 2))
-        rows.append(line)
+        found = [figures.values(pool, budget, policy, "psnr") for policy in present]
+        ours = [[value for place, value in values.items() if place[0] == scene] for values in found]
+        if any(ours):
+            rows.append([scene, *[spread(values, 2) for values in ours]])
     return f"PSNR by scene, `{pool}`, {budget} views:\n\n{table(['scene', *[f'`{p}`' for p in present]], rows)}"
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Print the report of a results file."""
-    print(markdown(read_results(Path(arguments[0])), pictures=False), end="")
+    """Print the report of a results file, or of several together."""
+    runs = [read_results(Path(argument)) for argument in arguments]
+    print(together(runs) if len(runs) > 1 else markdown(runs[0], pictures=False), end="")
     return 0
 
 
