@@ -9,6 +9,7 @@ import pytest
 import torch
 from test_losses import random_weights
 
+from dnrtrain import perceptual
 from dnrtrain.metrics import image_metrics, psnr, psnr_masked, ssim, ssim_map, ssim_masked
 from dnrtrain.perceptual import Lpips, build_lpips
 from dnrtrain.weights import WeightsMissing, load_weights
@@ -99,6 +100,23 @@ def test_lpips_mechanics(network: str) -> None:
     assert black.grad is not None and torch.isfinite(black.grad).all()
     with pytest.raises(ValueError, match="at least"):
         lpips(a[..., :8, :8], b[..., :8, :8])
+
+
+@pytest.mark.parametrize("network", ["vgg", "alex"])
+@pytest.mark.parametrize("size", [(300, 40), (257, 33), (385, 31), (512, 48), (643, 37)])
+def test_lpips_in_bands_is_lpips(network: str, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    lpips = Lpips(network, random_weights(network)).double()  # type: ignore[arg-type]
+    generator = torch.Generator().manual_seed(0)
+    a, b = (torch.rand(2, 3, *size, generator=generator, dtype=torch.float64) for _ in range(2))
+    with torch.no_grad():
+        whole = lpips(a, b)
+        monkeypatch.setattr(perceptual, "AT_ONCE", 1)
+        seen = []
+        maps = lpips._maps
+        monkeypatch.setattr(lpips, "_maps", lambda x, y: seen.append(x.shape[-2]) or maps(x, y))
+        banded = lpips(a, b)
+    assert banded.shape == (2,) and torch.allclose(banded, whole, rtol=1e-9)
+    assert (len(seen) > 1) == (size[0] > 256) and max(seen) <= 384
 
 
 def test_lpips_reproduces_the_documented_value() -> None:

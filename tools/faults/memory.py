@@ -2,8 +2,8 @@
 
 python -m tools.faults.memory [--side 4096] [--passes 2000] [--candidates 10000] [--only view|passes|selection]
 
-    view       one view of side² pixels: passes, selection, ray tracing at one sample per pixel with and without the
-               denoiser, base image, and an epoch of fine-tuning on squares of it; one worker
+    view       one training and one test view of side² pixels: passes, selection, ray tracing at one sample per pixel
+               with and without the denoiser, base image, an epoch of fine-tuning on squares, evaluation; one worker
     passes     so many candidates of 16² pixels through `dnrpipe prepare`
     selection  so many candidates whose pass files are written here, without Blender: read, chosen from by every rule
                that needs no training, and read as step 1 reads them
@@ -39,6 +39,7 @@ BOUNDS = {
     "ray tracing and base image": 8.0,
     "ray tracing with the denoiser": 12.0,
     "an epoch of fine-tuning": 8.0,
+    "evaluation of one view": 20.0,
     "passes of many candidates": 4.0,
     "selection": 2.0,
     "reading as step 1 does": 2.0,
@@ -124,9 +125,10 @@ def large_view(folder: Path, side: int, timeout: float) -> list[Reading]:
     """One view of ``side``² pixels through passes, ray tracing and fine-tuning."""
     workspace = folder / "large.dnr"
     given = settings(
-        CAMERAS__TRAIN=1, CAMERAS__VAL=0, CAMERAS__TEST=0, CAMERAS__WIDTH=side, CAMERAS__HEIGHT=side,
+        CAMERAS__TRAIN=1, CAMERAS__VAL=0, CAMERAS__TEST=1, CAMERAS__WIDTH=side, CAMERAS__HEIGHT=side,
         PASSES__WORKERS=1, PASSES__COVERAGE_SAMPLES=4, PASSES__RASTER="cycles-direct", PASSES__RASTER_SAMPLES=1,
-        SELECT__BUDGET=1, RAYTRACE__SPP=1, RAYTRACE__WORKERS=1, RAYTRACE__MAX_DEPTH=4, RAYTRACE__DENOISE="false",
+        SELECT__BUDGET=1, RAYTRACE__SPP=1, RAYTRACE__EVALUATION_SPP=1, RAYTRACE__WORKERS=1,
+        RAYTRACE__MAX_DEPTH=4, RAYTRACE__DENOISE="false",
         BASE__LIGHT_SIZE=256, BASE__LIGHT_SPP=16, FINETUNE__STEP2__EPOCHS=1, FINETUNE__STEP2__PATCH=256,
     )  # fmt: skip
     steps = [
@@ -135,6 +137,7 @@ def large_view(folder: Path, side: int, timeout: float) -> list[Reading]:
         ("ray tracing and base image", pipeline("raytrace-selected", workspace)),
         ("ray tracing with the denoiser", own_step("ray tracing with the denoiser", workspace)),
         ("an epoch of fine-tuning", pipeline("finetune", workspace)),
+        ("evaluation of one view", pipeline("evaluate", workspace)),
     ]
     readings: list[Reading] = []
     for name, command in steps:

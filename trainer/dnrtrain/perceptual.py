@@ -6,7 +6,7 @@ Krizhevsky 2014), defined here: torchvision is no dependency. Weights come from 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Literal
 
 import torch
@@ -32,6 +32,12 @@ LAYOUT = {"vgg": VGG16, "alex": ALEXNET}
 TAPS = {"vgg": (1, 3, 6, 9, 12), "alex": (0, 1, 2, 3, 4)}
 """Convolutions whose ReLU output LPIPS compares (VGG: relu1_2, 2_2, 3_3, 4_3, 5_3)."""
 POOL = {"vgg": 2, "alex": 3}  # window; the stride is 2 in both
+STRIDES = {"vgg": (1, 2, 4, 8, 16), "alex": (4, 8, 16, 16, 16)}
+"""Input pixels from one pixel of a tap to the next."""
+REACH = 128
+"""No tap sees further than this from its place (98 pixels at most); a multiple of all strides."""
+AT_ONCE = 1 << 20
+"""Pixels whose features are held at one time where no gradient is wanted."""
 MINIMUM_SIDE = {"vgg": 16, "alex": 31}
 """Smallest image side for which the last tap still has a pixel."""
 
@@ -114,6 +120,9 @@ class Features(nn.Module):
 class Lpips(nn.Module):
     """LPIPS v0.1 (Zhang et al. 2018): weighted distance of unit-normalised features.
 
+    Without gradients, pictures larger than ``AT_ONCE`` are looked at in bands that overlap by what a tap can see: the
+    same value in bounded memory.
+
     Inputs in [0, 1] (converted to [-1, 1] here). The epsilon of the norm stands inside the square root:
     outside, its gradient at an all-zero feature is NaN.
     """
@@ -121,6 +130,7 @@ class Lpips(nn.Module):
     def __init__(self, network: Network, weights: Mapping[str, Tensor]) -> None:
         super().__init__()
         self.minimum_side = MINIMUM_SIDE[network]
+        self.strides = STRIDES[network]
         self.features = Features(network, weights)
         for index in range(len(TAPS[network])):
             self.register_buffer(f"head{index}", weights[f"head.{index}"].clone())
@@ -129,13 +139,27 @@ class Lpips(nn.Module):
         """[N, 3, H, W] twice -> distance [N]. Raises ValueError for images below ``minimum_side``."""
         if min(prediction.shape[-2:]) < self.minimum_side:
             raise ValueError(f"LPIPS needs images of at least {self.minimum_side} pixels a side")
-        total = prediction.new_zeros(prediction.shape[0])
+        height, width = prediction.shape[-2:]
+        rows = max(REACH, AT_ONCE // width // REACH * REACH)
+        if height <= rows + REACH or (torch.is_grad_enabled() and (prediction.requires_grad or target.requires_grad)):
+            return sum((part.mean(dim=(1, 2)) for part in self._maps(prediction, target)), prediction.new_zeros(1))
+        sums, counts = [prediction.new_zeros(prediction.shape[0]) for _ in self.strides], [0] * len(self.strides)
+        for start in range(0, height, rows):
+            first, end = max(0, start - REACH), start + rows
+            band = slice(first, end + REACH)
+            parts = self._maps(prediction[..., band, :], target[..., band, :])
+            for index, (part, stride) in enumerate(zip(parts, self.strides, strict=True)):
+                own = part[:, (start - first) // stride : None if end >= height else (end - first) // stride]
+                sums[index] = sums[index] + own.sum(dim=(1, 2))
+                counts[index] += own.shape[1] * own.shape[2]
+        return sum((total / count for total, count in zip(sums, counts, strict=True)), prediction.new_zeros(1))
+
+    def _maps(self, prediction: Tensor, target: Tensor) -> Iterator[Tensor]:
+        """[N, 3, H, W] twice -> per tap the weighted distance at each of its pixels, [N, h, w]."""
         pairs = zip(self.features(prediction), self.features(target), strict=True)
         for index, (a, b) in enumerate(pairs):
             difference = (_unit(a) - _unit(b)).square()
-            weighted = (difference * getattr(self, f"head{index}")).sum(dim=1)
-            total = total + weighted.mean(dim=(1, 2))
-        return total
+            yield (difference * getattr(self, f"head{index}")).sum(dim=1)
 
 
 class PerceptualLoss(nn.Module):
