@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from dnrtrain.preview import Preview
 
 SIDE = 512
+LARGEST = 1 << 21
+"""Pixels. Training goes by squares of a view; a picture shows the whole, which would take more memory than that."""
 
 
 def shown_view(workspace: Workspace, settings: Settings) -> View | None:
@@ -57,6 +59,9 @@ class LivePicture:
             return
         if importlib.util.find_spec("PIL") is None:
             console.say("no pictures while it trains: they need Pillow (pip install 'dnrpipe[render]')")
+            return
+        if training.size[0] * training.size[1] > LARGEST:
+            console.say(f"no pictures while it trains: views have more than {LARGEST / 1e6:.1f} megapixels")
             return
         from dnrtrain.preview import Preview
 

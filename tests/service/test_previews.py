@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -127,3 +128,17 @@ def test_what_is_not_a_picture(server: Server) -> None:
     (folder / "truth.png").symlink_to("/etc/hostname")
     assert httpx.get(f"{server.url}/workspaces/odd/preview/truth").status_code == 404
     assert httpx.get(f"{server.url}/workspaces/odd/preview/flip").status_code == 422
+
+
+def test_large_views_are_not_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Training goes by squares of them; the whole of one would want several times the memory."""
+    from dnrpipe.console import Console
+    from dnrpipe.previews import LivePicture
+    from dnrpipe.settings import resolve
+    from dnrpipe.workspace import Workspace
+
+    large: Any = SimpleNamespace(size=(2048, 2048))
+    empty_workspace(tmp_path, "large")
+    workspace, settings = Workspace.open(tmp_path / "large.dnr"), resolve("draft", {}, environment={})
+    picture = LivePicture(workspace, settings, Console(), "run", large)
+    assert picture.preview is None and "more than 2.1 megapixels" in capsys.readouterr().out
