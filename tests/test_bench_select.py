@@ -219,20 +219,20 @@ def test_every_pool_has_its_own_rival_and_differences_are_paired() -> None:
     values = {}
     for scene, offset in (("a", 20.0), ("b", 30.0)):
         for seed in range(2):
-            for policy, dome, path in (("random", 0, 0), ("farthest", 1, 2), ("kmedoids", 3, 1), ("auto", 4, 4)):
-                extra = 0.5 if (policy, scene, seed) == ("auto", "b", 1) else 0.0
+            for policy, dome, path in (("random", 0, 0), ("farthest", 1, 2), ("kmedoids", 3, 1), ("exchange", 4, 4)):
+                extra = 0.5 if (policy, scene, seed) == ("exchange", "b", 1) else 0.0
                 values[scene, "dome", 10, policy, seed] = offset + dome + extra
                 values[scene, "path", 10, policy, seed] = offset + path + extra
     figures = Figures(results(values))
     assert figures.best_simple("dome", 10) == "kmedoids" and figures.best_simple("path", 10) == "farthest"
-    found = figures.against("auto", "simple", ["dome", "path"], 10, "psnr")
+    found = figures.against("exchange", "simple", ["dome", "path"], 10, "psnr")
     assert found is not None and found.scenes == {"a": 1.5, "b": 1.75} and found.mean == 1.625
     own = figures.against("kmedoids", "simple", ["dome", "path"], 10, "psnr")
     assert own is not None and own.mean == -0.5  # 0 where it is itself the best
     assert figures.against("kmedoids", "simple", ["dome"], 10, "psnr") is None
-    assert figures.means("dome", 10, "auto", "psnr") == [29.0, 29.25]
+    assert figures.means("dome", 10, "exchange", "psnr") == [29.0, 29.25]
     text = markdown(results(values))
-    line = next(line for line in text.split("### `dome`, 10 views")[1].splitlines() if "`auto`" in line)
+    line = next(line for line in text.split("### `dome`, 10 views")[1].splitlines() if "`exchange`" in line)
     # Scenes differ by 0.25 / 2 from the mean: 12.706 · 0.125.
     assert "| 29.12 ± 0.18 |" in line and "| **+4.12 [+2.54, +5.71]** |" in line and "| +1.00 (a) |" in line
     assert "| 1.50 | 32 |" in line  # selection and total seconds
@@ -244,9 +244,9 @@ def test_runs_on_several_scenes_make_one_table() -> None:
         pairs = ((pool, policy, gain) for pool in ("dome", "path") for policy, gain in gains.items())
         return results({(scene, pool, 10, policy, 0): 20.0 + gain for pool, policy, gain in pairs})
 
-    runs = [run("a", {"random": 0, "farthest": 1, "auto": 2}), run("b", {"random": 0, "farthest": 1})]
+    runs = [run("a", {"random": 0, "farthest": 1, "exchange": 2}), run("b", {"random": 0, "farthest": 1})]
     text = together([*runs, runs[1]])  # a cell in two runs counts once
-    assert "| `farthest` | **+1.00 [+1.00, +1.00]** |" in text and "`auto`" not in text
+    assert "| `farthest` | **+1.00 [+1.00, +1.00]** |" in text and "`exchange`" not in text
     assert "| a | 20.00 | 21.00 |" in text and text.count("| b | 20.00 | 21.00 |") == 2
 
 

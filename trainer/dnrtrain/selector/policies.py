@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from ..contract import ContractError
-from .auto import AutoPolicy
 from .baselines import FarthestPolicy, RandomPolicy
 from .coverage import CoveragePolicy
 from .doptimal import DOptimalPolicy
@@ -14,7 +13,7 @@ from .names import NAMES, full_name
 from .protocol import Policy
 
 UNTRAINED: dict[str, Policy] = {
-    "auto": AutoPolicy(),
+    "auto": ExchangePolicy(),  # of the rules, the one that measures best (docs/bench-select.md)
     "coverage": CoveragePolicy(),
     "exchange": ExchangePolicy(),
     "kmedoids": KMedoidsPolicy(),
