@@ -50,7 +50,7 @@ _CONTENDERS = (
     Contender("d-optimal", "greedy D-optimal design of the neural texture", "d-optimal"),
     Contender("exchange", "k-medoids, then swaps that count what is seen, too", "exchange"),
     Contender(
-        "auto-2", "exchange in two rounds: half is traced, the rest goes where it shows errors", "auto", rounds=2
+        "auto-2", "exchange in two rounds: half is traced, the rest goes where that errs", "auto", rounds=2
     ),
     Contender("dqn", "learned on a surrogate of texture training, other scenes; never worse by it than rules", "dqn"),
     Contender("fisher", "Fisher information of the coarse renderer, redundancy controlled", "fisher", rule=False),
