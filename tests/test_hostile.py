@@ -9,6 +9,7 @@ import struct
 import subprocess
 import sys
 import threading
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from dnrpipe.settings import CameraSettings
 from dnrpipe.stages import owner_of
 from dnrpipe.training import read_selection
 from dnrpipe.workspace import Manifest, Source, Workspace
-from dnrtrain.contract import DamagedFile, SceneFrame, View, file_name, parse_transforms, write_cameras
+from dnrtrain.contract import ContractError, DamagedFile, SceneFrame, View, file_name, parse_transforms, write_cameras
 from dnrtrain.display import DisplayTransform
 from dnrtrain.exr import read_exr, write_exr
 
@@ -48,6 +49,26 @@ def test_the_fuzz_can_fail(tmp_path: Path) -> None:
 
     careless = Target("a.json", b'{"views": ["a"]}', lambda path: json.loads(path.read_text())["views"][0], text=True)
     assert fuzz("careless", careless, tmp_path, 50, 0)["escaped"] > 10
+
+
+@pytest.mark.parametrize("header", [b"no array at all", b"\x93NUMPY\x01\x00\x10\x00{'descr': (\x00,\n     "])
+def test_archives_whose_arrays_have_no_header(tmp_path: Path, header: bytes) -> None:
+    """numpy then gives bytes, or the errors of Python's parser."""
+    from dnrpipe.blender.geometry.frozen import load_geometry
+    from dnrpipe.raytrace.light_worker import read_light
+
+    for name, read in (("header", load_geometry), ("light", read_light)):
+        path = tmp_path / f"{name}.npz"
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr(f"{name}.npy", header)
+        with pytest.raises(UserError, match=path.name) as refused:
+            read(path)
+        assert "\n" not in str(refused.value)
+
+
+def test_an_error_is_one_line_whatever_it_quotes() -> None:
+    assert str(UserError("unknown preset 'a\nb'")) == "unknown preset 'a b'"
+    assert str(ContractError("view 'a\r\nb'")) == "view 'a b'"
 
 
 @pytest.mark.parametrize("side", [65536, 99999, 2**31 - 1])

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 
 class UserError(Exception):
-    """Bad input. The message says what is wrong, where, and what to do."""
+    """Bad input. The message says what is wrong, where, and what to do, in one line whatever it quotes."""
+
+    def __str__(self) -> str:
+        return " ".join(super().__str__().splitlines())
 
 
 class NothingVisible(UserError):

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import functools
 import itertools
 import json
 import os
@@ -56,6 +57,7 @@ COMMANDS = {
 HANG_SECONDS = 60
 """After which a worker counts as hung here; a healthy task takes a few, a busy machine some more."""
 PAGE = 4096
+UNSAID = "nothing was said of it"
 CLOCK = """
 import os, time
 _real, _calls = time.time, [0]
@@ -180,7 +182,9 @@ def worker_struck(bench: Bench, folder: Path, stage: str, kind: str, strike: Cal
                 struck = True
     errors = bench.finish(process, result)
     if not struck or "once more" not in errors:
-        result.problems.append("no worker was there to be struck" if not struck else f"not said: {errors[-200:]}")
+        said = errors.strip()[-200:]
+        missed = f"not said: {said}" if said else UNSAID
+        result.problems.append(missed if struck else "no worker was there to be struck")
     if "SIGSTOP" in kind and struck and "worker hung for" not in errors:
         result.problems.append(f"not called a hang: {errors[-200:]}")
     bench.complete(copy, stage, result)
@@ -199,13 +203,21 @@ def worker_hangs(bench: Bench, folder: Path, stage: str) -> Result:
 
 
 def worker_starves(bench: Bench, folder: Path, stage: str, dice: random.Random) -> Result:
-    """A worker process gets no further memory, from some moment on: whatever it asks for is refused."""
+    """A worker process gets no further memory, from some moment on: whatever it asks for is refused.
 
-    def starve(pid: int) -> None:
-        time.sleep(dice.uniform(0.0, 3.0))
+    One that asks for none any more is not struck: then a new run is, from its beginning on.
+    """
+
+    def starve(wait: float, pid: int) -> None:
+        time.sleep(wait)
         resource.prlimit(pid, resource.RLIMIT_AS, (PAGE, PAGE))
 
-    return worker_struck(bench, folder, stage, "worker out of memory (RLIMIT_AS)", starve)
+    result = Result("worker out of memory (RLIMIT_AS)", stage)
+    for wait in (dice.uniform(0.0, 3.0), 0.0):
+        result = worker_struck(bench, folder, stage, result.kind, functools.partial(starve, wait))
+        if result.problems != [UNSAID]:
+            break
+    return result
 
 
 def _workers(parent: int) -> list[int]:

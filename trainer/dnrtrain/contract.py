@@ -36,6 +36,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterable, Sequence
@@ -85,12 +86,17 @@ Split = Literal["train", "val", "test", "novel"]
 NPZ_ERRORS = (
     *(OSError, ValueError, KeyError, TypeError, EOFError, MemoryError, RuntimeError),
     *(zipfile.BadZipFile, zlib.error),
+    *(SyntaxError, tokenize.TokenError, AttributeError),
 )
-"""What reading a damaged npz file may raise: numpy passes zip's and deflate's own errors through."""
+"""What reading a damaged npz file may raise: numpy passes zip's and deflate's own errors through, and those of Python's
+parser on an array's header; an array without one is bytes, which lack an array's methods."""
 
 
 class ContractError(ValueError):
-    """Input that breaks the data contract; the message names what, where and what to do."""
+    """Input that breaks the data contract; the message names what, where and what to do, in one line."""
+
+    def __str__(self) -> str:
+        return " ".join(super().__str__().splitlines())
 
 
 class DamagedFile(ContractError):
