@@ -215,7 +215,7 @@ def test_a_choice_beside_a_coarse_model_is_made_once(
 ) -> None:
     """Step 1 trains with the views that were chosen in rounds, and its record names them."""
     import dnrpipe.selection
-    from dnrtrain.selector.exchange import ExchangePolicy
+    from dnrtrain.selector.auto import AutoPolicy
 
     workspace.scene.mkdir(parents=True)
     (workspace.scene / "frame.json").write_text(synthetic.FRAME.model_dump_json())
@@ -229,13 +229,13 @@ def test_a_choice_beside_a_coarse_model_is_made_once(
     monkeypatch.setattr(dnrpipe.selection, "trace_round", trace_by_hand(workspace, traced))
     monkeypatch.setattr(dnrpipe.selection, "plan_of", lambda *_: SimpleNamespace(model=lambda settings: settings))
     asked: list[int] = []
-    first_look = ExchangePolicy.choose
+    first_look = AutoPolicy.choose
 
-    def choose_auto(self: ExchangePolicy, candidates: Any, budget: int, *rest: Any) -> Any:
+    def choose_auto(self: AutoPolicy, candidates: Any, budget: int, *rest: Any) -> Any:
         asked.append(budget)
         return first_look(self, candidates, budget, *rest)
 
-    monkeypatch.setattr(ExchangePolicy, "choose", choose_auto)
+    monkeypatch.setattr(AutoPolicy, "choose", choose_auto)
     select = {"budget": 5, "policy": "auto", "rounds": 2, "step1": {"epochs": 1}}
     small = {"texture_size": 16, "width": 4, "depth": 1, "stride": 1}
     settings = resolve(

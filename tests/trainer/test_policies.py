@@ -235,7 +235,7 @@ def test_coverage_prefers_new_sides_to_more_of_the_same() -> None:
 
 
 def test_auto_is_the_rule_that_measured_best(pool: Candidates) -> None:
-    assert UNTRAINED["auto"].choose(pool, 4, 0) == UNTRAINED["exchange"].choose(pool, 4, 0)
+    assert UNTRAINED["auto"].choose(pool, 4, 0) == UNTRAINED["coverage"].choose(pool, 4, 0)
 
 
 def test_exchange_lowers_both_costs_together(pool: Candidates) -> None:

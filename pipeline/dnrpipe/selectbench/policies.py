@@ -49,7 +49,7 @@ _CONTENDERS = (
     Contender("coverage", "greedy coverage: surface x view direction x resolution", "coverage"),
     Contender("d-optimal", "greedy D-optimal design of the neural texture", "d-optimal"),
     Contender("exchange", "k-medoids, then swaps that count what is seen, too", "exchange"),
-    Contender("auto-2", "exchange in two rounds: half is traced, the rest goes where that errs", "auto", rounds=2),
+    Contender("auto-2", "coverage, traced, then exchange where that shows errors", "auto", rounds=2),
     Contender("dqn", "learned on a surrogate of texture training, other scenes; never worse by it than rules", "dqn"),
     Contender("fisher", "Fisher information of the coarse renderer, redundancy controlled", "fisher", rule=False),
     Contender("ensemble", "active: where coarse renderers of the views so far disagree", "ensemble", rule=False),
@@ -66,7 +66,7 @@ SIMPLE = ("farthest", "kmedoids", "coverage")
 GROUPS: dict[str, tuple[str, ...]] = {
     "core": tuple(c.name for c in _CONTENDERS if c.rule and c.rounds == 1),
     "simple": ("random", *SIMPLE),
-    "auto": ("exchange",),  # what the default is
+    "auto": ("coverage",),  # what the default is
     "rewards": tuple(c.name for c in _CONTENDERS if c.policy == LEARNED),
     "all": tuple(CONTENDERS),
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ..contract import ContractError
+from .auto import AutoPolicy
 from .baselines import FarthestPolicy, RandomPolicy
 from .coverage import CoveragePolicy
 from .doptimal import DOptimalPolicy
@@ -13,7 +14,7 @@ from .names import NAMES, full_name
 from .protocol import Policy
 
 UNTRAINED: dict[str, Policy] = {
-    "auto": ExchangePolicy(),  # of the rules, the one that measures best (docs/bench-select.md)
+    "auto": AutoPolicy(),
     "coverage": CoveragePolicy(),
     "exchange": ExchangePolicy(),
     "kmedoids": KMedoidsPolicy(),
