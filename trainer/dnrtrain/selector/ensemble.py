@@ -22,7 +22,7 @@ from ..aggregator import Inside
 from ..dataset import ViewSet
 from ..model import DNR
 from ..settings import ActiveSettings
-from .pieces import COUNT, Pieces, cells_of, seen_cells, usual_pixels
+from .pieces import Pieces, Sighted, cells_of, seen_cells
 
 
 class Disagreement:
@@ -62,14 +62,8 @@ class Disagreement:
         return Spread(table)
 
 
-class Spread:
+class Spread(Sighted):
     """Σ over the view's pieces of what is unsure there / (1 + the batch's sightings of it)."""
-
-    def __init__(self, table: list[Pieces]) -> None:
-        self.usual, self.sighted = usual_pixels(table), np.zeros(COUNT)
 
     def gain(self, pieces: Pieces) -> float:
         return float((pieces.unsure / (1.0 + self.sighted[pieces.keys])).sum())
-
-    def take(self, pieces: Pieces) -> None:
-        self.sighted[pieces.keys] += pieces.pixels / self.usual[pieces.keys]

@@ -64,10 +64,21 @@ def seen_cells(views: ViewSet, some: Iterable[int]) -> np.ndarray:
     return seen
 
 
-def usual_pixels(table: list[Pieces]) -> np.ndarray:
-    """Mean pixels of a sighting of each piece, [COUNT]; 1 where nobody sees it."""
-    pixels, number = np.zeros(COUNT), np.zeros(COUNT)
-    for one in table:
-        pixels[one.keys] += one.pixels
-        number[one.keys] += 1.0
-    return np.where(number > 0, pixels / np.maximum(number, 1.0), 1.0)
+class Sighted:
+    """How often the views taken so far sight each piece; 1 is a sighting with the mean number of pixels."""
+
+    def __init__(self, table: list[Pieces]) -> None:
+        pixels, number = np.zeros(COUNT), np.zeros(COUNT)
+        for one in table:
+            pixels[one.keys] += one.pixels
+            number[one.keys] += 1.0
+        self.usual = np.where(number > 0, pixels / np.maximum(number, 1.0), 1.0)
+        self.sighted = np.zeros(COUNT)
+
+    def sightings(self, pieces: Pieces) -> np.ndarray:
+        """Of one view: [E]."""
+        return pieces.pixels / self.usual[pieces.keys]
+
+    def take(self, pieces: Pieces) -> None:
+        """Count a view."""
+        self.sighted[pieces.keys] += self.sightings(pieces)

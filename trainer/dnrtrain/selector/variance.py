@@ -31,7 +31,7 @@ from ..renderer import SLOPE
 from ..schedule import adam, guarded_step, learning_rate, require_target
 from ..settings import ActiveSettings
 from ..textures import spherical_harmonics
-from .pieces import COUNT, Pieces, cells_of, seen_cells, usual_pixels
+from .pieces import COUNT, Pieces, Sighted, cells_of, seen_cells
 
 HIDDEN = 32
 STEPS = 400
@@ -142,19 +142,17 @@ class PredictedVariance:
         return Reduction(table)
 
 
-class Reduction:
+class Reduction(Sighted):
     """Σ over pieces of the variance that all candidates have there · (1/(1 + s) − 1/(1 + s + the view's sightings))."""
 
     def __init__(self, table: list[Pieces]) -> None:
-        self.usual, self.sighted, self.variance = usual_pixels(table), np.zeros(COUNT), np.zeros(COUNT)
+        super().__init__(table)
+        self.variance = np.zeros(COUNT)
         for one in table:
             self.variance[one.keys] += one.unsure
         self.variance /= max(1e-12, sum(float(one.pixels.sum()) for one in table))
 
     def gain(self, pieces: Pieces) -> float:
         before = 1.0 + self.sighted[pieces.keys]
-        after = before + pieces.pixels / self.usual[pieces.keys]
+        after = before + self.sightings(pieces)
         return float((self.variance[pieces.keys] * (1.0 / before - 1.0 / after)).sum())
-
-    def take(self, pieces: Pieces) -> None:
-        self.sighted[pieces.keys] += pieces.pixels / self.usual[pieces.keys]
