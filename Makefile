@@ -12,7 +12,7 @@ APT_DEV := chromium
 RESULTS := $(addprefix docs/,ablation.md bench-select.md cost.md frames.md noise.md)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system browser demo test lint types imports docs docs-check robustness bench bench-effects bench-frames fidelity scenes clean
+.PHONY: help setup system browser demo test lint types imports docs docs-check audit robustness bench bench-effects bench-frames fidelity scenes clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -23,10 +23,10 @@ setup: system $(STAMP)  ## .venv with everything, system libraries where this is
 system:
 	@sh tools/system-libraries.sh $(APT)
 
-$(STAMP): pyproject.toml
+$(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check torch==2.13.0
-	$(BIN)/pip install --quiet --disable-pip-version-check -e '.[render,train,serve,export,dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt torch
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[render,train,serve,export,dev]'
 	@touch $@
 
 demo: setup  ## the demo scene from .blend to report; prints the report's path
@@ -58,6 +58,12 @@ docs-check: $(STAMP)
 	$(BIN)/python tools/cli_reference.py --check docs/cli.md
 	$(BIN)/python -m tools.result_tables --check $(RESULTS)
 	$(BIN)/python -m tools.robustness_table --check docs/robustness.md
+	$(BIN)/python -m tools.dependencies --check
+
+audit:  ## known vulnerabilities of the pinned dependencies, by pip-audit; needs pypi.org
+	$(PYTHON) -m venv .cache/audit
+	.cache/audit/bin/pip install --quiet --disable-pip-version-check pip-audit
+	.cache/audit/bin/pip-audit -r constraints.txt --no-deps --disable-pip --strict
 
 robustness: setup  ## every case of docs/robustness.md, 2,000 damaged files of each format, 50 kills; an hour or more
 	$(BIN)/python -m tools.robustness_table --check docs/robustness.md
