@@ -34,8 +34,8 @@ TEXT = """\
 
 Versions are those of [`constraints.txt`](../constraints.txt), which `make setup` installs and the tests ran with;
 `pyproject.toml` says what else may do. `make audit` looks all of them up among known vulnerabilities (pip-audit; it
-needs pypi.org's own address, mirrors do not have that list). Licences are what the packages say of themselves; this page
-is made by `python -m tools.dependencies --pin`.
+needs pypi.org's own address, mirrors do not have that list). Licences are what the packages say of themselves.
+`python -m tools.dependencies --pin` makes this page.
 
 bpy is under the GPL: it is not part of dnrpipe and not shipped with it, is imported in one package
 (`dnrpipe.blender`) and runs in processes of its own. Who passes on dnrpipe and bpy as one program is bound by the GPL.
@@ -87,7 +87,7 @@ def pin() -> None:
 
 
 def licence(package: metadata.Distribution) -> str:
-    """What a package says: its SPDX expression, else its classifiers, else its licence field's first line, else its file."""
+    """What a package says: an SPDX expression, else classifiers, else the first line of the field, else its file."""
     about = package.metadata
     if expression := about.get("License-Expression"):
         return expression
