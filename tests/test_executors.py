@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from dnrpipe import executors
+from dnrpipe import patience as patience_module
 from dnrpipe.errors import UserError
 from dnrpipe.executors import LocalWorker, Retry, TaskFailed, TaskResult, WorkerDied, run_tasks
 
@@ -125,14 +125,14 @@ def test_a_time_limit_from_the_environment(module: str, tmp_path: Path, monkeypa
 
 def test_a_time_limit_from_what_tasks_took(module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Hours before anything is known, then a multiple of the longest, and twice that for the second try."""
-    patience = executors.Patience()
+    patience = patience_module.Patience()
     assert (patience.limit(1), patience.words()) == (6 * 3600, "")
     for seconds in (4.0, 100.0, 50.0):
         patience.took(seconds)
     assert (patience.limit(1), patience.limit(2)) == (3000, 6000)
     assert patience.words() == "; the longest so far took 100 s"
-    monkeypatch.setattr(executors, "LEAST_LIMIT", 0.5)
-    monkeypatch.setattr(executors, "SLOWEST", 1.0)
+    monkeypatch.setattr(patience_module, "LEAST_LIMIT", 0.5)
+    monkeypatch.setattr(patience_module, "SLOWEST", 1.0)
     results, retries = _run(module, tmp_path, ["sleep", "hang"], workers=1)
     assert results[0].error is None
     assert "hung" in retries[0].reason and "the longest so far took" in retries[0].reason

@@ -22,7 +22,8 @@ from filelock import FileLock, Timeout
 
 from ..errors import UserError
 from ..event_stream import VARIABLE
-from ..executors import TIMEOUT_VARIABLE, die_with_parent
+from ..executors import die_with_parent
+from ..patience import TIMEOUT_VARIABLE
 from ..workspace import LOCK_FILES
 from .config import ServerConfig, tightest
 from .models import Job, Limits
