@@ -58,6 +58,7 @@ HANG_SECONDS = 60
 """After which a worker counts as hung here; a healthy task takes a few, a busy machine some more."""
 PAGE = 4096
 UNSAID = "nothing was said of it"
+GONE = "no worker was there to be struck"
 CLOCK = """
 import os, time
 _real, _calls = time.time, [0]
@@ -184,7 +185,7 @@ def worker_struck(bench: Bench, folder: Path, stage: str, kind: str, strike: Cal
     if not struck or "once more" not in errors:
         said = errors.strip()[-200:]
         missed = f"not said: {said}" if said else UNSAID
-        result.problems.append(missed if struck else "no worker was there to be struck")
+        result.problems.append(missed if struck else GONE)
     if "SIGSTOP" in kind and struck and "worker hung for" not in errors:
         result.problems.append(f"not called a hang: {errors[-200:]}")
     bench.complete(copy, stage, result)
@@ -205,7 +206,7 @@ def worker_hangs(bench: Bench, folder: Path, stage: str) -> Result:
 def worker_starves(bench: Bench, folder: Path, stage: str, dice: random.Random) -> Result:
     """A worker process gets no further memory, from some moment on: whatever it asks for is refused.
 
-    One that asks for none any more is not struck: then a new run is, from its beginning on.
+    One that asks for none any more, or has ended, is not struck: then a new run is, from its beginning on.
     """
 
     def starve(wait: float, pid: int) -> None:
@@ -215,7 +216,7 @@ def worker_starves(bench: Bench, folder: Path, stage: str, dice: random.Random) 
     result = Result("worker out of memory (RLIMIT_AS)", stage)
     for wait in (dice.uniform(0.0, 3.0), 0.0):
         result = worker_struck(bench, folder, stage, result.kind, functools.partial(starve, wait))
-        if result.problems != [UNSAID]:
+        if result.problems not in ([UNSAID], [GONE]):
             break
     return result
 
