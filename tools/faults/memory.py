@@ -34,7 +34,7 @@ REPO = Path(__file__).resolve().parents[2]
 SCENE = REPO / "blender_scenes" / "hard" / "emissive_only.blend"
 SMALL = 16
 BOUNDS = {
-    "passes of one view": 6.0,
+    "passes of two views": 8.0,
     "selection of one view": 4.0,
     "ray tracing and base image": 8.0,
     "ray tracing with the denoiser": 12.0,
@@ -132,7 +132,7 @@ def large_view(folder: Path, side: int, timeout: float) -> list[Reading]:
         BASE__LIGHT_SIZE=256, BASE__LIGHT_SPP=16, FINETUNE__STEP2__EPOCHS=1, FINETUNE__STEP2__PATCH=256,
     )  # fmt: skip
     steps = [
-        ("passes of one view", pipeline("prepare", workspace, str(SCENE))),
+        ("passes of two views", pipeline("prepare", workspace, str(SCENE))),
         ("selection of one view", pipeline("select", workspace)),
         ("ray tracing and base image", pipeline("raytrace-selected", workspace)),
         ("ray tracing with the denoiser", own_step("ray tracing with the denoiser", workspace)),
