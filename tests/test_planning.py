@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dnrpipe.planning.choose import Predictor, best_within, budgets, cheapest_reaching
-from dnrpipe.planning.quality import LEAST_SHARE, load_prior, predict, scene_gain, share
+from dnrpipe.planning.quality import LEAST_SHARE, load_prior, predict, scene_gain, share, views_error
 from dnrpipe.planning.records import (
     BasePart,
     FramePart,
@@ -73,6 +73,7 @@ def pilot() -> Pilot:
             neural=FramePoint(name="neural", ms=55, psnr=29.5),
             rival=[FramePoint(name=name, ms=ms, psnr=psnr) for name, ms, psnr in RUNGS],
             views=3,
+            deviation=2.0,
         ),
     )
 
@@ -81,7 +82,7 @@ def predictor() -> Predictor:
     one = pilot()
     work = Work(pixels=128 * 128, trained=128 * 128, light=(512, 128), policy_seconds=1.0, tests=12, evaluation_spp=512)
     gain = scene_gain(PRIOR, 1.5, 6, 150)
-    return Predictor(one, Costs(one, work, "seconds"), Costs(one, work, "cpu_seconds"), PRIOR, 28.0, gain, 1)
+    return Predictor(one, Costs(one, work, "seconds"), Costs(one, work, "cpu_seconds"), PRIOR, 28.0, gain, 0.0, 1)
 
 
 @functools.cache
@@ -132,6 +133,13 @@ def test_more_views_steps_and_samples_never_hurt(views: int, steps: int, noise: 
     assert predict(PRIOR, 28.0, gain, views + 1, steps, noise).expected >= here
     assert predict(PRIOR, 28.0, gain, views, steps + 50, noise).expected >= here
     assert predict(PRIOR, 28.0, gain, views, steps, noise / 2).expected >= here
+    sure, unsure = (predict(PRIOR, 28.0, gain, views, steps, noise, judged) for judged in (0.0, 2.0))
+    assert sure.expected == unsure.expected and unsure.high - unsure.low > sure.high - sure.low
+
+
+def test_few_of_many_views_judged_widen_the_interval() -> None:
+    assert views_error(5.0, 6, 6) == 0.0 and views_error(5.0, 6, 4) == 0.0
+    assert views_error(5.0, 6, 20) == pytest.approx(5.0 * (1 / 6 - 1 / 20) ** 0.5)
 
 
 @given(st.floats(-1.0, 8.0))

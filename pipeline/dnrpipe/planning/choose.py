@@ -19,7 +19,7 @@ NEAR = 0.02
 
 @dataclass(frozen=True)
 class Predictor:
-    """Costs and quality of any choice. base, gain: dB, of the pilot; batch: views per optimiser step."""
+    """Costs and quality of any choice. base, gain, judged: dB, of the pilot (:mod:`.quality`); batch: views per step."""
 
     pilot: Pilot
     wall: Costs
@@ -27,6 +27,7 @@ class Predictor:
     prior: Prior
     base: float
     gain: tuple[float, float]
+    judged: float
     batch: int
 
     def choice(self, views: int, spp: int, steps: int) -> Choice:
@@ -53,7 +54,7 @@ class Predictor:
             choice=choice,
             seconds=seconds,
             cpu_seconds=self.processor.raytrace(choice.views, choice.spp) + self.processor.finetune(choice.steps),
-            psnr=predict(self.prior, self.base, self.gain, choice.views, choice.steps, noise),
+            psnr=predict(self.prior, self.base, self.gain, choice.views, choice.steps, noise, self.judged),
         )
 
     def grid(self, candidates: int) -> Iterator[Prediction]:

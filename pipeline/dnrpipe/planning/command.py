@@ -19,7 +19,7 @@ from ..settings import Settings
 from ..workspace import Workspace
 from .choose import Predictor, best_within, budgets, cheapest_reaching
 from .pilot import FOLDER, run_pilot
-from .quality import Prior, load_prior, scene_gain
+from .quality import Prior, load_prior, scene_gain, views_error
 from .records import Pilot, Prediction, Route
 from .routes import break_even, routes
 from .seconds import Costs, Work
@@ -100,6 +100,7 @@ def make_predictor(workspace: Workspace, settings: Settings, pilot: Pilot, prior
         prior=prior,
         base=base,
         gain=scene_gain(prior, measured, training.views, training.steps),
+        judged=views_error(frames.deviation, frames.views, work.tests),
         batch=settings.finetune.step2.batch,
     )
 

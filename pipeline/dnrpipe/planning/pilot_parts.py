@@ -233,7 +233,8 @@ class Piloting:
 def _views(workspace: Workspace) -> tuple[list[View], list[View]]:
     """(a few candidates, the farthest from each other; a few others) at the pilot's size.
 
-    Others: validation views, else candidates that were not taken.
+    Others: test views, for their PSNR is what is predicted (by poses alone; nothing is trained on them or chosen among
+    them), else validation views, else candidates that were not taken.
     """
     from dnrtrain.selector.policies import untrained
     from dnrtrain.selector.protocol import Candidates
@@ -245,7 +246,8 @@ def _views(workspace: Workspace) -> tuple[list[View], list[View]]:
     positions = np.stack([view.position for view in views])
     directions = np.stack([-view.matrix[:3, 2] for view in views])
     chosen = rule.choose(Candidates(positions, directions), min(VIEWS, len(views)), 0).views
-    left = splits.get("val") or [view for i, view in enumerate(views) if i not in set(chosen)] or views
+    others = [view for i, view in enumerate(views) if i not in set(chosen)]
+    left = splits.get("test") or splits.get("val") or others or views
     step = max(1, len(left) // HELD_OUT)
     pick = left[::step][:HELD_OUT]
     return [scaled_to(views[i], RESOLUTION) for i in chosen], [scaled_to(view, RESOLUTION) for view in pick]

@@ -64,10 +64,17 @@ def scene_gain(prior: Prior, measured: float, views: int, steps: int) -> tuple[f
     return gain, math.sqrt(weight * own_variance)
 
 
-def predict(prior: Prior, base: float, gain: tuple[float, float], views: int, steps: int, noise: float) -> Interval:
-    """PSNR, dB. gain: of :func:`scene_gain`. noise: RMSE of the training pictures."""
+def views_error(deviation: float, judged: int, tests: int) -> float:
+    """dB: standard error of the mean PSNR over ``tests`` views when ``judged`` of them were looked at."""
+    return deviation * math.sqrt(max(0.0, 1 / judged - 1 / max(tests, judged)))
+
+
+def predict(
+    prior: Prior, base: float, gain: tuple[float, float], views: int, steps: int, noise: float, judged: float = 0.0
+) -> Interval:
+    """PSNR, dB. gain: of :func:`scene_gain`. noise: RMSE of the training pictures. judged: of :func:`views_error`."""
     part = share(prior, views, steps)
     clean = 10 ** (-(base + gain[0] * part) / 10)
     expected = -10 * math.log10(clean + prior.kappa * noise**2)
-    spread = NINE_IN_TEN * math.hypot(prior.sd, gain[1] * part)
+    spread = NINE_IN_TEN * math.hypot(prior.sd, gain[1] * part, judged)
     return Interval(expected=expected, low=expected - spread, high=expected + spread)

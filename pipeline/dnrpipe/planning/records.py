@@ -84,12 +84,13 @@ class FramePoint(Record):
 
 
 class FramePart(Record):
-    """Frames of the pilot's held-out views."""
+    """Frames of the pilot's held-out views. deviation: of the base image's PSNR over these views, dB."""
 
     base: FramePoint
     neural: FramePoint
     rival: list[FramePoint]
     views: int
+    deviation: float
 
 
 class Pilot(Record):

@@ -149,6 +149,7 @@ class Worker:
             "base": {"name": BASE, **rows[BASE].summary()},
             "neural": {"name": NEURAL, **rows[NEURAL].summary()},
             "rival": rival,
+            "deviation": float(np.std(rows[BASE].psnr, ddof=1)) if len(views) > 1 else 0.0,
             "unknown": sum(int((~known).sum()) for _, _, known in truth),
         }
 
