@@ -19,7 +19,7 @@ NEAR = 0.02
 
 @dataclass(frozen=True)
 class Predictor:
-    """Costs and quality of any choice. base, gain, judged: dB, of the pilot (:mod:`.quality`); batch: views per step."""
+    """Costs and quality of any choice. base, gain, judged: dB, of the pilot (:mod:`.quality`); batch: views a step."""
 
     pilot: Pilot
     wall: Costs
