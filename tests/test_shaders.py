@@ -229,6 +229,7 @@ CASES: list[tuple[Callable[[], None], float, float]] = [
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("mitsuba_variant")
 @pytest.mark.parametrize(("build", "energy", "rmse"), CASES, ids=lambda v: getattr(v, "__name__", None))
 def test_matches_cycles(
     build: Callable[[], None], energy: float, rmse: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
