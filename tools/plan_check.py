@@ -109,19 +109,21 @@ def routes_of(scene: str, results: dict[str, Any], predictor: Predictor) -> list
     return found
 
 
-def _expected(predictor: Predictor, results: dict[str, Any], wanted: float, frames: int) -> list[Route]:
-    """The plan's routes by the frontier's clock: processor seconds over the cores and over training's threads."""
+def clocked(predictor: Predictor, results: dict[str, Any], choice: Choice) -> float:
+    """Predicted seconds by the frontier's clock: processor seconds over the cores and over training's threads."""
+    costs = predictor.processor
+    return (
+        costs.raytrace(choice.views, choice.spp) / results["cores"] + costs.finetune(choice.steps) / results["threads"]
+    )
 
-    def total(choice: Choice) -> float:
-        costs = predictor.processor
-        return costs.raytrace(choice.views, choice.spp) / results["cores"] + (
-            costs.finetune(choice.steps) / results["threads"]
-        )
+
+def _expected(predictor: Predictor, results: dict[str, Any], wanted: float, frames: int) -> list[Route]:
+    """The plan's routes by the frontier's clock."""
 
     enough = [p for p in predictor.grid(max(VIEWS)) if p.psnr.expected >= wanted]
-    neural = min(enough, key=lambda p: total(p.choice)) if enough else None
+    neural = min(enough, key=lambda p: clocked(predictor, results, p.choice)) if enough else None
     if neural is not None:
-        seconds = total(neural.choice)
+        seconds = clocked(predictor, results, neural.choice)
         clock = neural.seconds.model_copy(update={"total": Interval(expected=seconds, low=seconds, high=seconds)})
         neural = neural.model_copy(update={"seconds": clock})
     width, height = predictor.pilot.size
@@ -137,11 +139,7 @@ def against_default(scene: str, results: dict[str, Any], predictor: Predictor, d
 
     def predicted(point: dict[str, Any]) -> tuple[float, float]:
         choice = predictor.choice(point["views"], point["spp"], point["steps"])
-        costs = predictor.processor
-        seconds = costs.raytrace(choice.views, choice.spp) / results["cores"] + (
-            costs.finetune(choice.steps) / results["threads"]
-        )
-        return seconds, predictor.predict(choice).psnr.expected
+        return clocked(predictor, results, choice), predictor.predict(choice).psnr.expected
 
     found = []
     for usual in neural:
