@@ -119,7 +119,6 @@ def clocked(predictor: Predictor, results: dict[str, Any], choice: Choice) -> fl
 
 def _expected(predictor: Predictor, results: dict[str, Any], wanted: float, frames: int) -> list[Route]:
     """The plan's routes by the frontier's clock."""
-
     enough = [p for p in predictor.grid(max(VIEWS)) if p.psnr.expected >= wanted]
     neural = min(enough, key=lambda p: clocked(predictor, results, p.choice)) if enough else None
     if neural is not None:
