@@ -7,13 +7,24 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dnrpipe.planning.choose import Predictor, best_within, budgets, cheapest_reaching
-from dnrpipe.planning.quality import LEAST_SHARE, load_prior, predict, scene_gain, share, views_error
+from dnrpipe.planning.quality import (
+    Gain,
+    Measured,
+    load_prior,
+    predict,
+    scene_gain,
+    share,
+    views_error,
+    with_noise,
+    without_noise,
+)
 from dnrpipe.planning.records import (
     BasePart,
     FramePart,
@@ -26,7 +37,7 @@ from dnrpipe.planning.records import (
     TracePart,
     TrainingPart,
 )
-from dnrpipe.planning.routes import break_even, rival_line, routes, seconds_for
+from dnrpipe.planning.routes import as_reported, break_even, rival_line, routes, seconds_for
 from dnrpipe.planning.seconds import Costs, Work, noise_at, view_line
 from dnrpipe.planning.worker import without_reference
 
@@ -66,11 +77,11 @@ def pilot() -> Pilot:
         ),
         base=BasePart(pixels=128 * 128, seconds=0.05, cpu_seconds=0.1, startup=3.0),
         training=TrainingPart(
-            views=6, spp=16, steps=150, pixels=128 * 128, seconds=0.05, cpu_seconds=0.07, startup=1.0, threads=2
+            views=6, spp=16, steps=[100, 300], pixels=128 * 128, seconds=0.05, cpu_seconds=0.07, startup=1.0, threads=2
         ),
         frames=FramePart(
             base=FramePoint(name="base", ms=40, psnr=28.0),
-            neural=FramePoint(name="neural", ms=55, psnr=29.5),
+            neural=[FramePoint(name="neural", ms=55, psnr=29.0), FramePoint(name="neural", ms=55, psnr=29.8)],
             rival=[FramePoint(name=name, ms=ms, psnr=psnr) for name, ms, psnr in RUNGS],
             views=3,
             deviation=2.0,
@@ -81,8 +92,9 @@ def pilot() -> Pilot:
 def predictor() -> Predictor:
     one = pilot()
     work = Work(pixels=128 * 128, trained=128 * 128, light=(512, 128), policy_seconds=1.0, tests=12, evaluation_spp=512)
-    gain = scene_gain(PRIOR, 1.5, 6, 150)
-    return Predictor(one, Costs(one, work, "seconds"), Costs(one, work, "cpu_seconds"), PRIOR, 28.0, gain, 0.0, 1)
+    gain = scene_gain(PRIOR, [Measured(6, 100, 1.0), Measured(6, 300, 1.8)])
+    wall, processor = Costs(one, work, "seconds"), Costs(one, work, "cpu_seconds")
+    return Predictor(one, wall, processor, PRIOR, 28.0, gain, judged=0.0, reference=0.0, batch=1)
 
 
 @functools.cache
@@ -128,12 +140,12 @@ def test_processor_seconds_count_no_waiting_and_no_cores() -> None:
 
 @given(st.integers(4, 200), st.integers(50, 10_000), st.floats(0.001, 0.2))
 def test_more_views_steps_and_samples_never_hurt(views: int, steps: int, noise: float) -> None:
-    gain = (3.0, 0.3)
+    gain = scene_gain(PRIOR, [Measured(6, 100, 1.0)])
     here = predict(PRIOR, 28.0, gain, views, steps, noise).expected
     assert predict(PRIOR, 28.0, gain, views + 1, steps, noise).expected >= here
     assert predict(PRIOR, 28.0, gain, views, steps + 50, noise).expected >= here
     assert predict(PRIOR, 28.0, gain, views, steps, noise / 2).expected >= here
-    sure, unsure = (predict(PRIOR, 28.0, gain, views, steps, noise, judged) for judged in (0.0, 2.0))
+    sure, unsure = (predict(PRIOR, 28.0, gain, views, steps, noise, judged=judged) for judged in (0.0, 2.0))
     assert sure.expected == unsure.expected and unsure.high - unsure.low > sure.high - sure.low
 
 
@@ -142,12 +154,50 @@ def test_few_of_many_views_judged_widen_the_interval() -> None:
     assert views_error(5.0, 6, 20) == pytest.approx(5.0 * (1 / 6 - 1 / 20) ** 0.5)
 
 
-@given(st.floats(-1.0, 8.0))
-def test_the_gain_lies_between_the_pilots_and_the_priors(measured: float) -> None:
-    gain, spread = scene_gain(PRIOR, measured, 6, 150)
-    own = measured / max(share(PRIOR, 6, 150), LEAST_SHARE)
-    assert min(own, PRIOR.gain_mean) - 1e-9 <= gain <= max(own, PRIOR.gain_mean) + 1e-9
-    assert 0 < spread <= PRIOR.gain_sd
+@given(st.floats(0.0, 6.0))
+def test_the_gain_is_drawn_to_what_the_pilot_measured_and_is_surer_there(measured: float) -> None:
+    blind, sees = scene_gain(PRIOR, []), scene_gain(PRIOR, [Measured(6, 300, measured)])
+    before, unsure = blind.at(PRIOR, 6, 300)
+    after, sure = sees.at(PRIOR, 6, 300)
+    assert abs(after - measured) <= abs(before - measured) + 1e-6
+    assert sure < unsure
+    assert sees.weight.sum() == pytest.approx(1.0)
+    assert (sees.total[sees.weight > 0] > 0).all()
+
+
+@given(st.floats(1.0, 4.0), st.floats(0.3, 0.9), st.floats(0.3, 0.9))
+def test_what_still_grows_is_expected_to_go_on(last: float, one: float, other: float) -> None:
+    def expected(first: float) -> float:
+        gain = scene_gain(PRIOR, [Measured(6, 100, first * last), Measured(6, 300, last)])
+        return gain.at(PRIOR, 6, 1000)[0] - gain.at(PRIOR, 6, 300)[0]
+
+    slow, fast = sorted((one, other))
+    assert expected(slow) >= expected(fast) - 1e-9
+
+
+def test_a_sure_gain_is_itself() -> None:
+    gain = Gain(np.array([4.0]), np.array([0.1]), np.array([1.0]))
+    expected = 4.0 * float(share(PRIOR, 0.1, 25, 500))
+    assert gain.at(PRIOR, 25, 500) == pytest.approx((expected, 0.0))
+    assert gain.most == 4.0
+    assert float(share(PRIOR, 0.1, 25, 5)) == 0.0  # a network that has hardly begun
+
+
+@given(st.floats(15.0, 40.0), st.floats(0.0, 0.008))
+def test_noise_is_taken_out_again(psnr: float, noise: float) -> None:
+    assert without_noise(with_noise(psnr, noise), noise) == pytest.approx(psnr, abs=1e-6)
+    assert with_noise(psnr, noise) <= psnr
+
+
+def test_what_a_report_measures_counts_its_references_noise() -> None:
+    part = pilot().frames
+    assert part is not None
+    shown = as_reported(part, 10 ** (-30 / 20))
+    assert shown.base.psnr == pytest.approx(28.0 - 2.124, abs=0.01)
+    assert max(point.psnr for point in shown.rival) < 30.0
+    gain = scene_gain(PRIOR, [])
+    clean, noisy = (predict(PRIOR, 28.0, gain, 25, 500, 0.0, reference=r).expected for r in (0.0, 0.02))
+    assert noisy == pytest.approx(with_noise(clean, 0.02))
 
 
 def test_noise_of_the_references_does_not_count() -> None:
@@ -214,7 +264,7 @@ def test_few_frames_are_not_worth_training_and_many_are() -> None:
     few = routes(one.pilot.frames, neural, one.wall.light(), 1.0, at, 5)
     assert few[0].name == "path tracing + denoiser"
     dear = 33.0  # the rival needs 0.2 s a frame there
-    at_dear = cheapest_reaching(grid, one.base + 0.7 * one.gain[0])
+    at_dear = cheapest_reaching(grid, one.base + 0.7 * one.gain.most)
     many = routes(one.pilot.frames, at_dear, one.wall.light(), 1.0, dear, 1_000_000)
     assert many[0].name == "neural renderer"
     even = break_even(many)
@@ -258,7 +308,7 @@ def test_a_scene_is_planned_and_the_plan_carried_out(
         (pilot, "HELD_OUT", 1),
         (pilot, "REFERENCE_SPP", 16),
         (pilot, "SPP", 4),
-        (pilot, "STEPS", 12),
+        (pilot, "STEPS", (6, 12)),
         (pilot, "RUNGS", (1, 4)),
         (pilot, "METHODS", ("raw", "clean16-fast")),
         (choose, "STEPS", (12, 24)),

@@ -30,7 +30,7 @@ def planned(root: Path, **more: Any) -> Path:
         "settings_default": prediction(200, 30.5),
         "table": [prediction(60, 30.0), prediction(120, 31.0), prediction(240, 31.5)],
         "base_psnr": 28.0,
-        "gain": [4.0, 0.5],
+        "gain": 4.0,
         **more,
     }
     (root / "plan").mkdir(parents=True)

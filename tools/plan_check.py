@@ -33,7 +33,7 @@ from dnrpipe.planning.choose import VIEWS, Predictor
 from dnrpipe.planning.command import make_predictor
 from dnrpipe.planning.pilot import read_pilot
 from dnrpipe.planning.records import Choice, Interval, Route
-from dnrpipe.planning.routes import routes
+from dnrpipe.planning.routes import as_reported, routes
 from dnrpipe.session import resolve_settings
 from dnrpipe.workspace import Workspace
 from dnrtrain.atomic import write_json
@@ -129,7 +129,8 @@ def _expected(predictor: Predictor, results: dict[str, Any], wanted: float, fram
     scale = predictor.wall.work.pixels / (width * height)
     assert predictor.pilot.frames is not None  # make_predictor asked for it
     light = predictor.processor.light() / results["cores"]
-    return routes(predictor.pilot.frames, neural, light, scale, wanted, frames)
+    part = as_reported(predictor.pilot.frames, predictor.reference)
+    return routes(part, neural, light, scale, wanted, frames)
 
 
 def against_default(scene: str, results: dict[str, Any], predictor: Predictor, default: Choice) -> list[dict[str, Any]]:

@@ -3,9 +3,10 @@
     python -m tools.plan_prior collect .cache/plan/*.dnr/frontier/results.json docs/results/ablation-core.json ...
     python -m tools.plan_prior fit                                       # -> pipeline/dnrpipe/planning/prior.json
 
-``collect`` gathers cells (views, samples, steps, PSNR, PSNR of the base image, noise of the training pictures) of
-`dnrpipe frontier`, of `dnrpipe ablate`, and of its own older output in docs/results/plan-prior.json. ``fit`` reads
-that, fits :mod:`dnrpipe.planning.quality`, leaves every scene out in turn, and prints how far off it is then.
+``collect`` gathers cells (views, samples, steps, PSNR, PSNR of the base image, noise of training pictures and of
+references) of `dnrpipe frontier`, of `dnrpipe ablate`, and of its own older output; and the pilots beside frontiers.
+``fit`` reads that, fits :mod:`dnrpipe.planning.quality`, leaves every scene that has a pilot out in turn, predicts its
+cells from that pilot, and prints how far off that is.
 """
 
 from __future__ import annotations
@@ -20,7 +21,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from dnrpipe.planning.quality import LEAST_SHARE, Prior, load_prior, predict, scene_gain, share
+from dnrpipe.planning.pilot import read_pilot
+from dnrpipe.planning.quality import Measured, Prior, load_prior, predict, scene_gain, without_noise
+from dnrpipe.planning.seconds import noise_at
+from dnrpipe.workspace import Workspace
 from dnrtrain.atomic import write_json
 from dnrtrain.exr import read_metadata
 
@@ -28,31 +32,67 @@ NEURAL_KINDS = ("ours", "random", "all")
 """Points of a frontier that are the default model, however their views were chosen."""
 ABLATION_SPP = 128
 """Samples of training views in `dnrpipe ablate`, preset draft."""
+CELL = ("scene", "source", "seed", "views", "spp", "steps")
+"""What tells one cell from another."""
 
 
 def collect(sources: list[Path], workspaces: list[Path], out: Path) -> None:
-    """Cells of all sources in one file. workspaces: folders of the ablation's, whose files tell the noise."""
-    found: list[dict[str, Any]] = []
+    """Cells of all sources in one file, later ones in place of earlier ones.
+
+    workspaces: folders of the ablation's, whose files tell the noise.
+    """
+    cells: list[dict[str, Any]] = []
+    pilots: list[dict[str, Any]] = []
     for source in sources:
         results = _read(source)
         if "points" in results:
-            found += _of_frontier(source, results)
+            cells += _of_frontier(source, results)
+            pilots += _pilot(source.resolve().parent.parent, results["scene"])
         elif all("noise" in cell for cell in results["cells"]):
-            found += results["cells"]
+            cells += results["cells"]
+            pilots += results.get("pilots", [])
         else:
-            found += _of_ablation(source, results, workspaces)
-    write_json(out, {"command": "python -m tools.plan_prior " + " ".join(sys.argv[1:]), "cells": found})
-    print(f"{len(found)} cells of {len({cell['scene'] for cell in found})} scenes: {out}")
+            cells += _of_ablation(source, results, workspaces)
+    cells, pilots = _latest(cells, CELL), _latest(pilots, ("scene",))
+    write_json(
+        out, {"command": "python -m tools.plan_prior " + " ".join(sys.argv[1:]), "cells": cells, "pilots": pilots}
+    )
+    print(f"{len(cells)} cells of {len({cell['scene'] for cell in cells})} scenes, {len(pilots)} pilots: {out}")
+
+
+def _latest(found: list[dict[str, Any]], names: Sequence[str]) -> list[dict[str, Any]]:
+    """The last of those that agree in ``names``: what was measured again replaces what was."""
+    return list({tuple(one[name] for name in names): one for one in found}.values())
 
 
 def _of_frontier(source: Path, results: dict[str, Any]) -> list[dict[str, Any]]:
     root = source.resolve().parent.parent
     base = next(point["psnr"] for point in results["points"] if point["kind"] == "base")
+    reference = _noise([root], results["evaluation_spp"], "test") or 0.0
     found = []
     for point in results["points"]:
         if point["kind"] in NEURAL_KINDS and (noise := _noise([root], point["spp"])) is not None:
-            found.append(_cell(point, results["scene"], point["spp"], noise, base, "frontier"))
+            found.append(_cell(point, results["scene"], point["spp"], noise, base, "frontier", reference))
     return found
+
+
+def _pilot(root: Path, scene: str) -> list[dict[str, Any]]:
+    """What the workspace's pilot measured of quality."""
+    pilot = read_pilot(Workspace.open(root))
+    if pilot is None or pilot.frames is None or pilot.training is None or pilot.trace is None:
+        return []
+    training, frames = pilot.training, pilot.frames
+    return [
+        {
+            "scene": scene,
+            "views": training.views,
+            "spp": training.spp,
+            "noise": round(noise_at(pilot.trace, training.spp), 5),
+            "steps": training.steps,
+            "psnr": [point.psnr for point in frames.neural],
+            "base": frames.base.psnr,
+        }
+    ]
 
 
 def _of_ablation(source: Path, results: dict[str, Any], workspaces: list[Path]) -> list[dict[str, Any]]:
@@ -63,19 +103,24 @@ def _of_ablation(source: Path, results: dict[str, Any], workspaces: list[Path]) 
             continue
         noise = _noise([folder / f"{cell['scene']}.dnr" for folder in workspaces], ABLATION_SPP)
         if noise is not None:
-            found.append(_cell(cell, cell["scene"], ABLATION_SPP, noise, bases[cell["scene"]], source.name))
+            reference = 10 ** (-cell["ceiling"] / 20) if cell.get("ceiling") else 0.0
+            base = bases[cell["scene"]]
+            found.append(_cell(cell, cell["scene"], ABLATION_SPP, noise, base, source.name, reference))
     return found
 
 
-def _cell(measured: dict[str, Any], scene: str, spp: int, noise: float, base: float, source: str) -> dict[str, Any]:
+def _cell(
+    measured: dict[str, Any], scene: str, spp: int, noise: float, base: float, source: str, reference: float
+) -> dict[str, Any]:
     kept = {name: measured[name] for name in ("seed", "views", "steps", "psnr")}
-    return {"scene": scene, **kept, "spp": spp, "noise": round(noise, 5), "base": base, "source": source}
+    noises = {"noise": round(noise, 5), "reference": round(reference, 5)}
+    return {"scene": scene, **kept, "spp": spp, **noises, "base": base, "source": source}
 
 
-def _noise(roots: Sequence[Path], spp: int) -> float | None:
-    """RMSE of training pictures at ``spp``, by their files in the first workspace that has some."""
+def _noise(roots: Sequence[Path], spp: int, kind: str = "train") -> float | None:
+    """RMSE of the pictures of a kind at ``spp``, by their files in the first workspace that has some."""
     for root in roots:
-        for split in (f"train-{spp}spp", "train"):
+        for split in (f"{kind}-{spp}spp", kind):
             files = sorted((root / "raytraced" / split).glob("*.exr"))
             known = [m for f in files if (m := read_metadata(f)) and m.get("spp") == spp and m.get("noise_rmse")]
             if known:
@@ -86,77 +131,94 @@ def _noise(roots: Sequence[Path], spp: int) -> float | None:
 START = {"a": 0.15, "alpha": 0.7, "b": 0.12, "beta": 0.8, "kappa": 0.3}
 """Where the fit starts, and what it is drawn to by as much as a cell that is WEIGHT times off."""
 WEIGHT = 0.2
-PILOT = (6, 16, 200)
-"""The pilot's corner of the grid: at most so many views, samples, steps."""
+OWN = 0.36
+"""A scene's log b is drawn to the median by so much: (0.3 dB of a cell / a spread of 0.5)²."""
+LEAST_B_SPREAD = 0.25
 LEAST_SPREAD = 0.4
 """dB: no prediction is called surer than this; two seeds of one cell differ by up to 0.3."""
+PILOT_SD = 0.4
+"""dB: of a pilot's gain, likewise."""
 
 
-def shared(cells: list[dict[str, Any]]) -> dict[str, float]:
-    """a, alpha, b, beta, kappa: least squares over all cells, with the best G of each scene and source."""
+def fit_prior(cells: list[dict[str, Any]], source: str, sd: float) -> Prior:
+    """Least squares over all cells, with the best G of each scene and source and the best b of each scene."""
     groups = sorted({(cell["scene"], cell["source"]) for cell in cells})
-    place = torch.tensor([groups.index((cell["scene"], cell["source"])) for cell in cells])
-    views, steps, noise, base, truth = (
-        torch.tensor([float(cell[name]) for cell in cells]) for name in ("views", "steps", "noise", "base", "psnr")
+    scenes = sorted({cell["scene"] for cell in cells})
+    of_group = torch.tensor([groups.index((cell["scene"], cell["source"])) for cell in cells])
+    of_scene = torch.tensor([scenes.index(cell["scene"]) for cell in cells])
+    views, steps, noise, reference, truth = (
+        torch.tensor([float(cell[name]) for cell in cells]) for name in ("views", "steps", "noise", "reference", "psnr")
     )
+    base = torch.tensor([without_noise(cell["base"], cell["reference"]) for cell in cells])
     start = torch.tensor(list(START.values())).log()
     logs, gains = start.clone().requires_grad_(), torch.full((len(groups),), 3.0, requires_grad=True)
-    optimiser = torch.optim.LBFGS([logs, gains], max_iter=500, line_search_fn="strong_wolfe")
+    own = torch.zeros(len(scenes), requires_grad=True)
+    optimiser = torch.optim.LBFGS([logs, gains, own], max_iter=1000, line_search_fn="strong_wolfe")
 
     def loss() -> torch.Tensor:
         optimiser.zero_grad()
         a, alpha, b, beta, kappa = logs.exp()
-        part = 1 - a * (25 / views) ** alpha - b * (500 / steps) ** beta
-        clean = 10 ** (-(base + gains[place] * part) / 10)
-        error = -10 * torch.log10(clean + kappa * noise**2) - truth
-        total = error.square().sum() + WEIGHT * (logs - start).square().sum()
+        part = 1 - a * (25 / views) ** alpha - b * own[of_scene].exp() * (500 / steps) ** beta
+        clean = 10 ** (-(base + gains[of_group] * part) / 10)
+        error = -10 * torch.log10(clean + kappa * noise**2 + reference**2) - truth
+        total = error.square().sum() + OWN * own.square().sum() + WEIGHT * (logs - start).square().sum()
         total.backward()
         return total
 
     optimiser.step(loss)
-    return dict(zip(START, logs.detach().exp().tolist(), strict=True))
+    known = dict(zip(START, (round(value, 4) for value in logs.detach().exp().tolist()), strict=True))
+    by_scene = {scene: [] for scene in scenes}
+    for (scene, _), gain in zip(groups, gains.detach().tolist(), strict=True):
+        by_scene[scene].append(gain)
+    means = [float(np.mean(values)) for values in by_scene.values()]
+    several = [i for i, s in enumerate(scenes) if len({c["steps"] for c in cells if c["scene"] == s}) > 2]
+    spread = float(own.detach()[several].std()) if len(several) > 2 else 0.0
+    return Prior(
+        **known,
+        b_spread=round(max(LEAST_B_SPREAD, spread), 3),
+        gain_mean=round(float(np.mean(means)), 3),
+        gain_sd=round(float(np.std(means, ddof=1)) if len(means) > 1 else 2.0, 3),
+        pilot_sd=PILOT_SD,
+        sd=sd,
+        scenes=scenes,
+        source=source,
+    )
+
+
+def gains_of(pilot: dict[str, Any], prior: Prior) -> list[Measured]:
+    """What a pilot of ``collect`` measured; as :func:`dnrpipe.planning.command.measured_gains`."""
+    noise = prior.kappa**0.5 * pilot["noise"]
+    return [
+        Measured(pilot["views"], steps, without_noise(psnr, noise) - pilot["base"])
+        for steps, psnr in zip(pilot["steps"], pilot["psnr"], strict=True)
+    ]
 
 
 def fit(path: Path, out: Path) -> None:
-    """Fit, leave every scene out that has the pilot's corner, print, write ``out``."""
-    cells = read_cells(path)
-    scenes = sorted({cell["scene"] for cell in cells})
+    """Fit, leave every scene out that has a pilot, print, write ``out``."""
+    found = _read(path)
+    cells, pilots = found["cells"], found["pilots"]
     errors: list[float] = []
-    print(f"{'scene left out':<16}{'predicted from its pilot corner, minus measured, dB':>60}")
-    for scene in scenes:
-        own = [cell for cell in cells if cell["scene"] == scene]
-        corner = next(
-            (c for c in own if all(c[k] <= m for k, m in zip(("views", "spp", "steps"), PILOT, strict=True))), None
-        )
-        others = [cell for cell in cells if cell["scene"] != scene]
-        if corner is None or not others:
-            continue
-        prior = _prior(others, scenes, str(path))
-        gain = scene_gain(prior, corner["psnr"] - corner["base"], corner["views"], corner["steps"])
+    print(f"{'scene left out':<16}{'predicted from its pilot, minus measured, dB':>60}")
+    for pilot in pilots:
+        own = [cell for cell in cells if cell["scene"] == pilot["scene"]]
+        others = [cell for cell in cells if cell["scene"] != pilot["scene"]]
+        prior = fit_prior(others, str(path), LEAST_SPREAD)
+        gain = scene_gain(prior, gains_of(pilot, prior))
         off = [
-            predict(prior, cell["base"], gain, cell["views"], cell["steps"], cell["noise"]).expected - cell["psnr"]
+            predict(
+                prior, pilot["base"], gain, cell["views"], cell["steps"], cell["noise"], reference=cell["reference"]
+            ).expected
+            - cell["psnr"]
             for cell in own
-            if cell is not corner
         ]
         errors += off
-        print(f"{scene:<16}{', '.join(f'{value:+.2f}' for value in off):>60}")
-    prior = _prior(cells, scenes, str(path))
-    spread = float(np.sqrt(np.mean(np.square(errors)))) if len(errors) > 1 else 1.0
-    prior = prior.model_copy(update={"sd": round(max(LEAST_SPREAD, spread), 3)})
+        print(f"{pilot['scene']:<16}{', '.join(f'{value:+.2f}' for value in off):>60}")
+    spread = float(np.sqrt(np.mean(np.square(errors)))) if errors else 1.0
+    prior = fit_prior(cells, str(path), round(max(LEAST_SPREAD, spread), 3))
     write_json(out, prior.model_dump(mode="json"))
-    print(f"median |error| {np.median(np.abs(errors)):.2f} dB, root mean square {spread:.2f} dB; {out}")
-
-
-def _prior(cells: list[dict[str, Any]], scenes: list[str], source: str) -> Prior:
-    found = {name: round(value, 4) for name, value in shared(cells).items()}
-    bare = Prior(**found, gain_mean=0, gain_sd=1, pilot_sd=LEAST_SPREAD, sd=LEAST_SPREAD, scenes=scenes, source=source)
-    gains: dict[str, list[float]] = {}
-    for cell in cells:
-        part = max(share(bare, cell["views"], cell["steps"]), LEAST_SHARE)
-        gains.setdefault(cell["scene"], []).append((cell["psnr"] - cell["base"]) / part)
-    means = [float(np.mean(values)) for values in gains.values()]
-    spread = float(np.std(means, ddof=1)) if len(means) > 1 else 2.0
-    return bare.model_copy(update={"gain_mean": round(float(np.mean(means)), 3), "gain_sd": round(spread, 3)})
+    if errors:
+        print(f"median |error| {np.median(np.abs(errors)):.2f} dB, root mean square {spread:.2f} dB; {out}")
 
 
 def read_cells(path: Path) -> list[dict[str, Any]]:
@@ -166,8 +228,7 @@ def read_cells(path: Path) -> list[dict[str, Any]]:
 
 def without(cells: list[dict[str, Any]], scene: str, source: str) -> Prior:
     """The prior of all scenes but one, as sure of itself as the one that comes with the package."""
-    others = [cell for cell in cells if cell["scene"] != scene]
-    return _prior(others, sorted({cell["scene"] for cell in others}), source).model_copy(update={"sd": load_prior().sd})
+    return fit_prior([cell for cell in cells if cell["scene"] != scene], source, load_prior().sd)
 
 
 def _read(path: Path) -> dict[str, Any]:

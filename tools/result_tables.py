@@ -3,7 +3,7 @@
 A part stands between ``<!-- rows -->`` or ``<!-- KIND FILE -->``, FILE in docs/, and ``<!-- end -->``.
 Kinds: results (of `dnrpipe ablate`), frames (of tools.bench_frames), noise (of tools.bench_noise),
 frontier (of `dnrpipe frontier`), plan-check (of tools.plan_check), selection (of `dnrpipe bench-select`),
-selections (of several of its runs together: FILE,FILE).
+selections (of several of its runs together: FILE,FILE), plan-equal (of tools.plan_equal).
 
 python -m tools.result_tables [--check] docs/ablation.md docs/*.md
 """
@@ -18,6 +18,7 @@ from pathlib import Path
 from tools.bench_frames.document import markdown as frames_markdown
 from tools.bench_noise.document import markdown as noise_markdown
 from tools.plan_check import markdown as check_markdown
+from tools.plan_equal import markdown as equal_markdown
 
 from dnrpipe.ablation.results import read_results
 from dnrpipe.ablation.rows import GROUPS, ROWS
@@ -28,7 +29,7 @@ from dnrpipe.selectbench.results import read_results as selection_results
 from dnrpipe.selectbench.tables import markdown as selection_markdown
 from dnrpipe.selectbench.tables import together as selections_markdown
 
-KINDS = "rows|results|frames|noise|frontier|plan-check|selections?"
+KINDS = "rows|results|frames|noise|frontier|plan-check|plan-equal|selections?"
 PART = re.compile(rf"(<!-- ({KINDS})(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -58,6 +59,8 @@ def generate(text: str, folder: Path) -> str:
         elif match[2] == "selections":
             runs = [selection_results(folder / name) for name in match[3].split(",")]
             body = lowered(selections_markdown(runs))
+        elif match[2] == "plan-equal":
+            body = equal_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
         elif match[2] == "plan-check":
             body = check_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
         else:

@@ -6,28 +6,31 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from .quality import Prior, predict
+from .quality import Gain, Prior, predict
 from .records import Choice, Interval, Pilot, Prediction, Seconds
 from .seconds import TIME_SPREAD, Costs, noise_at
 
 VIEWS = (4, 6, 8, 10, 12, 16, 20, 25, 32, 40, 50, 65, 80, 100, 150, 200)
 SAMPLES = (4, 8, 16, 32, 64, 128, 256, 512, 1024)
-STEPS = (50, 75, 100, 150, 200, 300, 400, 600, 800, 1200, 1600, 2400, 3200, 4800, 6400, 9600)
+STEPS = tuple(round(50 * 1.2**n) for n in range(30))
+"""50 to 9,900: so dense that a budget of time is filled."""
 NEAR = 0.02
 """dB within which two choices count as equally good: the cheaper one is taken."""
 
 
 @dataclass(frozen=True)
 class Predictor:
-    """Costs and quality of any choice. base, gain, judged: dB, of the pilot (:mod:`.quality`); batch: views a step."""
+    """Costs and quality of any choice. base, gain, judged, reference: of the pilot (:mod:`.quality`); batch: views a
+    step."""
 
     pilot: Pilot
     wall: Costs
     processor: Costs
     prior: Prior
     base: float
-    gain: tuple[float, float]
+    gain: Gain
     judged: float
+    reference: float
     batch: int
 
     def choice(self, views: int, spp: int, steps: int) -> Choice:
@@ -54,7 +57,16 @@ class Predictor:
             choice=choice,
             seconds=seconds,
             cpu_seconds=self.processor.raytrace(choice.views, choice.spp) + self.processor.finetune(choice.steps),
-            psnr=predict(self.prior, self.base, self.gain, choice.views, choice.steps, noise, self.judged),
+            psnr=predict(
+                self.prior,
+                self.base,
+                self.gain,
+                choice.views,
+                choice.steps,
+                noise,
+                judged=self.judged,
+                reference=self.reference,
+            ),
         )
 
     def grid(self, candidates: int) -> Iterator[Prediction]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -19,10 +20,10 @@ from ..settings import Settings
 from ..workspace import Workspace
 from .choose import Predictor, best_within, budgets, cheapest_reaching
 from .pilot import FOLDER, run_pilot
-from .quality import Prior, load_prior, scene_gain, views_error
+from .quality import Measured, Prior, load_prior, scene_gain, views_error, with_noise, without_noise
 from .records import Pilot, Prediction, Route
-from .routes import break_even, routes
-from .seconds import Costs, Work
+from .routes import as_reported, break_even, routes
+from .seconds import Costs, Work, noise_at
 
 if TYPE_CHECKING:
     from ..session import Session
@@ -42,13 +43,15 @@ class Wanted:
     frames: int | None = None
 
 
-def make_plan(workspace: Workspace, settings: Settings, console: Console, wanted: Wanted) -> dict[str, Any]:
-    """Run the pilot where it is missing and write ``plan/plan.json`` -> its content.
+def make_plan(
+    workspace: Workspace, settings: Settings, console: Console, wanted: Wanted, prior: Prior | None = None
+) -> dict[str, Any]:
+    """Run the pilot where it is missing and write ``plan/plan.json`` -> its content. prior: by default the package's.
 
     Raises UserError: a budget that not even the smallest choice fits in, or a target that nothing reaches.
     """
     pilot = run_pilot(workspace, settings, console)
-    prior = load_prior()
+    prior = prior or load_prior()
     predictor = make_predictor(workspace, settings, pilot, prior)
     candidates = len(split_views(workspace)["train"])
     grid = list(predictor.grid(candidates))
@@ -59,8 +62,8 @@ def make_plan(workspace: Workspace, settings: Settings, console: Console, wanted
         "wanted": {"seconds": wanted.seconds, "psnr": wanted.psnr, "frames": wanted.frames},
         "pilot": {"fingerprint": pilot.fingerprint, "seconds": pilot.seconds, "load": pilot.load},
         "policy": policy_of(workspace, settings),
-        "base_psnr": predictor.base,
-        "gain": list(predictor.gain),
+        "base_psnr": with_noise(predictor.base, predictor.reference),
+        "gain": predictor.gain.most,
         "chosen": chosen.model_dump(mode="json") if chosen else None,
         "table": [p.model_dump(mode="json") for p in budgets(grid)],
         "prior": {"source": prior.source, "scenes": prior.scenes, "sd": prior.sd},
@@ -92,17 +95,37 @@ def make_predictor(workspace: Workspace, settings: Settings, pilot: Pilot, prior
         evaluation_spp=settings.raytrace.evaluation_spp,
     )
     base = frames.base.psnr
-    measured = frames.neural.psnr - base
     return Predictor(
         pilot=pilot,
         wall=Costs(pilot, work, "seconds"),
         processor=Costs(pilot, work, "cpu_seconds"),
         prior=prior,
         base=base,
-        gain=scene_gain(prior, measured, training.views, training.steps),
+        gain=scene_gain(prior, measured_gains(pilot, prior)),
         judged=views_error(frames.deviation, frames.views, work.tests),
+        reference=_reference_noise(settings, pilot),
         batch=settings.finetune.step2.batch,
     )
+
+
+def measured_gains(pilot: Pilot, prior: Prior) -> list[Measured]:
+    """What the pilot's networks add to its base image, dB, as they would from noiseless pictures."""
+    assert pilot.frames is not None and pilot.training is not None and pilot.trace is not None
+    training, frames = pilot.training, pilot.frames
+    noise = math.sqrt(prior.kappa) * noise_at(pilot.trace, training.spp)
+    return [
+        Measured(training.views, steps, without_noise(point.psnr, noise) - frames.base.psnr)
+        for steps, point in zip(training.steps, frames.neural, strict=True)
+    ]
+
+
+def _reference_noise(settings: Settings, pilot: Pilot) -> float:
+    """RMSE of the test views' references; 0 where the pilot cannot tell, for it denoised nothing."""
+    assert pilot.trace is not None
+    trace = settings.raytrace
+    if trace.evaluation_denoise and not trace.denoise:
+        return 0.0
+    return noise_at(pilot.trace, trace.evaluation_spp, raw=not trace.evaluation_denoise)
 
 
 def whether_to_train(
@@ -116,7 +139,8 @@ def whether_to_train(
     neural = cheapest_reaching(grid, at)
     width, height = predictor.pilot.size
     scale = predictor.wall.work.pixels / (width * height)
-    found = routes(predictor.pilot.frames, neural, predictor.wall.light(), scale, at, wanted.frames)
+    part = as_reported(predictor.pilot.frames, predictor.reference)
+    found = routes(part, neural, predictor.wall.light(), scale, at, wanted.frames)
     return found, at
 
 

@@ -3,8 +3,8 @@
     trace      a few views at few samples, the held-out ones at more
     light      small bakes
     base       base images of those views
-    training   some hundred steps on the few views
-    frames     the held-out views by the network, by the base image alone, and by path tracing with a denoiser
+    training   two networks on the few views, by a hundred steps and by three hundred
+    frames     the held-out views by the networks, by the base image alone, and by path tracing with a denoiser
 
 Its pictures lie in ``plan/pilot/`` until the last part is done. What it takes is booked in the ledger, stage ``plan``.
 """
@@ -33,7 +33,7 @@ from ..workspace import Workspace, digest
 from .pilot_parts import FOLDER, HELD_OUT, REFERENCE_SPP, RESOLUTION, SPP, STEPS, VIEWS, Piloting
 from .records import Pilot, Record
 
-VERSION = 3
+VERSION = 4
 FILE = "pilot.json"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +29,8 @@ from .records import BasePart, FramePart, LightPart, LightPoint, Traced, TracePa
 RESOLUTION = 128
 VIEWS, SPP = 6, 16
 HELD_OUT, REFERENCE_SPP = 6, 64
-STEPS = 150
+STEPS = (100, 300)
+"""Two trainings: from the second on, how fast a scene's network still gains is measured, not assumed."""
 RUNGS = (1, 4, 16, 64)
 METHODS = ("raw", "clean16-fast", "clean16")
 """Path tracing's samples, and what the denoiser is given (:mod:`..frames.rival`)."""
@@ -79,6 +81,7 @@ class Piloting:
                     seconds=result["seconds"],
                     cpu_seconds=result["cpu_seconds"],
                     noise_rmse=result.get("noise_rmse"),
+                    raw_rmse=_raw_rmse(result),
                 )
             )
         startup = max(0.0, took - sum(point.seconds for point in points) / workers)
@@ -130,16 +133,16 @@ class Piloting:
         )
 
     def training(self) -> TrainingPart:
-        """A short step 2."""
+        """Short step 2s."""
         view = self.train[0]
         task = {
             "kind": "train",
             "views": [view.model_dump(mode="json") for view in self.train],
             "base_files": [str(self._base_file("train", view)) for view in self.train],
             "images": [str(self._image(f"train-{view.name}")) for view in self.train],
-            "folder": str(self.folder / "model"),
+            "folders": [str(folder) for folder in self._models()],
             "fingerprint": self.run_id,
-            "epochs": max(2, round(STEPS * self.settings.finetune.step2.batch / len(self.train))),
+            "epochs": [max(2, round(steps / self._steps_per_epoch())) for steps in STEPS],
         }
         ((_, result),) = self._run("pilot: training", "dnrpipe.planning.worker", self._common(), [task], 1, {})
         patch = self.settings.finetune.step2.patch or max(view.width, view.height)
@@ -160,7 +163,7 @@ class Piloting:
         task = {
             "kind": "frames",
             "views": [view.model_dump(mode="json") for view in self.held_out],
-            "folder": str(self.folder / "model"),
+            "folders": [str(folder) for folder in self._models()],
             "light": str(self._light(light)) if light is not None else None,
             "samples": list(RUNGS),
             "methods": list(METHODS),
@@ -219,6 +222,12 @@ class Piloting:
         settings = self.settings.model_copy(update={"model": model}).model_dump(mode="json")
         return {"workspace": str(self.workspace.root), "settings": settings, "threads": 0}
 
+    def _steps_per_epoch(self) -> int:
+        return math.ceil(len(self.train) / self.settings.finetune.step2.batch)
+
+    def _models(self) -> list[Path]:
+        return [self.folder / f"model-{steps}" for steps in STEPS]
+
     def _image(self, name: str) -> Path:
         return self.folder / f"{name}.exr"
 
@@ -228,6 +237,12 @@ class Piloting:
     def _light(self, task: dict[str, Any]) -> Path:
         """The real light where it is on disk, else the pilot's."""
         return Path(task["output"]) if light_is_baked(task) else self.folder / "light.npz"
+
+
+def _raw_rmse(result: dict[str, Any]) -> float | None:
+    """RMSE of a view as it was traced; the tracer tells that of the picture as it is used, and both over its level."""
+    used, raw, relative = (result.get(name) for name in ("noise_rmse", "raw_noise", "noise"))
+    return used if not (used and raw and relative) else used * raw / relative
 
 
 def _views(workspace: Workspace) -> tuple[list[View], list[View]]:

@@ -1,47 +1,87 @@
 """PSNR by views, samples and training steps: what the network adds to its base image.
 
-    gain(V, I) = G * (1 - a (25 / V)^alpha - b (500 / I)^beta)
-    mse        = 10^(-(base + gain) / 10) + kappa * noise(S)^2
+    gain(V, I) = G * max(0, 1 - a (25 / V)^alpha - b (500 / I)^beta)
+    mse        = 10^(-(base + gain) / 10) + kappa * noise(S)^2 + reference^2
     PSNR       = -10 log10(mse)
 
 Notation
-    V, S, I   views, samples per pixel, optimiser steps
-    base      PSNR of the base image alone, dB; the pilot measures it
-    G         dB that the network adds with many views and steps; the scene's own, from the pilot and the prior
-    noise(S)  RMSE of a training picture in display space (:func:`.seconds.noise_at`)
-    a, alpha, b, beta, kappa   shared by all scenes: the prior, ``prior.json``, by ``python -m tools.plan_prior fit``
+    V, S, I     views, samples per pixel, optimiser steps
+    base        PSNR of the base image alone against the truth, dB; the pilot measures it
+    G           dB that the network adds with many views and steps; the scene's own
+    b           part of G that 500 steps still lack; the scene's own: some are learned in a hundred steps, some go on
+    noise(S)    RMSE of a training picture in display space (:func:`.seconds.noise_at`)
+    reference   RMSE of the test views' references, likewise: what the report will measure counts it
+    a, alpha, beta, kappa   shared by all scenes: the prior, ``prior.json``, by ``python -m tools.plan_prior fit``
 
-A scene's G is the mean of two guesses, each weighted by the inverse of its variance: the pilot's own gain over what
-the formula expects at the pilot's views and steps, and the mean of the prior's scenes.
+What is known of a scene's G and b is a density on a grid: normal in G and in log b as the prior's scenes are, times how
+well each point explains the gains that the pilot measured after fewer and after more steps.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib import resources
+
+import numpy as np
 
 from .records import Interval, Record
 
 NINE_IN_TEN = 1.645
-LEAST_SHARE = 0.05
+REACH, POINTS = 3.0, 41
+"""The grid reaches so many standard deviations to both sides, by so many points."""
+LEAST_MSE = 1e-6
+"""60 dB: what is left of a picture's error where its noise explains all of it."""
 
 
 class Prior(Record):
-    """Shared parameters; ``sd`` of a prediction by leaving scenes out, dB; where they come from."""
+    """Shared parameters; b is the median over scenes, b_spread the standard deviation of its logarithm; ``sd`` of a
+    prediction by leaving scenes out, dB; where they come from."""
 
     a: float
     alpha: float
     b: float
+    b_spread: float
     beta: float
     kappa: float
     gain_mean: float
     gain_sd: float
     pilot_sd: float
-    """dB: how far the pilot's G is off the scene's, by its standard deviation"""
+    """dB: how far a gain of the pilot is off the scene's, by its standard deviation"""
     sd: float
     scenes: list[str]
     source: str
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A network of the pilot: so many dB over its base image after so many views and steps."""
+
+    views: int
+    steps: int
+    gain: float
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Points of (G, b), [K] each, and their weights, which sum to 1."""
+
+    total: np.ndarray
+    missing: np.ndarray
+    weight: np.ndarray
+
+    def at(self, prior: Prior, views: float, steps: float) -> tuple[float, float]:
+        """(expected gain, its standard deviation), dB."""
+        gains = self.total * share(prior, self.missing, views, steps)
+        mean = float(self.weight @ gains)
+        return mean, math.sqrt(max(0.0, float(self.weight @ (gains - mean) ** 2)))
+
+    @property
+    def most(self) -> float:
+        """Expected G, dB."""
+        return float(self.weight @ self.total)
 
 
 def load_prior() -> Prior:
@@ -50,18 +90,23 @@ def load_prior() -> Prior:
     return Prior.model_validate(json.loads(text))
 
 
-def share(prior: Prior, views: float, steps: float) -> float:
-    """Part of G that so many views and steps reach; may be negative: a network that has hardly begun does harm."""
-    return 1 - prior.a * (25 / views) ** prior.alpha - prior.b * (500 / steps) ** prior.beta
+def share(prior: Prior, missing: np.ndarray | float, views: float, steps: float) -> np.ndarray:
+    """Part of G that so many views and steps reach, for each b of ``missing``."""
+    reached = 1 - prior.a * (25 / views) ** prior.alpha - np.asarray(missing) * (500 / steps) ** prior.beta
+    return np.maximum(0.0, reached)
 
 
-def scene_gain(prior: Prior, measured: float, views: int, steps: int) -> tuple[float, float]:
-    """(G, its standard deviation) of a scene whose pilot gained ``measured`` dB with so many views and steps."""
-    part = max(share(prior, views, steps), LEAST_SHARE)
-    own, own_variance = measured / part, (prior.pilot_sd / part) ** 2
-    weight = prior.gain_sd**2 / (prior.gain_sd**2 + own_variance)
-    gain = weight * own + (1 - weight) * prior.gain_mean
-    return gain, math.sqrt(weight * own_variance)
+def scene_gain(prior: Prior, measured: Sequence[Measured]) -> Gain:
+    """What is known of a scene's G and b after the pilot's networks; without any, the prior."""
+    line = np.linspace(-REACH, REACH, POINTS)
+    u, v = (grid.ravel() for grid in np.meshgrid(line, line, indexing="ij"))
+    total, missing = prior.gain_mean + prior.gain_sd * u, prior.b * np.exp(prior.b_spread * v)
+    logs = -(u**2 + v**2) / 2
+    for one in measured:
+        logs -= ((total * share(prior, missing, one.views, one.steps) - one.gain) / prior.pilot_sd) ** 2 / 2
+    logs[total <= 0] = -np.inf  # a network that is trained to its end does no harm
+    weight = np.exp(logs - logs.max())
+    return Gain(total, missing, weight / weight.sum())
 
 
 def views_error(deviation: float, judged: int, tests: int) -> float:
@@ -69,12 +114,30 @@ def views_error(deviation: float, judged: int, tests: int) -> float:
     return deviation * math.sqrt(max(0.0, 1 / judged - 1 / max(tests, judged)))
 
 
+def with_noise(psnr: float, noise: float) -> float:
+    """PSNR, dB, of a picture once independent noise of RMSE ``noise`` is added to it, or to its reference."""
+    return -10 * math.log10(10 ** (-psnr / 10) + noise**2)
+
+
+def without_noise(psnr: float, noise: float) -> float:
+    """The reverse; at most 60 dB, where the noise explains all of the error."""
+    return -10 * math.log10(max(10 ** (-psnr / 10) - noise**2, LEAST_MSE))
+
+
 def predict(
-    prior: Prior, base: float, gain: tuple[float, float], views: int, steps: int, noise: float, judged: float = 0.0
+    prior: Prior,
+    base: float,
+    gain: Gain,
+    views: int,
+    steps: int,
+    noise: float,
+    *,
+    judged: float = 0.0,
+    reference: float = 0.0,
 ) -> Interval:
-    """PSNR, dB. gain: of :func:`scene_gain`. noise: RMSE of the training pictures. judged: of :func:`views_error`."""
-    part = share(prior, views, steps)
-    clean = 10 ** (-(base + gain[0] * part) / 10)
-    expected = -10 * math.log10(clean + prior.kappa * noise**2)
-    spread = NINE_IN_TEN * math.hypot(prior.sd, gain[1] * part, judged)
+    """PSNR, dB. gain: of :func:`scene_gain`. noise: RMSE of the training pictures. judged: of :func:`views_error`.
+    reference: RMSE of the references."""
+    added, unsure = gain.at(prior, views, steps)
+    expected = with_noise(base + added, math.hypot(math.sqrt(prior.kappa) * noise, reference))
+    spread = NINE_IN_TEN * math.hypot(prior.sd, unsure, judged)
     return Interval(expected=expected, low=expected - spread, high=expected + spread)

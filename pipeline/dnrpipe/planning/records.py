@@ -19,13 +19,15 @@ class Record(BaseModel):
 
 
 class Traced(Record):
-    """One path-traced view. noise_rmse: of the picture as it is used (denoised where the settings say so)."""
+    """One path-traced view. noise_rmse: of the picture as it is used (denoised where the settings say so); raw_rmse: as
+    it was traced."""
 
     spp: int
     pixels: int
     seconds: float
     cpu_seconds: float
     noise_rmse: float | None
+    raw_rmse: float | None = None
 
 
 class TracePart(Record):
@@ -62,11 +64,12 @@ class BasePart(Record):
 
 
 class TrainingPart(Record):
-    """seconds, cpu_seconds: of one optimiser step. startup: of the first epoch beyond its steps."""
+    """Networks trained anew with rising numbers of steps. seconds, cpu_seconds: of one optimiser step of the longest
+    training; startup: of its first epoch beyond its steps."""
 
     views: int
     spp: int
-    steps: int
+    steps: list[int]
     pixels: int
     seconds: float
     cpu_seconds: float
@@ -84,10 +87,11 @@ class FramePoint(Record):
 
 
 class FramePart(Record):
-    """Frames of the pilot's held-out views. deviation: of the base image's PSNR over these views, dB."""
+    """Frames of the pilot's held-out views. neural: a point per training. deviation: of the base image's PSNR over
+    these views, dB."""
 
     base: FramePoint
-    neural: FramePoint
+    neural: list[FramePoint]
     rival: list[FramePoint]
     views: int
     deviation: float

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 
 from ..costs import break_even_frames
 from ..frames.ladder import crossover, frontier
+from .quality import with_noise
 from .records import FramePart, FramePoint, Prediction, Route
 
 FURTHEST = 64.0
@@ -45,6 +46,21 @@ def seconds_for(line: Sequence[tuple[str, float, float]], psnr: float) -> tuple[
     return (seconds, True) if seconds <= FURTHEST * right else None
 
 
+def as_reported(part: FramePart, reference: float) -> FramePart:
+    """The part with every PSNR as a report measures it: against references whose own noise is ``reference``, RMSE."""
+
+    def shown(point: FramePoint) -> FramePoint:
+        return point.model_copy(update={"psnr": with_noise(point.psnr, reference)})
+
+    return part.model_copy(
+        update={
+            "base": shown(part.base),
+            "neural": [shown(point) for point in part.neural],
+            "rival": [shown(point) for point in part.rival],
+        }
+    )
+
+
 def routes(
     part: FramePart, neural: Prediction | None, light_seconds: float, scale: float, psnr: float, frames: int
 ) -> list[Route]:
@@ -68,7 +84,7 @@ def routes(
     found.append(
         _route("base image alone", "baked light, no network", light_seconds, alone, frames, base, base >= psnr)
     )
-    frame = part.neural.ms / 1000 * scale
+    frame = part.neural[-1].ms / 1000 * scale
     if neural is None:
         found.append(_route("neural renderer", "no choice is expected to reach it", 0.0, frame, frames, None, False))
     else:

@@ -48,15 +48,16 @@ def view_line(part: TracePart, clock: Clock) -> ViewLine:
     return ViewLine(float(alone[0]), 0.0) if errors[0] <= errors[1] else ViewLine(0.0, float(alone[1]))
 
 
-def noise_at(part: TracePart, spp: int) -> float:
+def noise_at(part: TracePart, spp: int, raw: bool = False) -> float:
     """RMSE of a view at ``spp`` samples, display space: c * spp^-p through the pilot's points; 0 where unknown.
 
-    p is 1/2 for raw pictures; denoised ones fall more slowly, so it is fitted, between 0 and 1/2.
+    p is 1/2 for raw pictures; denoised ones fall more slowly, so it is fitted, between 0 and 1/2. raw: of the pictures
+    as they are traced, else as the settings use them.
     """
     groups: dict[int, list[float]] = {}
     for point in part.points:
-        if point.noise_rmse:
-            groups.setdefault(point.spp, []).append(point.noise_rmse)
+        if rmse := point.raw_rmse if raw else point.noise_rmse:
+            groups.setdefault(point.spp, []).append(rmse)
     if not groups:
         return 0.0
     x = np.log([float(n) for n in groups])

@@ -67,7 +67,7 @@ def why(record: dict[str, Any]) -> list[str]:
     seconds, psnr, what = one["seconds"], one["psnr"]["expected"], one["choice"]
     found = [
         f"The base image alone gives {record['base_psnr']:.1f} dB; the network is expected to add"
-        f" {psnr - record['base_psnr']:.1f}, of at most {record['gain'][0]:.1f} with many views and steps."
+        f" {psnr - record['base_psnr']:.1f}, of at most {record['gain']:.1f} with many views and steps."
     ]
     most = "training" if seconds["finetune"] > seconds["raytrace"] else "ray tracing and the baked light"
     share = max(seconds["finetune"], seconds["raytrace"]) / seconds["total"]["expected"]

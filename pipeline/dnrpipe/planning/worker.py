@@ -1,4 +1,4 @@
-"""The pilot's worker: a short training, and frames of ours and of path tracing with a denoiser.
+"""The pilot's worker: short trainings, and frames of ours and of path tracing with a denoiser.
 
 Notation
     A, B      two independent path-traced pictures of a held-out view in display space, as they were traced
@@ -38,11 +38,11 @@ class Worker:
     """Answers the pilot's tasks.
 
     common: {"workspace", "settings", "threads"}
-    task "train": {"views", "base_files", "images", "folder", "fingerprint", "epochs"}
-        -> {"seconds", "cpu_seconds": of a step, "startup", "steps", "threads"}
-    task "frames": {"views", "folder": of the model, "light", "samples", "methods": the ladder}
-        -> {"base", "neural", "rival": rows {"name", "ms", "psnr"}, "unknown": pixels that no reference knows}; PSNR
-        by :func:`without_reference`
+    task "train": {"views", "base_files", "images", "fingerprint", "folders", "epochs": a training each}
+        -> {"seconds", "cpu_seconds": of a step of the last, "startup", "steps": of each, "threads"}
+    task "frames": {"views", "folders": of the models, "light", "samples", "methods": the ladder}
+        -> {"base", "rival": rows {"name", "ms", "psnr"}, "neural": a row per model, "unknown": pixels that no
+        reference knows}; PSNR by :func:`without_reference`
     """
 
     def __init__(self, common: dict[str, Any]) -> None:
@@ -59,21 +59,30 @@ class Worker:
         return self._train(task, views) if task["kind"] == "train" else self._frames(task, views)
 
     def _train(self, task: dict[str, Any], views: list[View]) -> dict[str, Any]:
-        from dnrtrain.checkpoint import read_record
-        from dnrtrain.step2 import run_step2
         from dnrtrain.weights import WeightsMissing, load_weights
-
-        from ..training import torch_device
 
         try:
             weights: Any = load_weights()
         except WeightsMissing:  # training will do without, too
             weights = None
+        found = [
+            self._train_one(task, views, weights, Path(folder), epochs)
+            for folder, epochs in zip(task["folders"], task["epochs"], strict=True)
+        ]
+        return found[-1] | {"steps": [one["steps"] for one in found], "threads": self.threads}
+
+    def _train_one(
+        self, task: dict[str, Any], views: list[View], weights: Any, folder: Path, epochs: int
+    ) -> dict[str, Any]:
+        from dnrtrain.checkpoint import read_record
+        from dnrtrain.step2 import run_step2
+
+        from ..training import torch_device
+
         started = time.monotonic()
         step2 = self.settings.finetune.step2.model_copy(
-            update={"epochs": task["epochs"], "start": "fresh", "validation_views": 0}
+            update={"epochs": epochs, "start": "fresh", "validation_views": 0}
         )
-        folder = Path(task["folder"])
         events = run_step2(
             self._load(views, task),
             None,
@@ -101,7 +110,6 @@ class Worker:
             "cpu_seconds": sum(entry["cpu_seconds"] for entry in later) / steps,
             "startup": max(0.0, took - seconds * total),
             "steps": total,
-            "threads": self.threads,
         }
 
     def _load(self, views: list[View], task: dict[str, Any]) -> ViewSet:
@@ -119,25 +127,33 @@ class Worker:
         )
 
     def _frames(self, task: dict[str, Any], views: list[View]) -> dict[str, Any]:
+        from dnrtrain.checkpoint import load_model
+
         from ..frames.ours import BASE, NEURAL, Ours
         from ..frames.rival import climb, make_rungs
         from ..frames.scene import Clock, open_scene
 
         scene = open_scene(self.workspace.root, views, self.threads, self.settings)
         light = Path(task["light"]) if task["light"] else None
-        ours = Ours(scene, (), Path(task["folder"]), light)
+        folders = [Path(folder) for folder in task["folders"]]
+        ours = Ours(scene, (), folders[-1], light)
+        models = [load_model(folder) for folder in folders]
         truth = [_references(scene, view, number) for number, view in enumerate(views)]
         clock, samples, methods = Clock("cpu", self.threads), tuple(task["samples"]), tuple(task["methods"])
         for _ in range(WARM):
             climb(scene, views[0], 1, clock, make_rungs(samples, methods))
             ours.frame(views[0], clock)
         rungs = make_rungs(samples, methods)
-        rows: dict[str, _Row] = {}
+        base, neural = _Row(), [_Row() for _ in models]
         for number, view in enumerate(views):
             climb(scene, view, 10_007 * (number + 1), clock, rungs)
-            for name, frame in ours.frame(view, clock).items():
-                row = rows.setdefault(BASE if name.startswith(BASE) else NEURAL, _Row())
-                row.add(frame["picture"], truth[number], frame["parts"])
+            for row, ours.model in zip(neural, models, strict=True):
+                frames = ours.frame(view, clock)
+                for name, frame in frames.items():
+                    if name.startswith(NEURAL):
+                        row.add(frame["picture"], truth[number], frame["parts"])
+                    elif row is neural[-1]:
+                        base.add(frame["picture"], truth[number], frame["parts"])
         rival = []
         for rung in rungs.values():
             row = _Row()
@@ -146,10 +162,10 @@ class Worker:
                 row.add(picture.float(), truth[number], parts)
             rival.append({"name": rung.name, **row.summary()})
         return {
-            "base": {"name": BASE, **rows[BASE].summary()},
-            "neural": {"name": NEURAL, **rows[NEURAL].summary()},
+            "base": {"name": BASE, **base.summary()},
+            "neural": [{"name": NEURAL, **row.summary()} for row in neural],
             "rival": rival,
-            "deviation": float(np.std(rows[BASE].psnr, ddof=1)) if len(views) > 1 else 0.0,
+            "deviation": float(np.std(base.psnr, ddof=1)) if len(views) > 1 else 0.0,
             "unknown": sum(int((~known).sum()) for _, _, known in truth),
         }
 
