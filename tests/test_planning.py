@@ -69,10 +69,8 @@ def pilot() -> Pilot:
         size=(128, 128),
         trace=trace_part(5e-7, 5e-6),
         light=LightPart(
-            points=[
-                LightPoint(size=16, spp=1, seconds=1.0, cpu_seconds=2.0),
-                LightPoint(size=256, spp=32, seconds=2.5, cpu_seconds=4.5),
-            ],
+            bake=LightPoint(size=256, spp=32, seconds=1.5, cpu_seconds=2.5),
+            kept=False,
             startup=4.0,
         ),
         base=BasePart(pixels=128 * 128, seconds=0.05, cpu_seconds=0.1, startup=3.0),
@@ -125,8 +123,8 @@ def test_noise_falls_with_the_power_that_was_measured(power: float) -> None:
 
 def test_light_is_extrapolated_by_texels_and_paths() -> None:
     costs = predictor().wall
-    slope = 1.5 / (256**2 * 32)  # of the bakes above: 1 s of start, 1.5 s of paths
-    assert costs.light() == pytest.approx(4.0 + 1.0 + 512**2 * 128 * slope)
+    slope = 1.5 / (256**2 * 32)  # of the bake above
+    assert costs.light() == pytest.approx(4.0 + 512**2 * 128 * slope)
     done = Costs(costs.pilot, Work(1, 1, None, 0.0, 0, 1), "seconds")
     assert done.light() == 0.0
 

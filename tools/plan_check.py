@@ -117,18 +117,23 @@ def clocked(predictor: Predictor, results: dict[str, Any], choice: Choice) -> fl
     )
 
 
+def _light(results: dict[str, Any]) -> float:
+    """Seconds of the baked light, which the pilot has baked: known to it, and counted on both sides."""
+    return next(point for point in results["points"] if point["kind"] == "base")["parts"]["light"]
+
+
 def _expected(predictor: Predictor, results: dict[str, Any], wanted: float, frames: int) -> list[Route]:
     """The plan's routes by the frontier's clock."""
+    light = _light(results)
     enough = [p for p in predictor.grid(max(VIEWS)) if p.psnr.expected >= wanted]
     neural = min(enough, key=lambda p: clocked(predictor, results, p.choice)) if enough else None
     if neural is not None:
-        seconds = clocked(predictor, results, neural.choice)
+        seconds = clocked(predictor, results, neural.choice) + light
         clock = neural.seconds.model_copy(update={"total": Interval(expected=seconds, low=seconds, high=seconds)})
         neural = neural.model_copy(update={"seconds": clock})
     width, height = predictor.pilot.size
     scale = predictor.wall.work.pixels / (width * height)
     assert predictor.pilot.frames is not None  # make_predictor asked for it
-    light = predictor.processor.light() / results["cores"]
     part = as_reported(predictor.pilot.frames, predictor.reference)
     return routes(part, neural, light, scale, wanted, frames)
 

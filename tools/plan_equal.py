@@ -5,8 +5,8 @@
 
 T is a share of the time that the preset's own choice is expected to take. The preset's side keeps its views and samples
 and takes as many steps as are expected to fit into T. Both sides run on the wall clock, in copies of the workspace that
-hold the passes and the test views' references and nothing else: light, tracing and training are done anew, one run at a
-time. Needs a machine that is otherwise idle. What is in ``--out`` is not run again.
+hold the passes, the light that the pilot baked and the test views' references: tracing, base images and training are
+done anew, one run at a time. Needs a machine that is otherwise idle. What is in ``--out`` is not run again.
 """
 
 from __future__ import annotations
@@ -35,7 +35,17 @@ from dnrpipe.session import Session, resolve_settings
 from dnrpipe.workspace import Workspace
 from dnrtrain.atomic import write_json
 
-KEPT = ("scene", "passes", "cameras", "bakes", "plan", "manifest.json", "dnrpipe.toml", "raytraced/test")
+KEPT = (
+    "scene",
+    "passes",
+    "cameras",
+    "bakes",
+    "plan",
+    "base/light.npz",
+    "manifest.json",
+    "dnrpipe.toml",
+    "raytraced/test",
+)
 SIDES = ("preset", "plan")
 OPTIONS = {"as_json": False, "quiet": True, "preset": None, "assignments": (), "force": False}
 

@@ -139,7 +139,7 @@ def _prepared(
     """(what the workers share, their environment, a hash of all that decides the images but for the view)."""
     common, environment, task, stamp = renderer_inputs(workspace, settings, plan)
     if task is not None:
-        _bake(workspace, console, run_id, stage, common, environment, task)
+        bake_light(workspace, console, run_id, stage, common, environment, task)
     return common, environment, stamp
 
 
@@ -204,7 +204,7 @@ def light_is_baked(task: dict[str, Any]) -> bool:
     return _light_print(Path(task["output"])) == task["fingerprint"]
 
 
-def _bake(
+def bake_light(
     workspace: Workspace,
     console: Console,
     run_id: str,
@@ -212,10 +212,15 @@ def _bake(
     common: dict[str, Any],
     environment: dict[str, str],
     task: dict[str, Any],
-) -> None:
-    """Bake the light where it is missing or of other inputs."""
+) -> dict[str, Any] | None:
+    """Bake the light where it is missing or of other inputs -> the worker's answer; None where nothing was due.
+
+    common, environment, task: of :func:`renderer_inputs`. Booked in the ledger under ``stage``.
+    Raises UserError: it failed twice.
+    """
     if light_is_baked(task):
-        return
+        return None
+    result: dict[str, Any] = {}
     shared = {"bundle": common["bundle"], "variant": common["variant"]}
     with console.bar("baking light", 1) as bar:
         outcomes = run_tasks(
@@ -252,6 +257,7 @@ def _bake(
                     detail={"texels": result["texels"], "lost": result["lost"]},
                 )
             )
+    return result
 
 
 def _light_print(path: Path) -> str | None:

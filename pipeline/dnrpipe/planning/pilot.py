@@ -1,7 +1,7 @@
 """The pilot: every kind of work once, small; kept part by part in ``plan/pilot.json``, so that it goes on after Ctrl-C.
 
     trace      a few views at few samples, the held-out ones at more
-    light      small bakes
+    light      the real bake, kept; a smaller one where that would take too long
     base       base images of those views
     training   two networks on the few views, by a hundred steps and by three hundred
     frames     the held-out views by the networks, by the base image alone, and by path tracing with a denoiser
@@ -31,7 +31,7 @@ from ..scene_files import read_json, scene_fingerprint
 from ..settings import Settings
 from ..workspace import Workspace, digest
 from .pilot_parts import FOLDER, HELD_OUT, REFERENCE_SPP, RESOLUTION, SPP, STEPS, VIEWS, Piloting
-from .records import Pilot, Record
+from .records import LightPart, Pilot, Record
 
 VERSION = 4
 FILE = "pilot.json"
@@ -83,7 +83,8 @@ def run_pilot(workspace: Workspace, settings: Settings, console: Console) -> Pil
         seconds = time.monotonic() - started
         found = found.model_copy(update={name: made, "seconds": found.seconds + seconds})
         write_json(pilot_path(workspace), found.model_dump(mode="json"))
-        _book(workspace, run_id, name, seconds)
+        booked = made.bake.seconds if isinstance(made, LightPart) and made.kept else 0.0
+        _book(workspace, run_id, name, seconds - booked)
     shutil.rmtree(piloting.folder, ignore_errors=True)
     return found
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from dnrtrain.contract import View
 
-from ..base import light_is_baked, renderer_inputs
+from ..base import bake_light, light_is_baked, renderer_inputs
 from ..cameras import scaled_to
 from ..console import Console
 from ..effects.plan import EffectPlan
@@ -34,8 +34,8 @@ STEPS = (100, 300)
 RUNGS = (1, 4, 16, 64)
 METHODS = ("raw", "clean16-fast", "clean16")
 """Path tracing's samples, and what the denoiser is given (:mod:`..frames.rival`)."""
-LIGHT_SHARE, LIGHT_SPP = 2, 32
-"""The pilot's light has a side of 1/LIGHT_SHARE of the real one's, and at most so many paths a texel."""
+LIGHT_PATHS = 2 * 512 * 512 * 128
+"""Paths of a bake of light that the pilot can afford: twice what ``light_spp = auto`` asks for at any size."""
 TIMEOUT = 600.0
 """Seconds after which a part counts as hung: ten times what the whole pilot should take."""
 FOLDER = "plan"
@@ -88,24 +88,27 @@ class Piloting:
         return TracePart(points=points, workers=workers, startup=startup)
 
     def light(self) -> LightPart | None:
-        """Small bakes, unless there is no light to bake or it is on disk."""
+        """The real light, kept, for the quality of base images hangs on its paths; fewer paths where that is too dear.
+
+        None where there is no light to bake or it is on disk.
+        """
         common, environment, task, _ = renderer_inputs(self.workspace, self.settings, self.plan)
         if task is None or light_is_baked(task):
             return None
-        size, spp = max(16, task["size"] // LIGHT_SHARE), min(LIGHT_SPP, task["spp"])
-        tasks = [
-            task | {"size": 16, "spp": 1, "output": str(self.folder / "warm.npz")},
-            task | {"size": size, "spp": spp, "output": str(self.folder / "light.npz")},
-        ]
-        shared = {"bundle": common["bundle"], "variant": common["variant"]}
+        size, spp = task["size"], max(1, min(task["spp"], LIGHT_PATHS // task["size"] ** 2))
         started = time.monotonic()
-        answers = self._run("pilot: baking light", "dnrpipe.raytrace.light_worker", shared, tasks, 1, environment)
+        if kept := spp == task["spp"]:
+            result = bake_light(self.workspace, self.console, self.run_id, "plan", common, environment, task)
+            assert result is not None  # it is not on disk
+        else:
+            shared = {"bundle": common["bundle"], "variant": common["variant"]}
+            small = task | {"spp": spp, "output": str(self.folder / "light.npz")}
+            ((_, result),) = self._run(
+                "pilot: baking light", "dnrpipe.raytrace.light_worker", shared, [small], 1, environment
+            )
         took = time.monotonic() - started
-        points = [
-            LightPoint(size=task["size"], spp=task["spp"], seconds=result["seconds"], cpu_seconds=result["cpu_seconds"])
-            for task, result in answers
-        ]
-        return LightPart(points=points, startup=max(0.0, took - sum(point.seconds for point in points)))
+        bake = LightPoint(size=size, spp=spp, seconds=result["seconds"], cpu_seconds=result["cpu_seconds"])
+        return LightPart(bake=bake, startup=max(0.0, took - bake.seconds), kept=kept)
 
     def base(self) -> BasePart:
         """Base images of all views of the pilot."""

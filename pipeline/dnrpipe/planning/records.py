@@ -48,9 +48,10 @@ class LightPoint(Record):
 
 
 class LightPart(Record):
-    """points: one bake so small that it is all start, and a larger one. startup: of the worker."""
+    """One bake. startup: of the worker. kept: it is the real light, on disk and in the ledger as such."""
 
-    points: list[LightPoint]
+    bake: LightPoint
+    kept: bool
     startup: float
 
 

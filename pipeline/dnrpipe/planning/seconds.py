@@ -2,7 +2,7 @@
 
     view      t = pixels * (b * spp + c)        (c: denoiser and its guides, where views are denoised)
     stage     start of the workers + views * t / workers
-    light     start of the worker + start of the bake + slope * texels^2 * paths
+    light     start of the worker + slope * texels^2 * paths
     base      start + views * t * (pixels / pilot's pixels)
     training  start + steps * t * (trained pixels / pilot's)
 
@@ -117,10 +117,8 @@ class Costs:
         if part is None or self.work.light is None:
             return 0.0
         size, spp = self.work.light
-        first, last = part.points  # the first is so small that it is all start
-        start, whole = getattr(first, self.clock), getattr(last, self.clock)
-        slope = max(0.0, whole - start) / (last.size**2 * last.spp)
-        return self._start(part.startup) + start + slope * size**2 * spp
+        slope = getattr(part.bake, self.clock) / (part.bake.size**2 * part.bake.spp)
+        return self._start(part.startup) + slope * size**2 * spp
 
     def _traced(self, views: int, spp: int) -> float:
         part = self.pilot.trace
