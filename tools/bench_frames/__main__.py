@@ -12,6 +12,7 @@ from typing import Any
 
 from dnrpipe.errors import UserError
 from dnrpipe.raytrace.variants import choose_variant
+from dnrpipe.thread_waiting import set_thread_waiting
 
 
 def main() -> int:
@@ -41,8 +42,7 @@ def _one(options: argparse.Namespace) -> int:
 
     try:
         os.environ.update(choose_variant().environment)  # before anything imports Mitsuba
-        # As the command line does: waiting threads that spin cost processor time on a machine that does other things.
-        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+        set_thread_waiting(os.environ)  # as the command line does
         from .run import Options, bench
 
         (root,) = options.workspaces

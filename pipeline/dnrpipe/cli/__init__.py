@@ -82,9 +82,9 @@ for _command in (
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point: runs the command and turns every expected failure into one line and an exit code."""
-    # Torch's threads wait asleep, not spinning (read when torch is loaded): on a busy machine training is 2-4 times
-    # faster so. Measured on two cores with four other processes: 56 instead of 210 ms a step.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    from ..thread_waiting import set_thread_waiting
+
+    set_thread_waiting(os.environ)
     code = _main(arguments)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is written; a late Ctrl-C must not spoil the exit code
     sys.exit(code)
