@@ -10,9 +10,6 @@ Whether to train at all is asked for each scene at the PSNR of its best measured
 costs is read off the frontier: path tracing on its measured ladder, the base image where it is good enough, the
 cheapest measured neural point that is. The answer counts as right where the route it names costs at most 15 % more
 than the cheapest.
-
-What planning buys is asked at the price of each measured point of the preset's own views and samples: of the measured
-points that it expects to cost no more, the plan takes the one it expects to be best.
 """
 
 from __future__ import annotations
@@ -42,8 +39,8 @@ FRAMES = (200, 2000)
 NEAR = 1.15
 
 
-def opened(root: Path, scene: str, cells: Path) -> tuple[dict[str, Any], Predictor, Choice]:
-    """(what the frontier measured, what the plan predicts with, the settings' own views and samples).
+def opened(root: Path, scene: str, cells: Path) -> tuple[dict[str, Any], Predictor]:
+    """(what the frontier measured, what the plan predicts with).
 
     Raises UserError: no pilot, or no frontier.
     """
@@ -54,8 +51,7 @@ def opened(root: Path, scene: str, cells: Path) -> tuple[dict[str, Any], Predict
     results = read_frontier(root / "frontier" / "results.json")
     prior = without(read_cells(cells), scene, str(cells))
     settings = resolve_settings(workspace, {}, None)
-    default = Choice(views=settings.select.budget, spp=settings.raytrace.spp, epochs=0, steps=0)
-    return results, make_predictor(workspace, settings, pilot, prior), default
+    return results, make_predictor(workspace, settings, pilot, prior)
 
 
 def check(scene: str, results: dict[str, Any], predictor: Predictor) -> list[dict[str, Any]]:
@@ -138,32 +134,6 @@ def _expected(predictor: Predictor, results: dict[str, Any], wanted: float, fram
     return routes(part, neural, light, scale, wanted, frames)
 
 
-def against_default(scene: str, results: dict[str, Any], predictor: Predictor, default: Choice) -> list[dict[str, Any]]:
-    """Per measured point of ``default``'s views and samples: what the plan takes at its price, measured of both."""
-    neural = [point for point in results["points"] if point["kind"] == "ours"]
-
-    def predicted(point: dict[str, Any]) -> tuple[float, float]:
-        choice = predictor.choice(point["views"], point["spp"], point["steps"])
-        return clocked(predictor, results, choice), predictor.predict(choice).psnr.expected
-
-    found = []
-    for usual in neural:
-        if (usual["views"], usual["spp"]) != (default.views, default.spp):
-            continue
-        within = [point for point in neural if predicted(point)[0] <= predicted(usual)[0]]
-        taken = max(within, key=lambda point: predicted(point)[1])
-        found.append(
-            {
-                "scene": scene,
-                "default": usual["name"],
-                "taken": taken["name"],
-                "seconds": [round(point["upfront"] - point["parts"]["passes"], 1) for point in (usual, taken)],
-                "psnr": [round(point["psnr"], 2) for point in (usual, taken)],
-            }
-        )
-    return found
-
-
 def _actual(results: dict[str, Any], neural: list[dict[str, Any]], wanted: float, frames: int) -> dict[str, float]:
     """Seconds of each route that reaches ``wanted``, without the candidates' passes, which the plan takes as given."""
 
@@ -182,15 +152,23 @@ def _actual(results: dict[str, Any], neural: list[dict[str, Any]], wanted: float
 
 
 def markdown(record: dict[str, Any]) -> str:
-    """Predicted and actual side by side, medians below."""
-    lines = [
-        "| scene | point | tracing, CPU s | actual | training, CPU s | actual | PSNR, dB | actual |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for row in record["rows"]:
-        cells = [f"{value:.1f}" for name in ("tracing", "training", "psnr") for value in row[name]]
-        lines.append(f"| {row['scene']} | {row['name']} | {' | '.join(cells)} |")
+    """Predicted and actual PSNR of the points that all scenes have, how far off the seconds are; medians below."""
     rows = record["rows"]
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    points = [
+        name
+        for name in dict.fromkeys(row["name"] for row in rows)
+        if {row["scene"] for row in rows if row["name"] == name} == set(scenes)
+    ]
+    lines = [
+        f"| scene | tracing | training | {' | '.join(points)} |",
+        "|" + "---|" * (3 + len(points)),
+    ]
+    for scene in scenes:
+        own = {row["name"]: row for row in rows if row["scene"] == scene}
+        seconds = [f"{100 * (_ratio(list(own.values()), name) - 1):+.0f} %" for name in ("tracing", "training")]
+        psnr = ["{:.1f} / {:.1f}".format(*own[name]["psnr"]) for name in points]
+        lines.append(f"| {scene} | {' | '.join([*seconds, *psnr])} |")
     off = {
         name: statistics.median(abs(r[name][0] / r[name][1] - 1) for r in rows)
         for name in ("tracing", "training", "total")
@@ -204,9 +182,11 @@ def markdown(record: dict[str, Any]) -> str:
     ]
     if record.get("routes"):
         lines += ["", *_routes_table(record["routes"])]
-    if record.get("default"):
-        lines += ["", *_default_table(record["default"])]
     return "\n".join(lines)
+
+
+def _ratio(rows: list[dict[str, Any]], name: str) -> float:
+    return statistics.median(row[name][0] / row[name][1] for row in rows)
 
 
 def _routes_table(found: list[dict[str, Any]]) -> list[str]:
@@ -228,19 +208,6 @@ def _routes_table(found: list[dict[str, Any]]) -> list[str]:
     return [*lines, "", f"Right in {right} of {len(found)} cases."]
 
 
-def _default_table(found: list[dict[str, Any]]) -> list[str]:
-    lines = [
-        "| scene | the preset's views and samples | s | PSNR, dB | the plan takes | s | PSNR, dB |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for one in found:
-        (usual, taken), (before, after) = one["seconds"], one["psnr"]
-        points = f"{one['default']} | {usual:.0f} | {before:.2f} | {one['taken']} | {taken:.0f} | {after:.2f}"
-        lines.append(f"| {one['scene']} | {points} |")
-    won = statistics.mean(one["psnr"][1] - one["psnr"][0] for one in found)
-    return [*lines, "", f"On average {won:+.2f} dB."]
-
-
 def main() -> int:
     """Exit code 2 where a workspace cannot be checked."""
     parser = argparse.ArgumentParser(prog="python -m tools.plan_check", description=__doc__)
@@ -250,16 +217,14 @@ def main() -> int:
     options = parser.parse_args()
     rows: list[dict[str, Any]] = []
     asked: list[dict[str, Any]] = []
-    usual: list[dict[str, Any]] = []
     try:
         for text in options.workspaces:
             scene, _, root = text.rpartition("=")
             path = Path(root)
             name = scene or path.name.removesuffix(".dnr")
-            results, predictor, default = opened(path, name, options.cells)
+            results, predictor = opened(path, name, options.cells)
             rows += check(name, results, predictor)
             asked += routes_of(name, results, predictor)
-            usual += against_default(name, results, predictor, default)
     except UserError as error:
         print(error, file=sys.stderr)
         return 2
@@ -268,7 +233,6 @@ def main() -> int:
         "command": "python -m tools.plan_check " + " ".join(sys.argv[1:]),
         "rows": rows,
         "routes": asked,
-        "default": usual,
     }
     if options.out:
         write_json(options.out, record)

@@ -6,7 +6,7 @@
 ``collect`` gathers cells (views, samples, steps, PSNR, PSNR of the base image, noise of training pictures and of
 references) of `dnrpipe frontier`, of `dnrpipe ablate`, and of its own older output; and the pilots beside frontiers.
 ``fit`` reads that, fits :mod:`dnrpipe.planning.quality`, leaves every scene that has a pilot out in turn, predicts its
-cells from that pilot, and prints how far off that is.
+frontier (the same test views) from that pilot, and prints how far off that is.
 """
 
 from __future__ import annotations
@@ -22,7 +22,15 @@ import numpy as np
 import torch
 
 from dnrpipe.planning.pilot import read_pilot
-from dnrpipe.planning.quality import Measured, Prior, load_prior, predict, scene_gain, without_noise
+from dnrpipe.planning.quality import (
+    Measured,
+    Prior,
+    learned_noise,
+    load_prior,
+    predict,
+    scene_gain,
+    without_noise,
+)
 from dnrpipe.planning.seconds import noise_at
 from dnrpipe.workspace import Workspace
 from dnrtrain.atomic import write_json
@@ -128,7 +136,7 @@ def _noise(roots: Sequence[Path], spp: int, kind: str = "train") -> float | None
     return None
 
 
-START = {"a": 0.15, "alpha": 0.7, "b": 0.12, "beta": 0.8, "kappa": 0.3}
+START = {"a": 0.15, "alpha": 0.7, "b": 0.12, "beta": 0.8, "kappa": 0.3, "gamma": 0.5, "delta": 0.5}
 """Where the fit starts, and what it is drawn to by as much as a cell that is WEIGHT times off."""
 WEIGHT = 0.2
 OWN = 0.36
@@ -157,10 +165,11 @@ def fit_prior(cells: list[dict[str, Any]], source: str, sd: float) -> Prior:
 
     def loss() -> torch.Tensor:
         optimiser.zero_grad()
-        a, alpha, b, beta, kappa = logs.exp()
+        a, alpha, b, beta, kappa, gamma, delta = logs.exp()
         part = 1 - a * (25 / views) ** alpha - b * own[of_scene].exp() * (500 / steps) ** beta
         clean = 10 ** (-(base + gains[of_group] * part) / 10)
-        error = -10 * torch.log10(clean + kappa * noise**2 + reference**2) - truth
+        learned = kappa * (25 / views) ** delta * (steps / 500) ** gamma * noise**2
+        error = -10 * torch.log10(clean + learned + reference**2) - truth
         total = error.square().sum() + OWN * own.square().sum() + WEIGHT * (logs - start).square().sum()
         total.backward()
         return total
@@ -187,9 +196,9 @@ def fit_prior(cells: list[dict[str, Any]], source: str, sd: float) -> Prior:
 
 def gains_of(pilot: dict[str, Any], prior: Prior) -> list[Measured]:
     """What a pilot of ``collect`` measured; as :func:`dnrpipe.planning.command.measured_gains`."""
-    noise = prior.kappa**0.5 * pilot["noise"]
+    noise, views = pilot["noise"], pilot["views"]
     return [
-        Measured(pilot["views"], steps, without_noise(psnr, noise) - pilot["base"])
+        Measured(views, steps, without_noise(psnr, learned_noise(prior, noise, views, steps)) - pilot["base"])
         for steps, psnr in zip(pilot["steps"], pilot["psnr"], strict=True)
     ]
 
@@ -201,9 +210,8 @@ def fit(path: Path, out: Path) -> None:
     errors: list[float] = []
     print(f"{'scene left out':<16}{'predicted from its pilot, minus measured, dB':>60}")
     for pilot in pilots:
-        own = [cell for cell in cells if cell["scene"] == pilot["scene"]]
-        others = [cell for cell in cells if cell["scene"] != pilot["scene"]]
-        prior = fit_prior(others, str(path), LEAST_SPREAD)
+        own = [cell for cell in cells if (cell["scene"], cell["source"]) == (pilot["scene"], "frontier")]
+        prior = fit_prior(but(cells + cells_of(pilots), pilot["scene"]), str(path), LEAST_SPREAD)
         gain = scene_gain(prior, gains_of(pilot, prior))
         off = [
             predict(
@@ -215,20 +223,42 @@ def fit(path: Path, out: Path) -> None:
         errors += off
         print(f"{pilot['scene']:<16}{', '.join(f'{value:+.2f}' for value in off):>60}")
     spread = float(np.sqrt(np.mean(np.square(errors)))) if errors else 1.0
-    prior = fit_prior(cells, str(path), round(max(LEAST_SPREAD, spread), 3))
+    prior = fit_prior(cells + cells_of(pilots), str(path), round(max(LEAST_SPREAD, spread), 3))
     write_json(out, prior.model_dump(mode="json"))
     if errors:
         print(f"median |error| {np.median(np.abs(errors)):.2f} dB, root mean square {spread:.2f} dB; {out}")
 
 
+def cells_of(pilots: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The networks of the pilots as cells: few steps, and judged without the noise of any reference."""
+    return [
+        {
+            **{name: pilot[name] for name in ("scene", "views", "spp", "noise", "base")},
+            "source": "pilot",
+            "seed": 0,
+            "steps": steps,
+            "psnr": psnr,
+            "reference": 0.0,
+        }
+        for pilot in pilots
+        for steps, psnr in zip(pilot["steps"], pilot["psnr"], strict=True)
+    ]
+
+
+def but(cells: list[dict[str, Any]], scene: str) -> list[dict[str, Any]]:
+    """The cells of all other scenes."""
+    return [cell for cell in cells if cell["scene"] != scene]
+
+
 def read_cells(path: Path) -> list[dict[str, Any]]:
-    """Cells that ``collect`` wrote."""
-    return _read(path)["cells"]
+    """Cells that ``collect`` wrote, those of pilots included."""
+    found = _read(path)
+    return found["cells"] + cells_of(found["pilots"])
 
 
 def without(cells: list[dict[str, Any]], scene: str, source: str) -> Prior:
     """The prior of all scenes but one, as sure of itself as the one that comes with the package."""
-    return fit_prior([cell for cell in cells if cell["scene"] != scene], source, load_prior().sd)
+    return fit_prior(but(cells, scene), source, load_prior().sd)
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -20,7 +19,7 @@ from ..settings import Settings
 from ..workspace import Workspace
 from .choose import Predictor, best_within, budgets, cheapest_reaching
 from .pilot import FOLDER, run_pilot
-from .quality import Measured, Prior, load_prior, scene_gain, views_error, with_noise, without_noise
+from .quality import Measured, Prior, learned_noise, load_prior, scene_gain, views_error, with_noise, without_noise
 from .records import Pilot, Prediction, Route
 from .routes import as_reported, break_even, routes
 from .seconds import Costs, Work, noise_at
@@ -112,9 +111,9 @@ def measured_gains(pilot: Pilot, prior: Prior) -> list[Measured]:
     """What the pilot's networks add to its base image, dB, as they would from noiseless pictures."""
     assert pilot.frames is not None and pilot.training is not None and pilot.trace is not None
     training, frames = pilot.training, pilot.frames
-    noise = math.sqrt(prior.kappa) * noise_at(pilot.trace, training.spp)
+    noise, views = noise_at(pilot.trace, training.spp), training.views
     return [
-        Measured(training.views, steps, without_noise(point.psnr, noise) - frames.base.psnr)
+        Measured(views, steps, without_noise(point.psnr, learned_noise(prior, noise, views, steps)) - frames.base.psnr)
         for steps, point in zip(training.steps, frames.neural, strict=True)
     ]
 

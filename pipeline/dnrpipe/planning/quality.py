@@ -1,7 +1,8 @@
 """PSNR by views, samples and training steps: what the network adds to its base image.
 
     gain(V, I) = G * max(0, 1 - a (25 / V)^alpha - b (500 / I)^beta)
-    mse        = 10^(-(base + gain) / 10) + kappa * noise(S)^2 + reference^2
+    learned    = noise(S) * sqrt(min(1, kappa (25 / V)^delta (I / 500)^gamma))
+    mse        = 10^(-(base + gain) / 10) + learned^2 + reference^2
     PSNR       = -10 log10(mse)
 
 Notation
@@ -10,8 +11,10 @@ Notation
     G           dB that the network adds with many views and steps; the scene's own
     b           part of G that 500 steps still lack; the scene's own: some are learned in a hundred steps, some go on
     noise(S)    RMSE of a training picture in display space (:func:`.seconds.noise_at`)
+    learned     RMSE of what the network takes of that noise for the truth: more, the longer it sees the fewer pictures
     reference   RMSE of the test views' references, likewise: what the report will measure counts it
-    a, alpha, beta, kappa   shared by all scenes: the prior, ``prior.json``, by ``python -m tools.plan_prior fit``
+    a, alpha, beta, kappa, gamma, delta   shared by all scenes: the prior, ``prior.json``, by
+                ``python -m tools.plan_prior fit``
 
 What is known of a scene's G and b is a density on a grid: normal in G and in log b as the prior's scenes are, times how
 well each point explains the gains that the pilot measured after fewer and after more steps.
@@ -46,6 +49,8 @@ class Prior(Record):
     b_spread: float
     beta: float
     kappa: float
+    gamma: float
+    delta: float
     gain_mean: float
     gain_sd: float
     pilot_sd: float
@@ -109,6 +114,11 @@ def scene_gain(prior: Prior, measured: Sequence[Measured]) -> Gain:
     return Gain(total, missing, weight / weight.sum())
 
 
+def learned_noise(prior: Prior, noise: float, views: float, steps: float) -> float:
+    """RMSE that the noise of training pictures, ``noise``, leaves in what the network renders."""
+    return noise * math.sqrt(min(1.0, prior.kappa * (25 / views) ** prior.delta * (steps / 500) ** prior.gamma))
+
+
 def views_error(deviation: float, judged: int, tests: int) -> float:
     """dB: standard error of the mean PSNR over ``tests`` views when ``judged`` of them were looked at."""
     return deviation * math.sqrt(max(0.0, 1 / judged - 1 / max(tests, judged)))
@@ -138,6 +148,6 @@ def predict(
     """PSNR, dB. gain: of :func:`scene_gain`. noise: RMSE of the training pictures. judged: of :func:`views_error`.
     reference: RMSE of the references."""
     added, unsure = gain.at(prior, views, steps)
-    expected = with_noise(base + added, math.hypot(math.sqrt(prior.kappa) * noise, reference))
+    expected = with_noise(base + added, math.hypot(learned_noise(prior, noise, views, steps), reference))
     spread = NINE_IN_TEN * math.hypot(prior.sd, unsure, judged)
     return Interval(expected=expected, low=expected - spread, high=expected + spread)
