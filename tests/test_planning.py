@@ -187,7 +187,7 @@ def test_a_sure_gain_is_itself() -> None:
 @given(st.floats(15.0, 40.0), st.floats(0.0, 0.008))
 def test_noise_is_taken_out_again(psnr: float, noise: float) -> None:
     assert without_noise(with_noise(psnr, noise), noise) == pytest.approx(psnr, abs=1e-6)
-    assert with_noise(psnr, noise) <= psnr
+    assert with_noise(psnr, noise) <= psnr + 1e-9
 
 
 def test_what_a_report_measures_counts_its_references_noise() -> None:
