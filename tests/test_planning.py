@@ -75,7 +75,16 @@ def pilot() -> Pilot:
         ),
         base=BasePart(pixels=128 * 128, seconds=0.05, cpu_seconds=0.1, startup=3.0),
         training=TrainingPart(
-            views=6, spp=16, steps=[100, 300], pixels=128 * 128, seconds=0.05, cpu_seconds=0.07, startup=1.0, threads=2
+            views=6,
+            spp=16,
+            steps=[100, 300],
+            pixels=128 * 128,
+            seconds=0.05,
+            cpu_seconds=0.07,
+            between=0.04,
+            cpu_between=0.05,
+            startup=1.0,
+            threads=2,
         ),
         frames=FramePart(
             base=FramePoint(name="base", ms=40, psnr=28.0),

@@ -63,7 +63,7 @@ def check(scene: str, results: dict[str, Any], predictor: Predictor) -> list[dic
             continue
         choice = predictor.choice(point["views"], point["spp"], point["steps"])
         traced = predictor.processor.raytrace(choice.views, choice.spp) - predictor.processor.light()
-        trained = predictor.processor.finetune(choice.steps)
+        trained = predictor.processor.finetune(choice.steps, choice.epochs)
         parts = point["parts"]
         actual = (cores * (parts["tracing"] + parts["base images"]), threads * parts["training"])
         psnr = predictor.predict(choice).psnr
@@ -109,7 +109,8 @@ def clocked(predictor: Predictor, results: dict[str, Any], choice: Choice) -> fl
     """Predicted seconds by the frontier's clock: processor seconds over the cores and over training's threads."""
     costs = predictor.processor
     return (
-        costs.raytrace(choice.views, choice.spp) / results["cores"] + costs.finetune(choice.steps) / results["threads"]
+        costs.raytrace(choice.views, choice.spp) / results["cores"]
+        + costs.finetune(choice.steps, choice.epochs) / results["threads"]
     )
 
 

@@ -28,7 +28,7 @@ from dnrpipe.errors import UserError
 from dnrpipe.planning.choose import Predictor
 from dnrpipe.planning.command import Wanted, apply, make_plan, make_predictor
 from dnrpipe.planning.pilot import read_pilot
-from dnrpipe.planning.records import Prediction
+from dnrpipe.planning.records import Choice, Prediction
 from dnrpipe.prepare import split_views
 from dnrpipe.scene_files import read_json
 from dnrpipe.session import Session, resolve_settings
@@ -104,9 +104,21 @@ def _run(root: Path, scene: str, share: float, side: str, cells: Path) -> dict[s
         "seconds": round(seconds, 1),
         "load": os.getloadavg()[0],
         "choice": chosen["choice"],
-        "predicted": {**chosen["seconds"], "cpu": chosen["cpu_seconds"], "psnr": chosen["psnr"]},
+        "predicted": _predicted(chosen),
         "actual": {**actual["seconds"], "cpu": actual["cpu_seconds"], "psnr": actual["psnr"]},
     }
+
+
+def _predicted(one: dict[str, Any]) -> dict[str, Any]:
+    return {**one["seconds"], "cpu": one["cpu_seconds"], "psnr": one["psnr"]}
+
+
+def again(root: Path, scene: str, cells: Path, rows: list[dict[str, Any]]) -> None:
+    """Predict the choices that were run anew, with the pilot as it is now; what they took and gave stays."""
+    predictor = opened(root, without(read_cells(cells), scene, str(cells)))
+    for row in rows:
+        if row["scene"] == scene:
+            row["predicted"] = _predicted(predictor.predict(Choice(**row["choice"])).model_dump(mode="json"))
 
 
 def opened(root: Path, prior: Any) -> Predictor:
@@ -137,6 +149,10 @@ def preset_choice(predictor: Predictor, session: Session) -> Callable[[float | N
         return predictor.predict(predictor.choice(views, settings.raytrace.spp, epochs * per_epoch))
 
     return of
+
+
+def _write(out: Path, rows: list[dict[str, Any]]) -> None:
+    write_json(out, {**made_by(), "command": "python -m tools.plan_equal " + " ".join(sys.argv[1:]), "rows": rows})
 
 
 def _line(row: dict[str, Any]) -> str:
@@ -206,6 +222,7 @@ def main() -> int:
     parser.add_argument("--shares", default="0.5,1", help="of the preset's own time")
     parser.add_argument("--cells", type=Path, default=Path("docs/results/plan-prior.json"))
     parser.add_argument("--out", type=Path, required=True, help="JSON of all rows, added to")
+    parser.add_argument("--again", action="store_true", help="run nothing: predict what is in --out by today's pilots")
     options = parser.parse_args()
     rows = read_json(options.out)["rows"] if options.out.exists() else []
     try:
@@ -213,10 +230,13 @@ def main() -> int:
             scene, _, root = text.rpartition("=")
             path = Path(root).resolve()
             name = scene or path.name.removesuffix(".dnr")
-            for share in options.shares.split(","):
+            if options.again:
+                again(path, name, options.cells, rows)
+            for share in () if options.again else options.shares.split(","):
                 rows += compare(path, name, [float(share)], options.cells, rows)
-                command = "python -m tools.plan_equal " + " ".join(sys.argv[1:])
-                write_json(options.out, {**made_by(), "command": command, "rows": rows})
+                _write(options.out, rows)
+            if options.again:
+                _write(options.out, rows)
     except UserError as error:
         print(error, file=sys.stderr)
         return 2

@@ -43,7 +43,10 @@ class Predictor:
         """What the choice is expected to cost and give."""
         assert self.pilot.trace is not None
         select = self.wall.work.policy_seconds
-        raytrace, finetune = self.wall.raytrace(choice.views, choice.spp), self.wall.finetune(choice.steps)
+        raytrace, finetune = (
+            self.wall.raytrace(choice.views, choice.spp),
+            self.wall.finetune(choice.steps, choice.epochs),
+        )
         total = select + raytrace + finetune
         seconds = Seconds(
             select=select,
@@ -56,7 +59,8 @@ class Predictor:
         return Prediction(
             choice=choice,
             seconds=seconds,
-            cpu_seconds=self.processor.raytrace(choice.views, choice.spp) + self.processor.finetune(choice.steps),
+            cpu_seconds=self.processor.raytrace(choice.views, choice.spp)
+            + self.processor.finetune(choice.steps, choice.epochs),
             psnr=predict(
                 self.prior,
                 self.base,

@@ -33,7 +33,7 @@ from ..workspace import Workspace, digest
 from .pilot_parts import FOLDER, HELD_OUT, REFERENCE_SPP, RESOLUTION, SPP, STEPS, VIEWS, Piloting
 from .records import LightPart, Pilot, Record
 
-VERSION = 4
+VERSION = 5
 FILE = "pilot.json"
 
 

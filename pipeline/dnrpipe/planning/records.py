@@ -66,7 +66,7 @@ class BasePart(Record):
 
 class TrainingPart(Record):
     """Networks trained anew with rising numbers of steps. seconds, cpu_seconds: of one optimiser step of the longest
-    training; startup: of its first epoch beyond its steps."""
+    training; between, cpu_between: from one epoch to the next, when the state is saved; startup: what is left."""
 
     views: int
     spp: int
@@ -74,6 +74,8 @@ class TrainingPart(Record):
     pixels: int
     seconds: float
     cpu_seconds: float
+    between: float
+    cpu_between: float
     startup: float
     threads: int
 

@@ -4,7 +4,7 @@
     stage     start of the workers + views * t / workers
     light     start of the worker + slope * texels^2 * paths
     base      start + views * t * (pixels / pilot's pixels)
-    training  start + steps * t * (trained pixels / pilot's)
+    training  start + steps * t * (trained pixels / pilot's) + epochs * t of saving the state
 
 Either clock: wall seconds, or processor seconds, which other work on the machine does not stretch.
 """
@@ -98,12 +98,13 @@ class Costs:
         """Tracing, baked light and base images of the training views."""
         return self._traced(views, spp) + self.light() + self._base(views)
 
-    def finetune(self, steps: int) -> float:
+    def finetune(self, steps: int, epochs: int) -> float:
         """Step 2."""
         part = self.pilot.training
         assert part is not None
         step = getattr(part, self.clock) * self.work.trained / part.pixels
-        return self._start(part.startup) + steps * step
+        between = part.between if self.clock == "seconds" else part.cpu_between
+        return self._start(part.startup) + steps * step + epochs * between
 
     def evaluate(self) -> float:
         """References of the test views and their base images; measuring itself is not modelled."""

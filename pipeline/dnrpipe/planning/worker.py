@@ -39,7 +39,8 @@ class Worker:
 
     common: {"workspace", "settings", "threads"}
     task "train": {"views", "base_files", "images", "fingerprint", "folders", "epochs": a training each}
-        -> {"seconds", "cpu_seconds": of a step of the last, "startup", "steps": of each, "threads"}
+        -> {"seconds", "cpu_seconds": of a step of the last, "between", "cpu_between": of its epochs, "startup",
+        "steps": of each, "threads"}
     task "frames": {"views", "folders": of the models, "light", "samples", "methods": the ladder}
         -> {"base", "rival": rows {"name", "ms", "psnr"}, "neural": a row per model, "unknown": pixels that no
         reference knows}; PSNR by :func:`without_reference`
@@ -75,6 +76,7 @@ class Worker:
         self, task: dict[str, Any], views: list[View], weights: Any, folder: Path, epochs: int
     ) -> dict[str, Any]:
         from dnrtrain.checkpoint import read_record
+        from dnrtrain.events import EpochEnd
         from dnrtrain.step2 import run_step2
 
         from ..training import torch_device
@@ -95,21 +97,29 @@ class Worker:
             fingerprint=task["fingerprint"],
             weights=weights,
         )
-        for _ in events:
-            pass
+        gaps, last = [], None
+        for event in events:
+            now = (time.monotonic(), time.process_time())
+            if isinstance(event, EpochEnd):
+                if last is not None:
+                    gaps.append((now[0] - last[0] - event.seconds, now[1] - last[1] - event.cpu_seconds))
+                last = now
         took = time.monotonic() - started
+        between, cpu_between = np.maximum(0.0, np.median(gaps, axis=0)).tolist()
         record = read_record(folder)
         assert record is not None  # training has just finished
         history = record["history"]
         later = history[1:] or history  # the first epoch warms up
         steps = sum(entry["steps"] for entry in later)
         seconds = sum(entry["seconds"] for entry in later) / steps
-        total = sum(entry["steps"] for entry in history)
+        booked = sum(entry["seconds"] for entry in history)
         return {
             "seconds": seconds,
             "cpu_seconds": sum(entry["cpu_seconds"] for entry in later) / steps,
-            "startup": max(0.0, took - seconds * total),
-            "steps": total,
+            "between": between,
+            "cpu_between": cpu_between,
+            "startup": max(0.0, took - booked - between * len(history)),
+            "steps": sum(entry["steps"] for entry in history),
         }
 
     def _load(self, views: list[View], task: dict[str, Any]) -> ViewSet:
