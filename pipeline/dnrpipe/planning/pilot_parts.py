@@ -156,6 +156,8 @@ class Piloting:
             pixels=min(patch, view.width) * min(patch, view.height),
             seconds=result["seconds"],
             cpu_seconds=result["cpu_seconds"],
+            between=result["between"],
+            cpu_between=result["cpu_between"],
             startup=result["startup"],
             threads=result["threads"],
         )
