@@ -98,7 +98,7 @@ class Piloting:
         size, spp = task["size"], max(1, min(task["spp"], LIGHT_PATHS // task["size"] ** 2))
         started = time.monotonic()
         if kept := spp == task["spp"]:
-            result = bake_light(self.workspace, self.console, self.run_id, "plan", common, environment, task)
+            result = bake_light(self.workspace, self.console, self.run_id, "raytrace", common, environment, task)
             assert result is not None  # it is not on disk
         else:
             shared = {"bundle": common["bundle"], "variant": common["variant"]}
