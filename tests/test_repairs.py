@@ -134,7 +134,7 @@ def test_light_that_is_not_finite_is_said(
     ledger = SimpleNamespace(append=booked.append)
     workspace: Any = SimpleNamespace(log=lambda stage: tmp_path / "log", ledger=ledger)
     common = {"bundle": "b", "variant": "v"}
-    base._bake(workspace, Console(quiet=True), "r", "raytrace", common, {}, task)
+    base.bake_light(workspace, Console(quiet=True), "r", "raytrace", common, {}, task)
     assert "repaired: 12 samples of the baked light were not finite" in capsys.readouterr().err
     assert booked[0].detail["lost"] == 12
 
