@@ -28,7 +28,8 @@ def test_memory_of_children_counts_and_the_bound_is_kept(monkeypatch: pytest.Mon
         monkeypatch.setitem(memory.BOUNDS, "selection", bound)
         reading = memory.measure("selection", [sys.executable, "-c", parent], {}, 50)
         if seconds == 1:
-            assert reading.problem == "" and 0.39 < reading.gib < 0.6
+            # Between fork and exec a child counts its parent's pages once more: 0.6 GiB and a little at most.
+            assert reading.problem == "" and 0.39 < reading.gib < 0.7
         else:
             assert reading.problem == "more than 0.3 GiB" and reading.seconds < 30
 
