@@ -20,6 +20,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from tools.plan_equal import predictor_in
 from tools.plan_prior import read_cells, without
 
 from dnrpipe.ablation.results import made_by
@@ -27,12 +28,8 @@ from dnrpipe.errors import UserError
 from dnrpipe.frames.ladder import crossover, frontier
 from dnrpipe.frontier.command import read_frontier
 from dnrpipe.planning.choose import VIEWS, Predictor
-from dnrpipe.planning.command import make_predictor
-from dnrpipe.planning.pilot import read_pilot
 from dnrpipe.planning.records import Choice, Interval, Route
 from dnrpipe.planning.routes import as_reported, routes
-from dnrpipe.session import resolve_settings
-from dnrpipe.workspace import Workspace
 from dnrtrain.atomic import write_json
 
 FRAMES = (200, 2000)
@@ -44,14 +41,8 @@ def opened(root: Path, scene: str, cells: Path) -> tuple[dict[str, Any], Predict
 
     Raises UserError: no pilot, or no frontier.
     """
-    workspace = Workspace.open(root)
-    pilot = read_pilot(workspace)
-    if pilot is None:
-        raise UserError(f"{root}: has no pilot; run `dnrpipe plan -w {root}`")
     results = read_frontier(root / "frontier" / "results.json")
-    prior = without(read_cells(cells), scene, str(cells))
-    settings = resolve_settings(workspace, {}, None)
-    return results, make_predictor(workspace, settings, pilot, prior)
+    return results, predictor_in(root, without(read_cells(cells), scene, str(cells)))
 
 
 def check(scene: str, results: dict[str, Any], predictor: Predictor) -> list[dict[str, Any]]:

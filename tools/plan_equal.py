@@ -89,7 +89,7 @@ def _link(source: str, target: str) -> None:
 def _run(root: Path, scene: str, share: float, side: str, cells: Path) -> dict[str, Any]:
     prior = without(read_cells(cells), scene, str(cells))
     with Session("plan", OPTIONS | {"workspace": str(root)}, None, {}) as session:
-        predictor = opened(root, prior)
+        predictor = predictor_in(root, prior)
         usual = preset_choice(predictor, session)
         seconds = share * usual(None).seconds.total.expected
         record = make_plan(session.workspace, session.settings, session.console, Wanted(seconds=seconds), prior)
@@ -115,13 +115,13 @@ def _predicted(one: dict[str, Any]) -> dict[str, Any]:
 
 def again(root: Path, scene: str, cells: Path, rows: list[dict[str, Any]]) -> None:
     """Predict the choices that were run anew, with the pilot as it is now; what they took and gave stays."""
-    predictor = opened(root, without(read_cells(cells), scene, str(cells)))
+    predictor = predictor_in(root, without(read_cells(cells), scene, str(cells)))
     for row in rows:
         if row["scene"] == scene:
             row["predicted"] = _predicted(predictor.predict(Choice(**row["choice"])).model_dump(mode="json"))
 
 
-def opened(root: Path, prior: Any) -> Predictor:
+def predictor_in(root: Path, prior: Any) -> Predictor:
     """The plan's predictor in a workspace. Raises UserError: no pilot."""
     workspace = Workspace.open(root)
     pilot = read_pilot(workspace)

@@ -23,10 +23,9 @@ import torch
 
 from dnrpipe.planning.pilot import read_pilot
 from dnrpipe.planning.quality import (
-    Measured,
     Prior,
-    learned_noise,
     load_prior,
+    measured_gains,
     predict,
     scene_gain,
     without_noise,
@@ -194,15 +193,6 @@ def fit_prior(cells: list[dict[str, Any]], source: str, sd: float) -> Prior:
     )
 
 
-def gains_of(pilot: dict[str, Any], prior: Prior) -> list[Measured]:
-    """What a pilot of ``collect`` measured; as :func:`dnrpipe.planning.command.measured_gains`."""
-    noise, views = pilot["noise"], pilot["views"]
-    return [
-        Measured(views, steps, without_noise(psnr, learned_noise(prior, noise, views, steps)) - pilot["base"])
-        for steps, psnr in zip(pilot["steps"], pilot["psnr"], strict=True)
-    ]
-
-
 def fit(path: Path, out: Path) -> None:
     """Fit, leave every scene out that has a pilot, print, write ``out``."""
     found = _read(path)
@@ -212,7 +202,8 @@ def fit(path: Path, out: Path) -> None:
     for pilot in pilots:
         own = [cell for cell in cells if (cell["scene"], cell["source"]) == (pilot["scene"], "frontier")]
         prior = fit_prior(but(cells + cells_of(pilots), pilot["scene"]), str(path), LEAST_SPREAD)
-        gain = scene_gain(prior, gains_of(pilot, prior))
+        networks = zip(pilot["steps"], pilot["psnr"], strict=True)
+        gain = scene_gain(prior, measured_gains(prior, pilot["base"], pilot["views"], pilot["noise"], networks))
         off = [
             predict(
                 prior, pilot["base"], gain, cell["views"], cell["steps"], cell["noise"], reference=cell["reference"]

@@ -19,7 +19,7 @@ from ..settings import Settings
 from ..workspace import Workspace
 from .choose import Predictor, best_within, budgets, cheapest_reaching
 from .pilot import FOLDER, run_pilot
-from .quality import Measured, Prior, learned_noise, load_prior, scene_gain, views_error, with_noise, without_noise
+from .quality import Gain, Prior, load_prior, measured_gains, scene_gain, views_error, with_noise
 from .records import Pilot, Prediction, Route
 from .routes import as_reported, break_even, routes
 from .seconds import Costs, Work, noise_at
@@ -100,22 +100,20 @@ def make_predictor(workspace: Workspace, settings: Settings, pilot: Pilot, prior
         processor=Costs(pilot, work, "cpu_seconds"),
         prior=prior,
         base=base,
-        gain=scene_gain(prior, measured_gains(pilot, prior)),
+        gain=_gain(pilot, prior),
         judged=views_error(frames.deviation, frames.views, work.tests),
         reference=_reference_noise(settings, pilot),
         batch=settings.finetune.step2.batch,
     )
 
 
-def measured_gains(pilot: Pilot, prior: Prior) -> list[Measured]:
-    """What the pilot's networks add to its base image, dB, as they would from noiseless pictures."""
+def _gain(pilot: Pilot, prior: Prior) -> Gain:
+    """What is known of the scene's gain after its pilot."""
     assert pilot.frames is not None and pilot.training is not None and pilot.trace is not None
     training, frames = pilot.training, pilot.frames
-    noise, views = noise_at(pilot.trace, training.spp), training.views
-    return [
-        Measured(views, steps, without_noise(point.psnr, learned_noise(prior, noise, views, steps)) - frames.base.psnr)
-        for steps, point in zip(training.steps, frames.neural, strict=True)
-    ]
+    noise = noise_at(pilot.trace, training.spp)
+    networks = zip(training.steps, (point.psnr for point in frames.neural), strict=True)
+    return scene_gain(prior, measured_gains(prior, frames.base.psnr, training.views, noise, networks))
 
 
 def _reference_noise(settings: Settings, pilot: Pilot) -> float:

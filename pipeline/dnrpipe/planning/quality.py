@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib import resources
 
@@ -117,6 +117,16 @@ def scene_gain(prior: Prior, measured: Sequence[Measured]) -> Gain:
 def learned_noise(prior: Prior, noise: float, views: float, steps: float) -> float:
     """RMSE that the noise of training pictures, ``noise``, leaves in what the network renders."""
     return noise * math.sqrt(min(1.0, prior.kappa * (25 / views) ** prior.delta * (steps / 500) ** prior.gamma))
+
+
+def measured_gains(
+    prior: Prior, base: float, views: int, noise: float, networks: Iterable[tuple[int, float]]
+) -> list[Measured]:
+    """What networks, (steps, PSNR), of pictures whose noise is ``noise`` would add to the base image without it."""
+    return [
+        Measured(views, steps, without_noise(psnr, learned_noise(prior, noise, views, steps)) - base)
+        for steps, psnr in networks
+    ]
 
 
 def views_error(deviation: float, judged: int, tests: int) -> float:
