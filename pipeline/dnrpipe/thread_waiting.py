@@ -3,8 +3,10 @@
 Measured on two cores, a training step at 128², ms (`python -m tools.bench_waiting WORKSPACE`):
 
     spins before sleeping       0    1,000   300,000 (libgomp's default)
-    idle machine               98       46        42
-    four other processes      272      291       856
+    idle machine               86       49        42
+    four other processes      288      361       878
+
+One run each. Beside other processes it varies by half; there spinning a little costs some, spinning on costs threefold.
 """
 
 from __future__ import annotations
