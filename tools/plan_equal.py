@@ -50,21 +50,18 @@ SIDES = ("preset", "plan")
 OPTIONS = {"as_json": False, "quiet": True, "preset": None, "assignments": (), "force": False}
 
 
-def compare(
-    root: Path, scene: str, shares: list[float], cells: Path, done: list[dict[str, Any]]
-) -> list[dict[str, Any]]:
-    """A row per share and side that is not in ``done``. Raises UserError: no pilot."""
+def compare(root: Path, scene: str, share: float, cells: Path, done: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row per side that is not in ``done``. Raises UserError: no pilot."""
     found = []
-    for share in shares:
-        for side in SIDES:
-            if any((row["scene"], row["share"], row["side"]) == (scene, share, side) for row in done):
-                continue
-            with tempfile.TemporaryDirectory(prefix="plan-equal-") as folder:
-                copy = Path(folder) / root.name
-                _copy(root, copy)
-                row = _run(copy, scene, share, side, cells)
-            found.append(row)
-            print(_line(row), flush=True)
+    for side in SIDES:
+        if any((row["scene"], row["share"], row["side"]) == (scene, share, side) for row in done):
+            continue
+        with tempfile.TemporaryDirectory(prefix="plan-equal-") as folder:
+            copy = Path(folder) / root.name
+            _copy(root, copy)
+            row = _run(copy, scene, share, side, cells)
+        found.append(row)
+        print(_line(row), flush=True)
     return found
 
 
@@ -233,7 +230,7 @@ def main() -> int:
             if options.again:
                 again(path, name, options.cells, rows)
             for share in () if options.again else options.shares.split(","):
-                rows += compare(path, name, [float(share)], options.cells, rows)
+                rows += compare(path, name, float(share), options.cells, rows)
                 _write(options.out, rows)
             if options.again:
                 _write(options.out, rows)

@@ -20,8 +20,8 @@ from ..errors import UserError
 from .records import Clock, Pilot, TracePart
 
 TIME_SPREAD = 1.25
-"""Intervals of seconds reach from 1/1.25 to 1.25 times the prediction: too narrow where the machine's speed drifts between
-pilot and run; 33 of 50 runs ended within (docs/cost.md)."""
+"""Intervals of seconds reach from 1/1.25 to 1.25 times the prediction: too narrow where the machine's speed drifts
+between pilot and run; 33 of 50 runs ended within (docs/cost.md)."""
 
 
 @dataclass(frozen=True)
