@@ -13,7 +13,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dnrpipe.planning.choose import Predictor, best_within, budgets, cheapest_reaching
+from dnrpipe.planning.carry_out import steps_within
+from dnrpipe.planning.choose import NEAR, Predictor, best_within, budgets, cheapest_reaching
+from dnrpipe.planning.pilot import pilot_path, read_pilot
 from dnrpipe.planning.quality import (
     Gain,
     Measured,
@@ -40,6 +42,7 @@ from dnrpipe.planning.records import (
 from dnrpipe.planning.routes import as_reported, break_even, rival_line, routes, seconds_for
 from dnrpipe.planning.seconds import Costs, Work, noise_at, view_line
 from dnrpipe.planning.worker import without_reference
+from dnrpipe.workspace import Source, Workspace
 
 PRIOR = load_prior()
 POSITIVE = st.floats(1e-8, 1e-5)
@@ -254,6 +257,28 @@ def test_a_table_of_budgets_rises_in_both() -> None:
     assert [r.psnr.expected for r in rows] == sorted(r.psnr.expected for r in rows)
 
 
+@given(st.sampled_from([(6, 16), (25, 4), (40, 128)]), st.floats(-10, 200))
+def test_training_takes_the_time_left_or_what_is_best(views_and_samples: tuple[int, int], left: float) -> None:
+    one = predictor()
+    chosen = one.choice(*views_and_samples, 300)
+    found = steps_within(one, chosen, left)
+    assert (found.choice.views, found.choice.spp) == views_and_samples
+    per_epoch = found.choice.steps // found.choice.epochs
+    assert found.choice.epochs == 1 or found.seconds.finetune <= left + 1e-6
+    longer = one.predict(one.choice(*views_and_samples, found.choice.steps + per_epoch))
+    assert longer.seconds.finetune > left or longer.psnr.expected <= found.psnr.expected + NEAR
+
+
+def test_a_torn_pilot_counts_as_none(tmp_path: Path, demo_blend: Path) -> None:
+    workspace = Workspace.create(tmp_path / "demo.dnr", Source(path=str(demo_blend), sha256="0" * 64))
+    path = pilot_path(workspace)
+    path.parent.mkdir()
+    path.write_text(pilot().model_dump_json())
+    assert read_pilot(workspace) == pilot()
+    path.write_text(pilot().model_dump_json()[:-100])
+    assert read_pilot(workspace) is None
+
+
 def test_the_ladder_is_followed_beyond_its_end_and_says_so() -> None:
     line = rival_line(pilot().frames)  # type: ignore[arg-type]
     assert [name for name, _, _ in line] == ["1 spp raw", "4 spp clean16", "64 spp clean16"]
@@ -341,11 +366,20 @@ def test_a_scene_is_planned_and_the_plan_carried_out(
     assert _main(["plan", "--time", "1h", "--apply", "-q"]) == 0
     assert (root / "plan" / "pilot.json").stat().st_mtime_ns == stamp  # the pilot is not run twice
     done = json.loads((root / "plan" / "plan.json").read_text())
-    choice = done["chosen"]["choice"]
+    choice, carried_out = done["chosen"]["choice"], done["carried_out"]["choice"]
+    assert {key: choice[key] for key in ("views", "spp")} == {key: carried_out[key] for key in ("views", "spp")}
+    assert (
+        json.loads((root / "manifest.json").read_text())["overrides"]["finetune"]["step2"]["epochs"]
+        == (carried_out["epochs"])
+    )
     assert len(json.loads((root / "selection.json").read_text())["views"]) == choice["views"]
     assert done["actual"]["psnr"] > 10
     assert done["actual"]["seconds"]["total"] > 0
     assert all(done["actual"]["ran"].values())
+    assert _main(["plan", "--time", "1h", "--apply", "-q"]) == 0  # the same plan again: nothing is due
+    again = json.loads((root / "plan" / "plan.json").read_text())
+    assert not any(again["actual"]["ran"].values())
+    assert again["carried_out"]["choice"] == carried_out
     assert _main(["plan", "--time", "0.01s"]) == 2
     assert "not enough" in capsys.readouterr().err
     assert _main(["report", "-q"]) == 0

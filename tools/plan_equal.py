@@ -3,10 +3,11 @@
     dnrpipe plan -w scene.dnr                               # the pilot, once
     python -m tools.plan_equal scene.dnr ... --shares 0.5,1 --out docs/results/plan-equal.json
 
-T is a share of the time that the preset's own choice is expected to take. The preset's side keeps its views and samples
-and takes as many steps as are expected to fit into T. Both sides run on the wall clock, in copies of the workspace that
-hold the passes, the light that the pilot baked and the test views' references: tracing, base images and training are
-done anew, one run at a time. Needs a machine that is otherwise idle. What is in ``--out`` is not run again.
+T is a share of the time that the preset's own choice is expected to take. The preset's side keeps its views and
+samples. Both take the steps that fit into what ray tracing has left of T, one pass over the views at least; the rows
+hold what the pilot predicts for those. Both run on the wall clock, one at a time, in copies of the workspace that hold
+the passes, the light that the pilot baked and the test views' references: tracing, base images and training are done
+anew. Needs a machine that is otherwise idle. What is in ``--out`` is not run again.
 """
 
 from __future__ import annotations
@@ -25,8 +26,9 @@ from tools.plan_prior import read_cells, without
 
 from dnrpipe.ablation.results import made_by
 from dnrpipe.errors import UserError
+from dnrpipe.planning.carry_out import apply
 from dnrpipe.planning.choose import Predictor
-from dnrpipe.planning.command import Wanted, apply, make_plan, make_predictor
+from dnrpipe.planning.command import Wanted, make_plan, make_predictor
 from dnrpipe.planning.pilot import read_pilot
 from dnrpipe.planning.records import Choice, Prediction
 from dnrpipe.prepare import split_views
@@ -92,8 +94,8 @@ def _run(root: Path, scene: str, share: float, side: str, cells: Path) -> dict[s
         record = make_plan(session.workspace, session.settings, session.console, Wanted(seconds=seconds), prior)
         if side == "preset":
             record["chosen"] = usual(seconds).model_dump(mode="json")
-        record = apply(session, record)
-    chosen, actual = record["chosen"], record["actual"]
+        record = apply(session, record, prior)
+    chosen, actual = record.get("carried_out") or record["chosen"], record["actual"]
     return {
         "scene": scene,
         "share": share,

@@ -48,7 +48,8 @@ def plan(
     if carry_out and duration is None and target_psnr is None:
         raise UserError("--apply: what shall be carried out? give --time or --target-psnr")
     from ..amounts import parse_seconds
-    from ..planning.command import Wanted, apply, make_plan
+    from ..planning.carry_out import apply
+    from ..planning.command import Wanted, make_plan
     from ..planning.pilot import pilot_path
     from ..planning.words import actual_lines, lines
     from ..tasks import worker_count

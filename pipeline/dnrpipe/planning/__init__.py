@@ -7,5 +7,6 @@ quality    pilot and prior -> PSNR by views, samples and steps
 choose     the views, samples and steps that a budget or a target calls for
 routes     whether to train at all: neural renderer, base image alone, or path tracing with a denoiser
 command    what the command does; ``plan/plan.json``
+carry_out  select, ray-trace, then train for the time that is left
 words      tables and sentences
 """

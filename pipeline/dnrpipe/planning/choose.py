@@ -85,10 +85,13 @@ class Predictor:
 def best_within(grid: list[Prediction], seconds: float) -> Prediction | None:
     """The highest expected PSNR within ``seconds`` of expected time; None where nothing is so fast."""
     within = [p for p in grid if p.seconds.total.expected <= seconds]
-    if not within:
-        return None
-    top = max(p.psnr.expected for p in within)
-    return min((p for p in within if p.psnr.expected >= top - NEAR), key=lambda p: p.seconds.total.expected)
+    return cheapest_of_the_best(within) if within else None
+
+
+def cheapest_of_the_best(found: list[Prediction]) -> Prediction:
+    """Of those whose expected PSNR is as good as the highest, within ``NEAR``, the one of the least expected time."""
+    top = max(p.psnr.expected for p in found)
+    return min((p for p in found if p.psnr.expected >= top - NEAR), key=lambda p: p.seconds.total.expected)
 
 
 def cheapest_reaching(grid: list[Prediction], psnr: float) -> Prediction | None:

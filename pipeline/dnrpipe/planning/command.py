@@ -1,20 +1,22 @@
-"""`dnrpipe plan` behind its options: pilot, prediction, choice; ``plan/plan.json``; carrying a plan out."""
+"""`dnrpipe plan` behind its options: pilot, prediction, choice; ``plan/plan.json``."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from dnrtrain.atomic import write_json
+from dnrtrain.contract import DamagedFile
 from dnrtrain.selector.names import ACTIVE_NAMES, TRAINED_NAMES
 
 from ..base import light_is_baked, renderer_inputs
 from ..console import Console
-from ..costs import total
 from ..effects.store import plan_of
 from ..errors import UserError
 from ..prepare import split_views
+from ..scene_files import read_json
 from ..settings import Settings
 from ..workspace import Workspace
 from .choose import Predictor, best_within, budgets, cheapest_reaching
@@ -23,9 +25,6 @@ from .quality import Gain, Prior, load_prior, measured_gains, scene_gain, views_
 from .records import Pilot, Prediction, Route
 from .routes import as_reported, break_even, routes
 from .seconds import Costs, Work, noise_at
-
-if TYPE_CHECKING:
-    from ..session import Session
 
 SCHEMA = 1
 BLIND_POLICY = "farthest"
@@ -72,7 +71,10 @@ def make_plan(
         found, at = whether_to_train(predictor, grid, settings, wanted, chosen)
         record |= {"routes": [r.model_dump(mode="json") for r in found], "routes_psnr": at}
         record |= {"break_even": break_even(found), "train": found[0].reaches and found[0].name == "neural renderer"}
-    write_json(workspace.root / FOLDER / "plan.json", record)
+    path = workspace.root / FOLDER / "plan.json"
+    if carried_out := _carried_out(path, record):
+        record["carried_out"] = carried_out
+    write_json(path, record)
     return record
 
 
@@ -141,45 +143,12 @@ def whether_to_train(
     return found, at
 
 
-def overrides_of(record: dict[str, Any]) -> dict[str, Any]:
-    """The settings that carry out a plan's choice."""
-    choice = record["chosen"]["choice"]
-    return {
-        "select": {"budget": choice["views"], "policy": record["policy"]},
-        "raytrace": {"spp": choice["spp"]},
-        "finetune": {"step2": {"epochs": choice["epochs"]}},
-    }
-
-
 def policy_of(workspace: Workspace, settings: Settings) -> str:
     """The policy that the plan counts on: the settings', or farthest points in place of a trained one that nobody
     asked for by name."""
     named = workspace.manifest.overrides.get("select", {}).get("policy")
     trained = settings.select.policy in TRAINED_NAMES
     return BLIND_POLICY if trained and named is None else settings.select.policy
-
-
-def apply(session: Session, record: dict[str, Any]) -> dict[str, Any]:
-    """Run the stages with the plan's choice; ``plan/plan.json`` then holds what they took and gave, too."""
-    workspace = session.workspace
-    before = len(workspace.ledger.read())
-    session.adopt(overrides_of(record))
-    names = ["select", "raytrace", "finetune"]
-    if split_views(workspace).get("test"):
-        names.append("evaluate")
-    session.stages(*names)
-    answers = session.answers
-    made = {name: answers[name].get("seconds", 0.0) if answers[name]["ran"] else 0.0 for name in names}
-    spent = workspace.ledger.read()[before:]
-    actual: dict[str, Any] = {
-        "seconds": {**made, "total": sum(made[name] for name in names[:3])},
-        "cpu_seconds": total(r for r in spent if r.purpose == "training").cpu_seconds,
-        "ran": {name: answers[name]["ran"] for name in names},
-        "psnr": answers.get("evaluate", {}).get("mean", {}).get("psnr"),
-    }
-    record = record | {"actual": actual}
-    write_json(workspace.root / FOLDER / "plan.json", record)
-    return record
 
 
 def _choose(grid: list[Prediction], wanted: Wanted) -> Prediction | None:
@@ -207,6 +176,18 @@ def _choose(grid: list[Prediction], wanted: Wanted) -> Prediction | None:
             )
         return found
     return None
+
+
+def _carried_out(path: Path, record: dict[str, Any]) -> dict[str, Any] | None:
+    """What the plan in the file was carried out as, if it is the same plan: its training may have been interrupted."""
+    try:
+        before = read_json(path)
+        same = all(before[key] == record[key] for key in ("wanted", "policy"))
+        same = same and before["pilot"]["fingerprint"] == record["pilot"]["fingerprint"]
+        same = same and before["chosen"]["choice"] == record["chosen"]["choice"]
+    except (UserError, DamagedFile, KeyError, TypeError):  # none, torn, of another version, or without a choice
+        return None
+    return before.get("carried_out") if same else None
 
 
 def _default(predictor: Predictor, settings: Settings, candidates: int) -> Any:

@@ -20,6 +20,7 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from dnrtrain.atomic import write_json
+from dnrtrain.contract import DamagedFile
 
 from ..base import RENDERED, light_is_baked, renderer_inputs
 from ..console import Console
@@ -96,7 +97,7 @@ def read_pilot(workspace: Workspace) -> Pilot | None:
         return None
     try:
         return Pilot.model_validate(read_json(path))
-    except (ValidationError, UserError):  # of another version, or torn: it is run again
+    except (ValidationError, DamagedFile):  # of another version, or torn: it is run again
         return None
 
 

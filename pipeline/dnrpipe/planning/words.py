@@ -125,6 +125,8 @@ def actual_lines(record: dict[str, Any]) -> list[str]:
     total = one["seconds"]["total"]["expected"]
     found.append(f"{'total':<10}{duration(total):>14}{duration(actual['seconds']['total']):>14}")
     found.append(f"{'CPU':<10}{duration(one['cpu_seconds']):>14}{duration(actual['cpu_seconds']):>14}")
+    if carried_out := record.get("carried_out"):
+        found.append(f"{'steps':<10}{one['choice']['steps']:>14}{carried_out['choice']['steps']:>14}")
     if actual["psnr"] is not None:
         found.append(f"{'PSNR':<10}{one['psnr']['expected']:>11.1f} dB{actual['psnr']:>11.1f} dB")
     return found

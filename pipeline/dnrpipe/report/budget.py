@@ -97,6 +97,9 @@ def _rows(plan: dict[str, Any] | None) -> list[PlannedRow]:
             actual=duration(actual["seconds"]["total"]),
         )
     )
+    if carried_out := plan.get("carried_out"):
+        steps = [str(one["choice"]["steps"]) for one in (chosen, carried_out)]
+        rows.append(PlannedRow(what="steps, by the time left", predicted=steps[0], actual=steps[1]))
     if actual["psnr"] is not None:
         rows.append(
             PlannedRow(

@@ -26,6 +26,7 @@ class _Plan(BaseModel):
 
     made: float
     chosen: Prediction | None
+    carried_out: Prediction | None = None
     settings_default: Prediction
 
 
@@ -42,7 +43,7 @@ def plan_state(workspace: Workspace, settings: Settings, states: Mapping[str, st
         return None
     except (ValueError, RecursionError):
         raise UserError(f"{path}: damaged; run `dnrpipe plan` again") from None
-    known = [found for found in (plan.chosen, plan.settings_default) if found is not None]
+    known = [found for found in (plan.carried_out, plan.chosen, plan.settings_default) if found is not None]
     prediction = next((found for found in known if _fits(found.choice, settings)), known[0])
     seconds, choice = prediction.seconds, prediction.choice
     since = [record for record in workspace.ledger.read() if record.time >= plan.made]
