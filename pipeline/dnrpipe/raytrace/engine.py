@@ -30,9 +30,10 @@ PASSES = "albedo:albedo,depth:depth,position:position,normal:sh_normal,geometric
 class Engine:
     """Renders views of bundles under one variant.
 
-    Bundles are loaded here, before threads go away: Mitsuba's loader waits for ever on an empty pool. With
-    ``threads`` 1 sums over samples are in a fixed order, so the same seed gives the same bits; views run side by
-    side in several workers instead. 0: all cores. The bundles are variants of one scene, in the same units.
+    Plugins are loaded one after the other: in parallel, Mitsuba 3.9 has failed now and then at a sensor (bad_alloc, or
+    basic_string::_M_create), took no less time, and would wait for ever on an empty pool. With ``threads`` 1 sums over
+    samples are in a fixed order, so the same seed gives the same bits; views run side by side in several workers
+    instead. 0: all cores. The bundles are variants of one scene, in the same units.
     """
 
     def __init__(self, variant: str, threads: int, bundles: Sequence[Path]) -> None:
@@ -50,7 +51,7 @@ class Engine:
         self.mi = mi
         self.variant = variant
         started = time.monotonic()
-        self.scenes = {str(bundle): mi.load_file(str(bundle)) for bundle in bundles}
+        self.scenes = {str(bundle): mi.load_file(str(bundle), parallel=False) for bundle in bundles}
         self.load_seconds = time.monotonic() - started
         self.unit_scale = unit_scale(bundles[0])
         if threads > 0:  # the caller's thread works too
