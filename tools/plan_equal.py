@@ -31,6 +31,7 @@ from dnrpipe.planning.choose import Predictor
 from dnrpipe.planning.command import Wanted, make_plan, make_predictor
 from dnrpipe.planning.pilot import read_pilot
 from dnrpipe.planning.records import Choice, Prediction
+from dnrpipe.planning.seconds import TIME_SPREAD
 from dnrpipe.prepare import split_views
 from dnrpipe.scene_files import read_json
 from dnrpipe.session import Session, resolve_settings
@@ -192,12 +193,16 @@ def markdown(record: dict[str, Any]) -> str:
     }
     late = [row["actual"]["total"] / row["seconds"] for row in rows if row["side"] == "plan"]
     lost = [abs(row["predicted"]["psnr"]["expected"] - row["actual"]["psnr"]) for row in rows]
+    ratios = [row["actual"]["total"] / _expected(row, "total") for row in rows]
+    kept = sum(1 / TIME_SPREAD <= ratio <= TIME_SPREAD for ratio in ratios)
     inside = sum(r["predicted"]["psnr"]["low"] <= r["actual"]["psnr"] <= r["predicted"]["psnr"]["high"] for r in rows)
     lines += [
         "",
         f"Wall seconds of all {len(rows)} runs, median error: ray tracing with light and base images"
         f" {100 * off['raytrace']:.0f} %, training {100 * off['finetune']:.0f} %, total {100 * off['total']:.0f} %."
-        f" PSNR: {statistics.median(lost):.2f} dB, {inside} of {len(rows)} inside their interval.",
+        f" Totals were {min(ratios):.2f} to {max(ratios):.2f} times their forecast, {kept} of {len(rows)} inside the"
+        f" printed interval (1/{TIME_SPREAD:g} to {TIME_SPREAD:g}). PSNR: {statistics.median(lost):.2f} dB,"
+        f" {inside} of {len(rows)} inside their interval.",
         "",
         f"`--time`: the plan's runs took {100 * min(late):.0f} to {100 * max(late):.0f} % of the time given, median"
         f" {100 * statistics.median(late):.0f} %; {sum(one <= 1.1 for one in late)} of {len(late)} stayed below 110 %.",
