@@ -170,7 +170,8 @@ def markdown(record: dict[str, Any]) -> str:
     pairs: dict[tuple[str, float], dict[str, dict[str, Any]]] = {}
     for row in rows:
         pairs.setdefault((row["scene"], row["share"]), {})[row["side"]] = row
-    whole = {key: pair for key, pair in pairs.items() if len(pair) == len(SIDES)}
+    by_share = sorted(pairs.items(), key=lambda item: item[0][1])
+    whole = {key: pair for key, pair in by_share if len(pair) == len(SIDES)}
     lines = [
         "| scene | s | the preset's views and samples | took, s | dB | the plan's choice | took, s | dB | bought |",
         "|---|---|---|---|---|---|---|---|---|",

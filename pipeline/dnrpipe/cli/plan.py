@@ -32,8 +32,8 @@ def plan(
     """Predict what time buys and choose views, samples and steps.
 
     SCENE is a scene file or a workspace (scene.dnr); without it, the workspace is found as usual. The scene is
-    prepared where it is not. A pilot of about a minute measures each kind of work once and is kept in the workspace,
-    and so is the light that it bakes.
+    prepared where it is not. A pilot of one to two minutes measures each kind of work once and is kept in the
+    workspace, and so is the light that it bakes.
     Without --time and --target-psnr, a table of budgets is printed.
 
     \b

@@ -34,7 +34,7 @@ from ..workspace import Workspace, digest
 from .pilot_parts import FOLDER, HELD_OUT, REFERENCE_SPP, RESOLUTION, SPP, STEPS, VIEWS, Piloting
 from .records import LightPart, Pilot, Record
 
-VERSION = 5
+VERSION = 6
 FILE = "pilot.json"
 
 

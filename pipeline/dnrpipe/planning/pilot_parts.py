@@ -64,6 +64,7 @@ class Piloting:
         tasks = [self._task(view, f"train-{view.name}", SPP, config) for view in self.train]
         tasks += [self._task(view, f"held-{view.name}", REFERENCE_SPP, config) for view in self.held_out]
         common = {"bundle": config["bundle"], "variant": choice.variant, "threads": 1}
+        self._compile("dnrpipe.raytrace.tracer", common, warm[0], choice.environment)
         started = time.monotonic()
         answers = self._run(
             "pilot: ray tracing", "dnrpipe.raytrace.tracer", common, [*warm, *tasks], workers, choice.environment
@@ -124,6 +125,7 @@ class Piloting:
             for kind, views in (("train", self.train), ("held", self.held_out))
             for view in views
         ]
+        self._compile("dnrpipe.raytrace.base_worker", common, tasks[0], environment)
         started = time.monotonic()
         answers = self._run("pilot: base images", "dnrpipe.raytrace.base_worker", common, tasks, 1, environment)
         took = time.monotonic() - started
@@ -179,6 +181,11 @@ class Piloting:
         return FramePart.model_validate(result | {"views": len(self.held_out)})
 
     # -- what the parts share --------------------------------------------------------------------------
+
+    def _compile(self, module: str, common: dict[str, Any], task: dict[str, Any], environment: dict[str, str]) -> None:
+        """One task on a worker of its own: its kernels are then in Dr.Jit's cache on disk, as they are when the plan is
+        carried out. Compiling them takes 2 to 7 s, which would count as the start of every later stage."""
+        self._run("pilot: compiling kernels", module, common, [task], 1, environment)
 
     def _run(
         self,

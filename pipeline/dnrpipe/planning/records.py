@@ -31,7 +31,8 @@ class Traced(Record):
 
 
 class TracePart(Record):
-    """startup: seconds until the workers traced their first small view; workers: side by side."""
+    """startup: seconds until the workers traced their first small view, kernels compiled before; workers: side by
+    side."""
 
     points: list[Traced]
     workers: int
@@ -56,7 +57,8 @@ class LightPart(Record):
 
 
 class BasePart(Record):
-    """Base images at the pilot's size, seconds each (median); startup: of the worker, kernels compiled."""
+    """Base images at the pilot's size, seconds each (median); startup: of the worker, kernels compiled
+    before."""
 
     pixels: int
     seconds: float
