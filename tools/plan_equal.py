@@ -30,7 +30,7 @@ from dnrpipe.planning.carry_out import apply
 from dnrpipe.planning.choose import Predictor
 from dnrpipe.planning.command import Wanted, make_plan, make_predictor
 from dnrpipe.planning.pilot import read_pilot
-from dnrpipe.planning.records import Choice, Prediction
+from dnrpipe.planning.records import Prediction
 from dnrpipe.planning.seconds import TIME_SPREAD
 from dnrpipe.prepare import split_views
 from dnrpipe.scene_files import read_json
@@ -111,14 +111,6 @@ def _run(root: Path, scene: str, share: float, side: str, cells: Path) -> dict[s
 
 def _predicted(one: dict[str, Any]) -> dict[str, Any]:
     return {**one["seconds"], "cpu": one["cpu_seconds"], "psnr": one["psnr"]}
-
-
-def again(root: Path, scene: str, cells: Path, rows: list[dict[str, Any]]) -> None:
-    """Predict the choices that were run anew, with the pilot as it is now; what they took and gave stays."""
-    predictor = predictor_in(root, without(read_cells(cells), scene, str(cells)))
-    for row in rows:
-        if row["scene"] == scene:
-            row["predicted"] = _predicted(predictor.predict(Choice(**row["choice"])).model_dump(mode="json"))
 
 
 def predictor_in(root: Path, prior: Any) -> Predictor:
@@ -227,7 +219,6 @@ def main() -> int:
     parser.add_argument("--shares", default="0.5,1", help="of the preset's own time")
     parser.add_argument("--cells", type=Path, default=Path("docs/results/plan-prior.json"))
     parser.add_argument("--out", type=Path, required=True, help="JSON of all rows, added to")
-    parser.add_argument("--again", action="store_true", help="run nothing: predict what is in --out by today's pilots")
     options = parser.parse_args()
     rows = read_json(options.out)["rows"] if options.out.exists() else []
     try:
@@ -235,12 +226,8 @@ def main() -> int:
             scene, _, root = text.rpartition("=")
             path = Path(root).resolve()
             name = scene or path.name.removesuffix(".dnr")
-            if options.again:
-                again(path, name, options.cells, rows)
-            for share in () if options.again else options.shares.split(","):
+            for share in options.shares.split(","):
                 rows += compare(path, name, float(share), options.cells, rows)
-                _write(options.out, rows)
-            if options.again:
                 _write(options.out, rows)
     except UserError as error:
         print(error, file=sys.stderr)
