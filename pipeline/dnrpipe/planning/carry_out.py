@@ -79,10 +79,10 @@ def steps_within(predictor: Predictor, choice: Choice, seconds: float) -> Predic
 
 
 def _with_the_steps_that_fit(session: Session, record: dict[str, Any], prior: Prior) -> dict[str, Any]:
-    """Where the plan keeps a time; else, and where all was traced by an earlier run, the record as it is."""
+    """Where a plan spends a time; else (a PSNR is wanted, or all was traced by an earlier run) the record as it is."""
     wanted, answers = record["wanted"]["seconds"], session.answers
     pilot = read_pilot(session.workspace)
-    if wanted is None or not answers["raytrace"]["ran"] or pilot is None:
+    if wanted is None or record["wanted"]["psnr"] is not None or not answers["raytrace"]["ran"] or pilot is None:
         return record
     predictor = make_predictor(session.workspace, session.settings, pilot, prior)
     chosen = Prediction.model_validate(record["chosen"])
