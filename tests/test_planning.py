@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dnrpipe.planning.carry_out import steps_within
+from dnrpipe.planning.carry_out import steps_that_fit, steps_within
 from dnrpipe.planning.choose import NEAR, Predictor, best_within, budgets, cheapest_reaching
 from dnrpipe.planning.pilot import pilot_path, read_pilot
 from dnrpipe.planning.quality import (
@@ -267,6 +268,15 @@ def test_training_takes_the_time_left_or_what_is_best(views_and_samples: tuple[i
     assert found.choice.epochs == 1 or found.seconds.finetune <= left + 1e-6
     longer = one.predict(one.choice(*views_and_samples, found.choice.steps + per_epoch))
     assert longer.seconds.finetune > left or longer.psnr.expected <= found.psnr.expected + NEAR
+
+
+def test_a_wanted_psnr_keeps_its_steps(tmp_path: Path, demo_blend: Path) -> None:
+    workspace = Workspace.create(tmp_path / "demo.dnr", Source(path=str(demo_blend), sha256="0" * 64))
+    pilot_path(workspace).parent.mkdir()
+    pilot_path(workspace).write_text(pilot().model_dump_json())
+    session = SimpleNamespace(workspace=workspace, answers={"raytrace": {"ran": True, "seconds": 1.0}})
+    record = {"wanted": {"seconds": 3600.0, "psnr": 29.0, "frames": None}}
+    assert steps_that_fit(session, record, PRIOR) is record  # type: ignore[arg-type]
 
 
 def test_a_torn_pilot_counts_as_none(tmp_path: Path, demo_blend: Path) -> None:

@@ -35,7 +35,7 @@ def apply(session: Session, record: dict[str, Any], prior: Prior | None = None) 
     before = len(workspace.ledger.read())
     session.adopt(overrides_of(record))
     session.stages("select", "raytrace")
-    record = _with_the_steps_that_fit(session, record, prior or load_prior())
+    record = steps_that_fit(session, record, prior or load_prior())
     session.adopt(overrides_of(record))
     write_json(workspace.root / FOLDER / "plan.json", record)  # after Ctrl-C the same training goes on
     names = ["finetune"]
@@ -78,8 +78,8 @@ def steps_within(predictor: Predictor, choice: Choice, seconds: float) -> Predic
     return cheapest_of_the_best(found)
 
 
-def _with_the_steps_that_fit(session: Session, record: dict[str, Any], prior: Prior) -> dict[str, Any]:
-    """Where a plan spends a time; else (a PSNR is wanted, or all was traced by an earlier run) the record as it is."""
+def steps_that_fit(session: Session, record: dict[str, Any], prior: Prior) -> dict[str, Any]:
+    """The record with ``carried_out`` where a plan spends a time; else (a PSNR is wanted, or all was traced by an earlier run) the record as it is."""
     wanted, answers = record["wanted"]["seconds"], session.answers
     pilot = read_pilot(session.workspace)
     if wanted is None or record["wanted"]["psnr"] is not None or not answers["raytrace"]["ran"] or pilot is None:
