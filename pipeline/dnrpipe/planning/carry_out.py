@@ -79,8 +79,8 @@ def steps_within(predictor: Predictor, choice: Choice, seconds: float) -> Predic
 
 
 def steps_that_fit(session: Session, record: dict[str, Any], prior: Prior) -> dict[str, Any]:
-    """The record with ``carried_out`` where a plan spends a time; else, with a wanted PSNR or where all was traced by an
-    earlier run, the record as it is."""
+    """The record with ``carried_out`` where a plan spends a time; else, with a wanted PSNR or where all was traced by
+    an earlier run, the record as it is."""
     wanted, answers = record["wanted"]["seconds"], session.answers
     pilot = read_pilot(session.workspace)
     if wanted is None or record["wanted"]["psnr"] is not None or not answers["raytrace"]["ran"] or pilot is None:
