@@ -344,7 +344,7 @@ def test_a_scene_is_planned_and_the_plan_carried_out(
     tmp_path: Path, demo_blend: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from dnrpipe.cli import _main
-    from dnrpipe.planning import choose
+    from dnrpipe.planning import carry_out, choose
     from dnrpipe.planning import pilot_parts as pilot
 
     monkeypatch.chdir(tmp_path)
@@ -359,6 +359,7 @@ def test_a_scene_is_planned_and_the_plan_carried_out(
         (choose, "STEPS", (12, 24)),
         (choose, "SAMPLES", (4, 8)),
         (choose, "VIEWS", (3, 4)),
+        (carry_out, "FILLED", 0.003),  # of the hour below: 11 s of training
     ):
         monkeypatch.setattr(module, name, value)
     (tmp_path / "dnrpipe.toml").write_text(_toml(SMALL))
