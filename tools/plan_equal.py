@@ -26,7 +26,7 @@ from tools.plan_prior import read_cells, without
 
 from dnrpipe.ablation.results import made_by
 from dnrpipe.errors import UserError
-from dnrpipe.planning.carry_out import apply
+from dnrpipe.planning.carry_out import apply, steps_within
 from dnrpipe.planning.choose import Predictor
 from dnrpipe.planning.command import Wanted, make_plan, make_predictor
 from dnrpipe.planning.pilot import read_pilot
@@ -133,12 +133,8 @@ def preset_choice(predictor: Predictor, session: Session) -> Callable[[float | N
             return predictor.predict(
                 predictor.choice(views, settings.raytrace.spp, settings.finetune.step2.epochs * per_epoch)
             )
-        one, two = (
-            predictor.predict(predictor.choice(views, settings.raytrace.spp, n * per_epoch)).seconds.total.expected
-            for n in (1, 2)
-        )
-        epochs = max(1, int((seconds - one) / (two - one)) + 1)  # time is a straight line in steps
-        return predictor.predict(predictor.choice(views, settings.raytrace.spp, epochs * per_epoch))
+        least = predictor.predict(predictor.choice(views, settings.raytrace.spp, per_epoch))
+        return steps_within(predictor, least.choice, seconds - least.seconds.select - least.seconds.raytrace)
 
     return of
 

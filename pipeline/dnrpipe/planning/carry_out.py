@@ -14,8 +14,8 @@ from ..costs import total
 from ..prepare import split_views
 from ..report.words import duration
 from .choose import STEPS, Predictor, cheapest_of_the_best
-from .command import make_predictor
-from .pilot import FOLDER, read_pilot
+from .command import make_predictor, plan_path
+from .pilot import read_pilot
 from .quality import Prior, load_prior
 from .records import Choice, Prediction
 
@@ -37,7 +37,7 @@ def apply(session: Session, record: dict[str, Any], prior: Prior | None = None) 
     session.stages("select", "raytrace")
     record = steps_that_fit(session, record, prior or load_prior())
     session.adopt(overrides_of(record))
-    write_json(workspace.root / FOLDER / "plan.json", record)  # after Ctrl-C the same training goes on
+    write_json(plan_path(workspace), record)  # after Ctrl-C the same training goes on
     names = ["finetune"]
     if split_views(workspace).get("test"):
         names.append("evaluate")
@@ -53,7 +53,7 @@ def apply(session: Session, record: dict[str, Any], prior: Prior | None = None) 
         "psnr": answers.get("evaluate", {}).get("mean", {}).get("psnr"),
     }
     record = record | {"actual": actual}
-    write_json(workspace.root / FOLDER / "plan.json", record)
+    write_json(plan_path(workspace), record)
     return record
 
 

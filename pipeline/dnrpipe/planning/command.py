@@ -41,6 +41,11 @@ class Wanted:
     frames: int | None = None
 
 
+def plan_path(workspace: Workspace) -> Path:
+    """``plan/plan.json``."""
+    return workspace.root / FOLDER / "plan.json"
+
+
 def make_plan(
     workspace: Workspace, settings: Settings, console: Console, wanted: Wanted, prior: Prior | None = None
 ) -> dict[str, Any]:
@@ -71,10 +76,9 @@ def make_plan(
         found, at = whether_to_train(predictor, grid, settings, wanted, chosen)
         record |= {"routes": [r.model_dump(mode="json") for r in found], "routes_psnr": at}
         record |= {"break_even": break_even(found), "train": found[0].reaches and found[0].name == "neural renderer"}
-    path = workspace.root / FOLDER / "plan.json"
-    if carried_out := _carried_out(path, record):
+    if carried_out := _carried_out(plan_path(workspace), record):
         record["carried_out"] = carried_out
-    write_json(path, record)
+    write_json(plan_path(workspace), record)
     return record
 
 
