@@ -270,22 +270,24 @@ def test_training_takes_the_time_left_or_what_is_best(views_and_samples: tuple[i
     assert longer.seconds.finetune > left or longer.psnr.expected <= found.psnr.expected + NEAR
 
 
-def test_a_wanted_psnr_keeps_its_steps(tmp_path: Path, demo_blend: Path) -> None:
-    workspace = Workspace.create(tmp_path / "demo.dnr", Source(path=str(demo_blend), sha256="0" * 64))
+def workspace_with_pilot(folder: Path) -> Workspace:
+    workspace = Workspace.create(folder / "demo.dnr", Source(path="demo.blend", sha256="0" * 64))
     pilot_path(workspace).parent.mkdir()
     pilot_path(workspace).write_text(pilot().model_dump_json())
+    return workspace
+
+
+def test_a_wanted_psnr_keeps_its_steps(tmp_path: Path) -> None:
+    workspace = workspace_with_pilot(tmp_path)
     session = SimpleNamespace(workspace=workspace, answers={"raytrace": {"ran": True, "seconds": 1.0}})
     record = {"wanted": {"seconds": 3600.0, "psnr": 29.0, "frames": None}}
     assert steps_that_fit(session, record, PRIOR) is record  # type: ignore[arg-type]
 
 
-def test_a_torn_pilot_counts_as_none(tmp_path: Path, demo_blend: Path) -> None:
-    workspace = Workspace.create(tmp_path / "demo.dnr", Source(path=str(demo_blend), sha256="0" * 64))
-    path = pilot_path(workspace)
-    path.parent.mkdir()
-    path.write_text(pilot().model_dump_json())
+def test_a_torn_pilot_counts_as_none(tmp_path: Path) -> None:
+    workspace = workspace_with_pilot(tmp_path)
     assert read_pilot(workspace) == pilot()
-    path.write_text(pilot().model_dump_json()[:-100])
+    pilot_path(workspace).write_text(pilot().model_dump_json()[:-100])
     assert read_pilot(workspace) is None
 
 
@@ -379,10 +381,8 @@ def test_a_scene_is_planned_and_the_plan_carried_out(
     done = json.loads((root / "plan" / "plan.json").read_text())
     choice, carried_out = done["chosen"]["choice"], done["carried_out"]["choice"]
     assert {key: choice[key] for key in ("views", "spp")} == {key: carried_out[key] for key in ("views", "spp")}
-    assert (
-        json.loads((root / "manifest.json").read_text())["overrides"]["finetune"]["step2"]["epochs"]
-        == (carried_out["epochs"])
-    )
+    remembered = json.loads((root / "manifest.json").read_text())["overrides"]
+    assert remembered["finetune"]["step2"]["epochs"] == carried_out["epochs"]
     assert len(json.loads((root / "selection.json").read_text())["views"]) == choice["views"]
     assert done["actual"]["psnr"] > 10
     assert done["actual"]["seconds"]["total"] > 0

@@ -33,17 +33,16 @@ def apply(session: Session, record: dict[str, Any], prior: Prior | None = None) 
     """
     workspace = session.workspace
     before = len(workspace.ledger.read())
+    names = ["select", "raytrace", "finetune"]
+    if split_views(workspace).get("test"):
+        names.append("evaluate")
     session.adopt(overrides_of(record))
-    session.stages("select", "raytrace")
+    session.stages(*names[:2])
     record = steps_that_fit(session, record, prior or load_prior())
     session.adopt(overrides_of(record))
     write_json(plan_path(workspace), record)  # after Ctrl-C the same training goes on
-    names = ["finetune"]
-    if split_views(workspace).get("test"):
-        names.append("evaluate")
-    session.stages(*names)
+    session.stages(*names[2:])
     answers = session.answers
-    names = ["select", "raytrace", *names]
     made = {name: answers[name].get("seconds", 0.0) if answers[name]["ran"] else 0.0 for name in names}
     spent = workspace.ledger.read()[before:]
     actual: dict[str, Any] = {

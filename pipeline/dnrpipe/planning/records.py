@@ -57,8 +57,7 @@ class LightPart(Record):
 
 
 class BasePart(Record):
-    """Base images at the pilot's size, seconds each (median); startup: of the worker, kernels compiled
-    before."""
+    """Base images at the pilot's size, seconds each (median); startup: of the worker, kernels compiled before."""
 
     pixels: int
     seconds: float

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict
 
 from ..costs import total
 from ..errors import UserError
-from ..planning.pilot_parts import FOLDER
+from ..planning.command import plan_path
 from ..planning.records import Choice, Prediction
 from ..settings import Settings
 from ..workspace import Workspace
@@ -36,7 +36,7 @@ def plan_state(workspace: Workspace, settings: Settings, states: Mapping[str, st
     A stage that has ended has cost the wall seconds of its last run, or what its parts are booked with where it was
     interrupted; one under way what its parts so far are booked with, which leaves out the start of processes.
     """
-    path = workspace.root / FOLDER / "plan.json"
+    path = plan_path(workspace)
     try:
         plan = _Plan.model_validate(json.loads(path.read_bytes()))
     except FileNotFoundError:
