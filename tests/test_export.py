@@ -199,7 +199,7 @@ def cycles(path: Path) -> np.ndarray:
 def mitsuba(folder: Path) -> np.ndarray:
     """The bundle's picture from the scene's camera, linear RGBA [SIZE, SIZE, 4]."""
     mi = pytest.importorskip("mitsuba")
-    scene = mi.load_file(str(folder / "scene.xml"))
+    scene = mi.load_file(str(folder / "scene.xml"), parallel=False)
     camera = bpy.context.scene.camera
     pose = np.array(camera.matrix_world)
     sensor = mi.load_dict(

@@ -54,7 +54,7 @@ import sys, numpy as np, mitsuba as mi
 from dnrpipe.raytrace import plugins
 mi.set_variant(sys.argv[1])
 plugins.register(mi)
-np.save(sys.argv[3], np.array(mi.render(mi.load_file(sys.argv[2]), seed=3, spp=int(sys.argv[4]))))
+np.save(sys.argv[3], np.array(mi.render(mi.load_file(sys.argv[2], parallel=False), seed=3, spp=int(sys.argv[4]))))
 """
 
 
