@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dnrpipe.errors import UserError
+from dnrpipe.core.errors import UserError
 from dnrpipe.report import build_report, build_report_data, charts, words
 from dnrpipe.report.collect import collect
 from dnrpipe.report.pictures import load_png

@@ -7,8 +7,8 @@ from typing import Any
 
 import bpy
 
+from dnrpipe.core.errors import NothingVisible
 from dnrpipe.effects.bundle import bundle_facts
-from dnrpipe.errors import NothingVisible
 
 from .baking.rehearsal import BakeOptions, convert_materials, place_atlas
 from .bundle.export import export_bundle

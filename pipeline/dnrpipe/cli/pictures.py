@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from ..errors import UserError
+from ..core.errors import UserError
 from .options import common, open_session
 
 

@@ -144,7 +144,7 @@ def run(scene: Path | None, strict: bool, **options: Any) -> None:
       dnrpipe run scene.blend --budget 25
       dnrpipe run scene.blend --preset paper
     """
-    from ..settings import merge
+    from ..core.settings import merge
 
     overrides = merge(camera_overrides(options), select_overrides(options))
     overrides |= strict_override(strict)

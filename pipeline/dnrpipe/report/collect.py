@@ -14,20 +14,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dnrtrain.contract import ContractError, SceneFrame, View, read_cameras
 
-from .. import costs
-from ..errors import UserError
+from ..core import ledger as costs
+from ..core.errors import UserError
 from .advice import missing, notes
 from .budget import build_budget
 from .coverage import coverage_maps
-from .data import (
-    ChosenView,
-    FindingGroup,
-    ReportData,
-    Selection,
-    Sphere,
-    SphereView,
-    Training,
-)
+from .data import ChosenView, FindingGroup, ReportData, Selection, Sphere, SphereView, Training
 from .pictures import ExrPictures
 from .quality import Metrics, build_quality
 from .words import verdict
@@ -83,7 +75,7 @@ class _Checkpoint(BaseModel):
 class Outline(BaseModel):
     """What a workspace holds, without pictures: quick enough to ask for while a stage runs.
 
-    psnr: dB by test view, in the order of the evaluation. costs: see :func:`dnrpipe.costs.summarise`.
+    psnr: dB by test view, in the order of the evaluation. costs: see :func:`dnrpipe.core.ledger.summarise`.
     """
 
     sphere: Sphere | None
