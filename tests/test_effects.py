@@ -12,12 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dnrpipe.core.cameras import view_lenses
+from dnrpipe.core.effect_names import FORCEABLE, LAMPS, NAMES, NEURAL
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import CameraSettings, Settings, resolve
 from dnrpipe.effects.bundle import bundle_facts, write_without
-from dnrpipe.effects.plan import FORCEABLE, LAMPS, NAMES, NEURAL, DepthPilot, DepthStep, EffectPlan, plan_effects
+from dnrpipe.effects.plan import DepthPilot, EffectPlan, plan_effects
 from dnrpipe.raytrace.sensors import _centred
-from dnrpipe.raytrace.statistics import difference, enough, remaining, significance
+from dnrpipe.raytrace.statistics import DepthStep, difference, enough, remaining, significance
 from dnrpipe.studies.effect_costs import override_settings, table
 from dnrtrain.settings import ModelSettings
 

@@ -127,10 +127,9 @@ def _time_calls(module: Any, seconds: list[float], wait: Callable[[], None]) -> 
 
 def _first_view(workspace: Path, base: Any) -> Any:
     """The first test view that has all files the model needs, as a batch."""
-    from dnrpipe.core.scene_files import read_frame
+    from dnrpipe.core.scene_files import read_frame, split_views
     from dnrpipe.core.workspace import Workspace
     from dnrpipe.stages.base_images import RENDERED, base_path
-    from dnrpipe.stages.prepare import split_views
     from dnrtrain.dataset import load_views
 
     opened = Workspace.open(workspace)

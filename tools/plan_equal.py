@@ -25,11 +25,10 @@ from typing import Any
 from tools.plan_prior import read_cells, without
 
 from dnrpipe.core.errors import UserError
-from dnrpipe.core.scene_files import read_json
+from dnrpipe.core.scene_files import read_json, split_views
 from dnrpipe.core.workspace import Workspace
-from dnrpipe.stages.prepare import split_views
 from dnrpipe.stages.session import Session, resolve_settings
-from dnrpipe.studies.ablation.results import made_by
+from dnrpipe.studies.cells.provenance import made_by
 from dnrpipe.studies.planning.carry_out import apply, steps_within
 from dnrpipe.studies.planning.choose import Predictor
 from dnrpipe.studies.planning.command import Wanted, make_plan, make_predictor

@@ -20,9 +20,9 @@ def test_the_file_renders_what_evaluate_rendered(tiny: Path, tmp_path: Path) -> 
     """From the EXR files to evaluation's own PNG, without torch (which evaluated in bfloat16 where that is fast)."""
     import onnxruntime
 
+    from dnrpipe.core.scene_files import split_views
     from dnrpipe.core.workspace import Workspace
     from dnrpipe.export.onnx import view_inputs
-    from dnrpipe.stages.prepare import split_views
 
     out = tmp_path / "m.onnx"
     answer = json.loads(run("export-onnx", str(tiny), "--out", str(out), "--json", folder=tmp_path).stdout)

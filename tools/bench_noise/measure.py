@@ -19,7 +19,7 @@ import numpy as np
 
 from dnrpipe.core.cameras import scaled_to
 from dnrpipe.core.errors import UserError
-from dnrpipe.core.scene_files import read_json
+from dnrpipe.core.scene_files import read_json, split_views
 from dnrpipe.core.workspace import Workspace
 from dnrpipe.effects.store import plan_of, trace_config, variant_for
 from dnrpipe.raytrace.grouped import GroupedSensor
@@ -28,7 +28,6 @@ from dnrpipe.raytrace.pass_worker import Worker
 from dnrpipe.raytrace.sample_schedule import Goal, Schedule, ViewProgress
 from dnrpipe.raytrace.samples import read_samples
 from dnrpipe.raytrace.statistics import display
-from dnrpipe.stages.prepare import split_views
 from dnrpipe.stages.raytrace import view_seed
 from dnrpipe.stages.session import resolve_settings
 from dnrtrain.contract import View

@@ -19,6 +19,7 @@ from .options import (
     strict_override,
     tracing_overrides,
 )
+from .pictures import write_report
 
 
 @click.command()
@@ -150,4 +151,4 @@ def run(scene: Path | None, strict: bool, **options: Any) -> None:
     overrides |= strict_override(strict)
     with open_session("run", options, scene=scene, overrides=overrides) as session:
         session.stages("prepare", "select", "raytrace", "finetune", "evaluate")
-        session.report()
+        write_report(session)

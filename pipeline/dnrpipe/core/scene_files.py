@@ -9,7 +9,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from dnrtrain.contract import DamagedFile, SceneFrame
+from dnrtrain.contract import SPLITS, DamagedFile, SceneFrame, View, read_cameras
 
 from .errors import UserError
 from .workspace import Workspace, digest, file_sha256
@@ -68,3 +68,13 @@ def _sha256_now(path: Path) -> str:
 def _sha256_cached(path: Path, modified_ns: int, size: int) -> str:
     del modified_ns, size  # part of the key only
     return file_sha256(path)
+
+
+def split_views(workspace: Workspace) -> dict[str, list[View]]:
+    """The views of each split, as `prepare` placed them."""
+    return {split: read_cameras(workspace.cameras(split)) for split in SPLITS if workspace.cameras(split).exists()}
+
+
+def has_test_views(workspace: Workspace) -> bool:
+    """Whether there is anything to evaluate on."""
+    return bool(split_views(workspace).get("test"))

@@ -18,7 +18,7 @@ from pydantic import Field, ValidationError, field_validator
 from dnrtrain.selector.names import TRAINED_NAMES, PolicyName, full_name
 from dnrtrain.settings import ActiveSettings, LossWeights, ModelSettings, Step1Settings, Step2Settings, Strict
 
-from ..effects.plan import EffectName
+from .effect_names import EffectName
 from .errors import UserError
 from .units import parse_seconds, parse_share
 

@@ -16,10 +16,9 @@ from dnrtrain.exr import read_exr
 from .. import __version__
 from ..core.console import Console
 from ..core.errors import UserError
-from ..core.scene_files import read_frame
+from ..core.scene_files import read_frame, split_views
 from ..core.workspace import Workspace
 from ..stages.base_images import RENDERED, base_path
-from ..stages.prepare import split_views
 
 if TYPE_CHECKING:
     from dnrtrain.contract import SceneFrame

@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from ..effects.plan import DepthStep, Measured
+from dnrtrain.settings import Strict
 
 BLOCK = 4
 WORST = 0.02
@@ -22,6 +22,24 @@ WORST = 0.02
 the 99th."""
 # Two-sided 95% quantiles of Student's t by degrees of freedom.
 T95 = (12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23, 2.20, 2.18, 2.16, 2.14, 2.13)
+REFERENCE_DEPTH = 64
+"""Path vertices that count as all of the light."""
+
+
+class Measured(Strict):
+    """A mean over views and half the width of its 95% confidence interval."""
+
+    mean: float
+    half_width: float
+
+
+class DepthStep(Strict):
+    """What paths cut at ``depth`` leave out, as shares of the mean radiance (see :mod:`.statistics`)."""
+
+    depth: int
+    mean: float
+    mean_error: float
+    pixel: float
 
 
 def remaining(depth: int, missing: np.ndarray, whole: np.ndarray, cover: np.ndarray) -> DepthStep:

@@ -11,9 +11,9 @@ import re
 from pathlib import Path
 from typing import Any
 
+from ..core.units import duration
 from ..studies.frames.ladder import quality_at
 from .data import Budget, FrontierSummary, PlannedRow, Quality
-from .words import duration
 
 NEXT = 60.0
 """Seconds of work whose worth is told."""

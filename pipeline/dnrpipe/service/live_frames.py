@@ -21,6 +21,7 @@ import numpy as np
 from PIL import Image
 
 from dnrpipe.core.errors import UserError
+from dnrpipe.core.images import flip_error
 from dnrpipe.core.settings import Settings
 from dnrpipe.raytrace.base import BaseRenderer
 from dnrpipe.raytrace.base_worker import Worker as BaseWorker
@@ -28,7 +29,6 @@ from dnrpipe.raytrace.engine import Engine
 from dnrpipe.raytrace.finite import masked, masked_channels
 from dnrpipe.raytrace.frames import Frames
 from dnrpipe.raytrace.light_worker import read_light
-from dnrpipe.stages.evaluate import flip_error
 from dnrpipe.stages.trainer import torch_device
 from dnrtrain.checkpoint import load_model
 from dnrtrain.contract import RASTER_CHANNELS, SceneFrame, View, require_channels

@@ -4,24 +4,24 @@ from __future__ import annotations
 
 import math
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dnrtrain.atomic import atomic_path, write_json
+from dnrtrain.atomic import write_json
 from dnrtrain.contract import ContractError, View
 from dnrtrain.exr import read_metadata
 
 from ..core.console import Console
 from ..core.errors import UserError
+from ..core.images import flip_error, write_png
 from ..core.ledger import CostRecord
+from ..core.scene_files import split_views
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest
 from .base_images import RENDERED, base_path, base_views
-from .pipeline import Outcome
-from .prepare import split_views
 from .raytrace import trace_views
+from .stage import Outcome
 from .trainer import load, perceptual_weights, torch_device
 
 NEURAL_REPEATS = 5
@@ -121,28 +121,6 @@ def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
         return 0, settings.cameras.test
     done = sum((workspace.evaluation / f"{view.name}.flip.png").exists() for view in views)
     return (done if (workspace.evaluation / "metrics.json").exists() else 0), len(views)
-
-
-def flip_error(truth: np.ndarray, prediction: np.ndarray) -> tuple[float, np.ndarray]:
-    """Mean LDR-FLIP and its heat map [H, W, 3] (magma) of two display-space images [H, W, 3] in [0, 1].
-
-    NVIDIA's flip-evaluator at its default 67 pixels per degree.
-    """
-    import flip_evaluator
-
-    heat, mean, _ = flip_evaluator.evaluate(
-        np.ascontiguousarray(truth, np.float32), np.ascontiguousarray(prediction, np.float32), "LDR"
-    )
-    return float(mean), np.asarray(heat)
-
-
-def write_png(path: Path, image: np.ndarray) -> None:
-    """Write display-space [H, W, 3] in [0, 1] as 8-bit PNG, atomically."""
-    from PIL import Image
-
-    data = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
-    with atomic_path(path) as temporary:
-        Image.fromarray(data).save(temporary)
 
 
 def _timed_render(render: Any, device: str) -> tuple[float, Any]:

@@ -9,6 +9,7 @@ from typing import Any
 from ..blender.finding_lines import finding_lines
 from ..core.errors import UserError
 from ..core.settings import PassSettings
+from ..effects.bundle import bundle_facts
 from ..effects.plan import plan_effects
 from ..workers.processes import Retry, run_tasks
 
@@ -33,10 +34,12 @@ def inspect_scene(scene: Path) -> dict[str, Any]:
     if not scene.exists():
         raise UserError(f"{scene}: no such file")
     with tempfile.TemporaryDirectory(prefix="dnrpipe-inspect-") as folder:
-        answer = _ask(scene, Path(folder))
+        bundle = Path(folder) / "bundle"
+        answer = _ask(scene, bundle, Path(folder) / "log")
+        facts = bundle_facts(bundle / "scene.xml") if bundle.exists() else {}  # nothing visible: nothing converted
     census = answer["census"]
     findings = {kind: [f for f in census["findings"] if f["kind"] == kind] for kind in ("exact", *ORDER)}
-    plan = plan_effects(census, answer["bundle"])
+    plan = plan_effects(census, facts)
     return {
         "file": str(scene),
         "warnings": answer["warnings"],
@@ -47,10 +50,9 @@ def inspect_scene(scene: Path) -> dict[str, Any]:
     }
 
 
-def _ask(scene: Path, folder: Path) -> dict[str, Any]:
-    size = PassSettings().bake_size
-    task = {"source": str(scene.resolve()), "folder": str(folder / "bundle"), "bake_size": size}
-    for outcome in run_tasks("dnrpipe.blender.inspection", {}, [task], workers=1, log=folder / "log"):
+def _ask(scene: Path, folder: Path, log: Path) -> dict[str, Any]:
+    task = {"source": str(scene.resolve()), "folder": str(folder), "bake_size": PassSettings().bake_size}
+    for outcome in run_tasks("dnrpipe.blender.inspection", {}, [task], workers=1, log=log):
         if isinstance(outcome, Retry):
             continue
         if outcome.died:

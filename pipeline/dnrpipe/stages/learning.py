@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from ..core.console import Console
 from ..core.errors import UserError
+from ..core.scene_files import split_views
 from ..core.workspace import Workspace
-from .prepare import split_views
 from .select import check_budget, look
 
 if TYPE_CHECKING:

@@ -12,8 +12,6 @@ import os
 import platform
 import shutil
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -21,39 +19,12 @@ from dnrtrain.selector.names import ACTIVE_NAMES, SHIPPED_WEIGHTS
 
 from .. import __version__
 from ..core.console import Console, clock
+from ..core.effect_names import NEURAL
 from ..core.errors import UserError
 from ..core.scene_files import scene_fingerprint
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest, file_sha256
-from ..effects.plan import NEURAL
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a stage's run returns: a hash of what it made, and facts for the manifest and ``--json``."""
-
-    output: str
-    detail: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Stage:
-    """One stage. ``run`` and ``progress`` are "module:function", imported when called.
-
-    run(workspace, settings, console, run_id) -> Outcome
-    progress(workspace, settings) -> (units present, units wanted)
-    """
-
-    name: str
-    command: str
-    does: str
-    needs: tuple[str, ...]
-    reads: tuple[str, ...]
-    writes: tuple[str, ...]
-    settings: Callable[[Settings], Any]
-    run: str
-    progress: str
-    version: int = 1
+from .stage import Outcome, Stage
 
 
 def _light(settings: Settings) -> dict[str, Any]:

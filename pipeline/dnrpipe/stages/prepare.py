@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dnrtrain.atomic import write_json
-from dnrtrain.contract import SPLITS, View, read_cameras, write_cameras
+from dnrtrain.contract import SPLITS, View, write_cameras
 
 from ..blender.finding_lines import finding_lines
 from ..core.cameras import depth_range, make_cameras
@@ -24,7 +24,7 @@ from ..effects.store import keep_plan, plan_of
 from ..workers.processes import Retry, run_tasks
 from ..workers.view_tasks import run_view_tasks, view_record, warn_repairs, worker_count
 from .baking import FOLDER, bake
-from .pipeline import Outcome
+from .stage import Outcome
 
 MAX_BAKE_ROUNDS = 4
 """Values whose need shows only after others are baked take further rounds; two are the rule."""
@@ -105,16 +105,6 @@ def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
         wanted = sum(workspace.manifest.stages["prepare"].detail["views"].values())
     present = sum(1 for split in SPLITS for _ in (workspace.root / "passes" / split).glob("[!.]*.exr"))
     return min(present, wanted), wanted
-
-
-def split_views(workspace: Workspace) -> dict[str, list[View]]:
-    """The views of each split, as `prepare` placed them."""
-    return {split: read_cameras(workspace.cameras(split)) for split in SPLITS if workspace.cameras(split).exists()}
-
-
-def has_test_views(workspace: Workspace) -> bool:
-    """Whether there is anything to evaluate on."""
-    return bool(split_views(workspace).get("test"))
 
 
 def pass_task(

@@ -11,7 +11,7 @@ from dnrtrain.exr import read_metadata
 
 from ..core.console import Console
 from ..core.ledger import CostRecord
-from ..core.scene_files import scene_fingerprint
+from ..core.scene_files import scene_fingerprint, split_views
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest
 from ..effects.plan import EffectPlan
@@ -20,8 +20,7 @@ from ..raytrace.sample_schedule import Goal
 from ..workers.view_tasks import is_made, run_view_tasks, task_name, view_record, warn_repairs, worker_count
 from .adaptive_sampling import run_passes
 from .base_images import RENDERED, base_path, base_views
-from .pipeline import Outcome
-from .prepare import split_views
+from .stage import Outcome
 from .trainer import read_selection
 
 TRACE_VERSION = 3

@@ -15,13 +15,13 @@ from dnrtrain.contract import View, write_cameras
 
 from ..core.console import Console
 from ..core.errors import UserError
+from ..core.images import write_png
 from ..core.ledger import CostRecord
 from ..core.scene_files import read_frame, scene_fingerprint
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest
 from ..workers.view_tasks import run_view_tasks, view_record, worker_count
 from .base_images import RENDERED, base_views
-from .evaluate import write_png
 from .pipeline import STAGES, require_inputs
 from .prepare import pass_common, pass_task
 from .trainer import torch_device

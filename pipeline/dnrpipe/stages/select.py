@@ -16,12 +16,13 @@ from dnrtrain.selector.names import ACTIVE_NAMES, TRAINED_NAMES
 from ..core.console import Bar, Console
 from ..core.errors import UserError
 from ..core.ledger import CostRecord
+from ..core.scene_files import split_views
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest, file_sha256
 from ..effects.store import plan_of
-from .pipeline import STAGES, Outcome, fingerprint
-from .prepare import split_views
+from .pipeline import STAGES, fingerprint
 from .rounds import check_rounds, go_on, portions, trace_round
+from .stage import Outcome
 from .trainer import epochs_done, follow, load, torch_device
 
 if TYPE_CHECKING:

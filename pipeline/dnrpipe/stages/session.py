@@ -84,8 +84,8 @@ class Session:
 
     def stages(self, *names: str) -> None:
         """Run stages in order; flags are remembered once the first one's inputs are known to be there."""
+        from ..core.scene_files import has_test_views
         from .pipeline import STAGES, require_inputs, run_stage
-        from .prepare import has_test_views
 
         require_inputs(STAGES[names[0]], self.workspace, self.settings)
         self.workspace.manifest.settings = self.settings.model_dump(mode="json")
@@ -115,44 +115,6 @@ class Session:
         manifest = self.workspace.manifest
         manifest.overrides = merge(manifest.overrides, overrides)
         self.settings = resolve_settings(self.workspace, {}, manifest.preset)
-
-    def render(
-        self,
-        orbit: int,
-        elevation: float,
-        camera_file: Path | None,
-        frames: str,
-        movie: str,
-        resolution: int | None,
-    ) -> None:
-        from dnrtrain.contract import parse_transforms
-
-        from ..core.cameras import orbit_views
-        from ..core.scene_files import read_summary
-        from .pipeline import STAGES, require_inputs
-        from .render import render_novel
-
-        require_inputs(STAGES["evaluate"], self.workspace, self.settings)
-        cameras = self.settings.cameras
-        if camera_file is not None:
-            views = parse_transforms(camera_file, (cameras.width, cameras.height))
-            name = camera_file.stem
-        else:
-            if resolution is not None:
-                cameras = cameras.model_copy(update={"width": resolution, "height": resolution})
-            views = orbit_views(read_summary(self.workspace), cameras, orbit, elevation)
-            name = f"orbit-{orbit}"
-        answer = render_novel(self.workspace, self.settings, self.console, views, name=name, frames=frames, movie=movie)
-        self.console.say(f"{answer['frames']} frames, {answer['neural_ms']:.1f} ms each for the network")
-        self.console.say(answer["movie"] or answer["folder"])
-        self.console.result(answer)
-
-    def report(self) -> None:
-        from ..report import build_report
-
-        path = build_report(self.workspace.root)
-        self.console.say(f"report: {path}")
-        self.console.result({"workspace": str(self.workspace.root), **self.answers, "report": str(path)})
 
     def _take_back(self) -> None:
         """A refused scene or camera file leaves the workspace as it was; a folder made for it is removed."""

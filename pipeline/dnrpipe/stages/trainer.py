@@ -10,59 +10,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from dnrtrain.contract import DamagedFile, View, read_cameras
-from dnrtrain.events import Diverged, EpochEnd, Event, Note, Previewed
+from dnrtrain.events import Diverged, EpochEnd, Event, Note
 
 from ..core.console import Bar, Console
 from ..core.errors import UserError
 from ..core.ledger import CostRecord
 from ..core.scene_files import read_frame
 from ..core.settings import Settings
-from ..core.workspace import Workspace, digest, file_sha256
-from ..effects.store import plan_of
+from ..core.workspace import Workspace
 from .base_images import RENDERED, base_path
-from .pipeline import STAGES, Outcome, fingerprint
-from .prepare import split_views
 
 if TYPE_CHECKING:
     from dnrtrain.dataset import Base, ViewSet
-
-
-def run_finetune(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
-    """Step 2: fine-tune the coarse DNR on the selected ray-traced views."""
-    from dnrtrain.step2 import run_step2
-
-    from .previews import LivePicture  # which imports this module
-
-    by_name = {view.name: view for view in split_views(workspace)["train"]}
-    names = read_selection(workspace)["views"]
-    dataset = load(workspace, [by_name[name] for name in names], "train", raytraced=True, base=settings.model.base)
-    stamp = fingerprint(STAGES["finetune"], workspace, settings)
-    assert stamp is not None
-    folder = workspace.checkpoints("step2")
-    weights = perceptual_weights(console)
-    picture = LivePicture(workspace, settings, console, run_id, dataset)
-    events = run_step2(
-        dataset,
-        None,
-        workspace.checkpoints("step1"),
-        plan_of(workspace, settings).model(settings.model),
-        settings.finetune.step2,
-        seed=settings.finetune.seed,
-        device=torch_device(settings),
-        checkpoints=folder,
-        fingerprint=digest([stamp, weights is not None]),
-        weights=weights,
-        preview=picture.preview,
-    )
-    for event in follow(events, "finetune", settings.finetune.step2.epochs, workspace, console, run_id):
-        if isinstance(event, Previewed):
-            picture.show(event)
-    return Outcome(file_sha256(folder / "model.safetensors"), {"perceptual": weights is not None, "views": len(names)})
-
-
-def finetune_progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
-    """(epochs trained, epochs wanted)."""
-    return epochs_done(workspace.checkpoints("step2"), settings.finetune.step2.epochs, True)
 
 
 def read_selection(workspace: Workspace) -> dict[str, Any]:

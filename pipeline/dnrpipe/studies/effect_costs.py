@@ -6,10 +6,12 @@ import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
+from ..core.effect_names import FORCEABLE, NAMES, EffectName
 from ..core.errors import UserError
 from ..core.ledger import CostRecord
-from ..effects.plan import FORCEABLE, NAMES, Effect, EffectName, EffectPlan, Measured
+from ..effects.plan import Effect, EffectPlan
 from ..effects.store import keep_plan, pilot_views, plan_of, resolve_plan, run_pilots, trace_config, variant_for
+from ..raytrace.statistics import Measured
 
 if TYPE_CHECKING:
     from ..core.settings import Settings

@@ -25,13 +25,11 @@ from ...core.settings import Settings
 from ...core.workspace import digest
 from ...effects.store import plan_of
 from ...stages.trainer import perceptual_weights
-from ..cells.cell import STEP1_SHARE
+from ..cells.cell import CELL_VERSION, STEP1_SHARE
+from ..cells.provenance import code_state
 from ..cells.scenes import Scene, make_bases, prepare_scene, trace_references, trace_train, traced_split
 from ..cells.worker_pool import Crew, make_crew
-from .results import code_state
 from .rows import Row, needs_base, needs_coarse, settings_of, step1_policy
-
-CELL_VERSION = 1  # raise when training or measuring changes what a cell holds
 
 
 @dataclass(frozen=True)

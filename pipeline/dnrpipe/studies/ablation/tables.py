@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..cells.scenes import HARD_LIGHT
+from ..cells.tables import NONE, code_of, spread, table
 from .results import known_rows, read_results
 from .rows import ROWS
 
@@ -36,7 +37,6 @@ COLUMNS: tuple[tuple[str, str, int], ...] = (
 PER_SCENE = (("psnr", "PSNR, dB", 2), ("psnr_mask", "PSNR inside the mask, dB", 2), ("ssim", "SSIM", 4),
              ("lpips_vgg", "LPIPS (VGG)", 4))  # fmt: skip
 RIVALS = ("vanilla", "paper")
-NONE = "–"
 
 
 class Figures:
@@ -103,29 +103,6 @@ def markdown(results: Mapping[str, Any]) -> str:
 
 def _mean_title(scenes: Sequence[str]) -> str:
     return f"Mean over {len(scenes)} scenes" if len(scenes) > 1 else scenes[0]
-
-
-def spread(values: Sequence[float], digits: int, *, signed: bool = False) -> str:
-    """``mean ± standard deviation`` (of the sample) over seeds; the mean alone where there is one seed."""
-    if not values:
-        return NONE
-    text = f"{statistics.fmean(values):{'+' if signed else ''}.{digits}f}"
-    return f"{text} ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else text
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table; all columns but the first are right-aligned."""
-    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-def code_of(results: Mapping[str, Any]) -> str:
-    """The commit that made the results, and those of its cells where they differ."""
-    commits = sorted({cell["commit"] for cell in results["cells"] if cell["commit"]})
-    state = f"commit {(results['commit'] or 'unknown')[:12]}{' with changes' if results['dirty'] else ''}"
-    if len(commits) > 1:
-        state += f" (cells of {len(commits)} commits: {', '.join(commit[:12] for commit in commits)})"
-    return state
 
 
 def _provenance(results: Mapping[str, Any], figures: Figures) -> str:

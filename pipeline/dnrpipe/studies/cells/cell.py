@@ -19,10 +19,9 @@ from dnrtrain.atomic import write_json
 from dnrtrain.contract import ContractError
 from dnrtrain.events import Event, Selected
 
-from ...core.scene_files import read_frame
+from ...core.scene_files import read_frame, split_views
 from ...core.settings import Settings
 from ...core.workspace import Workspace
-from ...stages.prepare import split_views
 from .measure import base_pictures, measure, network_pictures, rendered_ms
 from .scenes import base_file, raster_file
 
@@ -279,3 +278,6 @@ def _training_cost(folder: Path) -> dict[str, Any]:
     for key, value in record.get("choosing", {}).items():
         cost[key] += value
     return cost
+
+
+CELL_VERSION = 1  # raise when training or measuring changes what a cell holds

@@ -11,8 +11,8 @@ import numpy as np
 
 from dnrtrain.exr import read_metadata
 
+from ...core.images import flip_error, write_png
 from ...core.workspace import Workspace
-from ...stages.evaluate import flip_error, write_png
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -99,3 +99,12 @@ def pictured(tests: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _image(tensor: Tensor) -> np.ndarray:
     return tensor.float().clamp(0, 1).permute(1, 2, 0).cpu().numpy()
+
+
+METRICS = ("psnr", "psnr_mask", "ssim", "ssim_mask", "lpips_vgg", "lpips_alex", "flip", "ceiling")
+
+
+def mean_of(tests: list[dict[str, Any]], name: str) -> float | None:
+    """Mean of a metric over the test views that have it."""
+    values = [test[name] for test in tests if test[name] is not None]
+    return round(float(np.mean(values)), 5) if values else None

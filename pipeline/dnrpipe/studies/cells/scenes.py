@@ -13,11 +13,11 @@ from dnrtrain.contract import View
 from ...core.console import Console
 from ...core.errors import UserError
 from ...core.ledger import CostRecord
-from ...core.scene_files import read_json, scene_fingerprint
+from ...core.scene_files import read_json, scene_fingerprint, split_views
 from ...core.settings import Settings
 from ...core.workspace import Source, Workspace, file_sha256
 from ...stages.pipeline import run_stage
-from ...stages.prepare import pass_common, pass_task, split_views
+from ...stages.prepare import pass_common, pass_task
 from ...stages.raytrace import trace_views
 from ...workers.view_tasks import run_view_tasks, view_record, worker_count
 

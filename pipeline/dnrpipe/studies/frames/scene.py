@@ -16,11 +16,10 @@ from dnrtrain.display import DisplayTransform
 
 from ...core.console import Console
 from ...core.errors import UserError
-from ...core.scene_files import read_frame, read_summary, scene_fingerprint
+from ...core.scene_files import read_frame, read_summary, scene_fingerprint, split_views
 from ...core.settings import Settings
 from ...core.workspace import Workspace, digest
 from ...effects.store import lenses, resolve_plan, trace_config, variant_for
-from ...stages.prepare import split_views
 from ...stages.session import resolve_settings
 
 

@@ -19,8 +19,8 @@ from dnrtrain.exr import read_metadata
 
 from ...core.errors import UserError
 from ...core.ledger import CostRecord, break_even_frames
-from ..ablation.results import METRICS, mean_of
 from ..ablation.rows import Row
+from ..cells.measure import METRICS, mean_of
 from ..cells.scenes import base_file, traced_split
 from ..frames.ladder import Point, crossover, frontier
 from .run import Frontier

@@ -14,12 +14,11 @@ from typing import TYPE_CHECKING, Any
 from dnrtrain.atomic import atomic_path, write_json, write_text
 
 from ...core.errors import UserError
-from ...core.scene_files import scene_fingerprint
+from ...core.scene_files import scene_fingerprint, split_views
 from ...core.settings import Settings
 from ...core.workspace import digest
-from ...stages.prepare import split_views
 from ...workers.view_tasks import worker_count
-from ..ablation.results import made_by, read_made
+from ..cells.provenance import made_by, read_made
 from ..cells.worker_pool import Crew, check_amounts
 from .account import break_evens, pareto, point_of, settle_frames
 from .cycles import PREFIX

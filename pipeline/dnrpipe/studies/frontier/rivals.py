@@ -37,7 +37,7 @@ class Worker:
         self.threads = torch.get_num_threads()
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
-        from ...stages.prepare import split_views
+        from ...core.scene_files import split_views
         from ..frames.ours import BASE, TIMED, Ours
         from ..frames.rival import METHODS as ALL
         from ..frames.rival import climb, make_rungs
@@ -111,7 +111,7 @@ def quality_of(pictures: list[Any], truth: list[Any], masks: list[Any], lpips: A
     """Means over the views of the metrics that cells have."""
     from dnrtrain.metrics import image_metrics
 
-    from ...stages.evaluate import flip_error
+    from ...core.images import flip_error
 
     rows = []
     for picture, target, mask in zip(pictures, truth, masks, strict=True):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from ...report.words import duration
+from ...core.units import duration
 from .account import pareto, total_seconds
 
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from dnrtrain.atomic import write_json
 
 from ...core.ledger import total
-from ...report.words import duration
-from ...stages.prepare import split_views
+from ...core.scene_files import split_views
+from ...core.units import duration
 from .choose import STEPS, Predictor, cheapest_of_the_best
 from .command import make_predictor, plan_path
 from .pilot import read_pilot

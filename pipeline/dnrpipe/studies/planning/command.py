@@ -13,12 +13,11 @@ from dnrtrain.selector.names import ACTIVE_NAMES, TRAINED_NAMES
 
 from ...core.console import Console
 from ...core.errors import UserError
-from ...core.scene_files import read_json
+from ...core.scene_files import read_json, split_views
 from ...core.settings import Settings
 from ...core.workspace import Workspace
 from ...effects.store import plan_of
 from ...stages.base_images import light_is_baked, renderer_inputs
-from ...stages.prepare import split_views
 from .choose import Predictor, best_within, budgets, cheapest_reaching
 from .pilot import FOLDER, run_pilot
 from .quality import Gain, Prior, load_prior, measured_gains, scene_gain, views_error, with_noise

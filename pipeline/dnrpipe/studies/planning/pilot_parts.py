@@ -15,12 +15,12 @@ from dnrtrain.contract import View
 from ...core.cameras import scaled_to
 from ...core.console import Console
 from ...core.errors import UserError
+from ...core.scene_files import split_views
 from ...core.settings import Settings
 from ...core.workspace import Workspace
 from ...effects.plan import EffectPlan
 from ...effects.store import trace_config, variant_for
 from ...stages.base_images import bake_light, light_is_baked, renderer_inputs
-from ...stages.prepare import split_views
 from ...stages.raytrace import view_seed
 from ...workers.processes import Retry, run_tasks
 from ...workers.view_tasks import worker_count

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ...report.words import duration
+from ...core.units import duration
 
 BUSY = 1.5
 """Processes waiting per core from which on wall seconds say more of the other work than of this."""

@@ -12,8 +12,8 @@ import numpy as np
 
 from dnrtrain.atomic import write_json
 
+from ...core.scene_files import split_views
 from ...core.workspace import Workspace
-from ...stages.prepare import split_views
 from ..cells.cell import load_cell_views
 
 if TYPE_CHECKING:

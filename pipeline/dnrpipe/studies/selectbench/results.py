@@ -8,7 +8,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from ..ablation.results import METRICS, made_by, mean_of, read_made
+from ..cells.measure import METRICS, mean_of
+from ..cells.provenance import made_by, read_made
 from .run import Bench, Place, read_choice
 
 SCHEMA = 1

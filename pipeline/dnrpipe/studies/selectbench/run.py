@@ -28,8 +28,8 @@ from ...core.workspace import digest
 from ...effects.store import plan_of
 from ...stages.rounds import portions
 from ...stages.trainer import perceptual_weights
-from ..ablation.results import code_state
-from ..ablation.run import CELL_VERSION
+from ..cells.cell import CELL_VERSION
+from ..cells.provenance import code_state
 from ..cells.scenes import base_file, make_bases, trace_references, trace_train
 from ..cells.worker_pool import Crew
 from .policies import Contender, rules_fingerprint, settings_of

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..ablation.tables import NONE, code_of, spread, table
+from ..cells.tables import NONE, code_of, spread, table
 from .figures import SPHERICAL, Figures
 from .intervals import LEVEL, Difference
 from .pools import POOLS

@@ -21,13 +21,16 @@ from dnrtrain.events import Previewed
 from ..core.console import Console
 from ..core.errors import UserError
 from ..core.ledger import CostRecord
+from ..core.scene_files import split_views
 from ..core.settings import Settings
-from ..core.workspace import Workspace
+from ..core.workspace import Workspace, digest, file_sha256
+from ..effects.store import plan_of
 from ..workers.view_tasks import TasksFailed
 from .base_images import RENDERED, base_is_made, base_views
-from .prepare import split_views
+from .pipeline import STAGES, fingerprint
 from .raytrace import reference_is_made
-from .trainer import load
+from .stage import Outcome
+from .trainer import epochs_done, follow, load, perceptual_weights, read_selection, torch_device
 
 if TYPE_CHECKING:
     import numpy as np
@@ -101,7 +104,7 @@ class LivePicture:
 
     def show(self, event: Previewed) -> None:
         """Write the picture, tell of it, and book what it took. A full disk costs the picture, not the training."""
-        from .evaluate import write_png
+        from ..core.images import write_png
 
         assert self.preview is not None
         started = time.monotonic()
@@ -151,3 +154,41 @@ def _small(image: np.ndarray) -> Any:
     channels = [Image.fromarray(np.ascontiguousarray(image[..., c], np.float32)).resize(size, Image.Resampling.BOX)
                 for c in range(3)]  # fmt: skip
     return np.stack([np.asarray(channel) for channel in channels], axis=-1)
+
+
+def run_finetune(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
+    """Step 2: fine-tune the coarse DNR on the selected ray-traced views."""
+    from dnrtrain.step2 import run_step2
+
+    from .previews import LivePicture  # which imports this module
+
+    by_name = {view.name: view for view in split_views(workspace)["train"]}
+    names = read_selection(workspace)["views"]
+    dataset = load(workspace, [by_name[name] for name in names], "train", raytraced=True, base=settings.model.base)
+    stamp = fingerprint(STAGES["finetune"], workspace, settings)
+    assert stamp is not None
+    folder = workspace.checkpoints("step2")
+    weights = perceptual_weights(console)
+    picture = LivePicture(workspace, settings, console, run_id, dataset)
+    events = run_step2(
+        dataset,
+        None,
+        workspace.checkpoints("step1"),
+        plan_of(workspace, settings).model(settings.model),
+        settings.finetune.step2,
+        seed=settings.finetune.seed,
+        device=torch_device(settings),
+        checkpoints=folder,
+        fingerprint=digest([stamp, weights is not None]),
+        weights=weights,
+        preview=picture.preview,
+    )
+    for event in follow(events, "finetune", settings.finetune.step2.epochs, workspace, console, run_id):
+        if isinstance(event, Previewed):
+            picture.show(event)
+    return Outcome(file_sha256(folder / "model.safetensors"), {"perceptual": weights is not None, "views": len(names)})
+
+
+def finetune_progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
+    """(epochs trained, epochs wanted)."""
+    return epochs_done(workspace.checkpoints("step2"), settings.finetune.step2.epochs, True)
