@@ -11,11 +11,12 @@ from typing import Any
 import pytest
 
 from dnrpipe.core.console import Console
+from dnrpipe.core.scene_files import read_selection
 from dnrpipe.core.settings import Settings, resolve
 from dnrpipe.core.workspace import Source, Workspace
 from dnrpipe.stages.pipeline import STAGES, fingerprint, run_stage
-from dnrpipe.stages.select import progress
-from dnrpipe.stages.trainer import read_selection
+from dnrpipe.stages.select import progress, select_views
+from dnrpipe.stages.stage import Run
 from dnrtrain.contract import write_cameras
 from dnrtrain.selector.coverage import CoveragePolicy
 from dnrtrain.selector.names import UNTRAINED_NAMES
@@ -51,11 +52,9 @@ def workspace(tmp_path: Path) -> Workspace:
 
 def choose(workspace: Workspace, settings: Settings, capsys: pytest.CaptureFixture[str]) -> tuple[dict[str, Any], str]:
     """The stage's own work (its inputs' state is another test's) -> selection.json and what was said."""
-    from dnrpipe.stages.select import run
-
-    outcome = run(workspace, settings, Console(), "select-0")
     stamp = fingerprint(STAGES["select"], workspace, settings)
     assert stamp is not None
+    outcome = select_views(Run(workspace, settings, Console(), "select", "select-0", stamp))
     workspace.finish_stage("select", fingerprint=stamp, output=outcome.output, seconds=0.0, detail=outcome.detail)
     return read_selection(workspace).model_dump(), capsys.readouterr().out
 
@@ -111,8 +110,6 @@ def test_a_choice_beside_a_coarse_model_is_made_once(
     workspace: Workspace, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Step 1 trains beside the views that were chosen already, and its record names them."""
-    import dnrpipe.stages.select
-
     workspace.scene.mkdir(parents=True)
     (workspace.scene / "frame.json").write_text(synthetic.FRAME.model_dump_json())
     validation = synthetic.dome(1, 24, seed=1)
@@ -121,7 +118,7 @@ def test_a_choice_beside_a_coarse_model_is_made_once(
     target = workspace.passes("val", validation[0].name)
     target.parent.mkdir(parents=True)
     made.rename(target)
-    monkeypatch.setattr(dnrpipe.stages.select, "plan_of", lambda *_: SimpleNamespace(model=lambda settings: settings))
+    monkeypatch.setattr(Run, "effect_plan", SimpleNamespace(model=lambda settings: settings))
     asked: list[int] = []
     first_look = CoveragePolicy.choose
 
@@ -143,10 +140,9 @@ def test_a_choice_beside_a_coarse_model_is_made_once(
 
 def test_too_large_a_budget_is_refused(workspace: Workspace) -> None:
     from dnrpipe.core.errors import UserError
-    from dnrpipe.stages.select import run
 
     with pytest.raises(UserError, match="--budget 9: only 8 candidate views exist"):
-        run(workspace, told("auto", 9), Console(), "select-0")
+        select_views(Run(workspace, told("auto", 9), Console(), "select"))
 
 
 def test_an_unknown_policy_is_refused() -> None:
@@ -160,4 +156,4 @@ def test_the_stage_asks_for_its_inputs(workspace: Workspace) -> None:
     from dnrpipe.core.errors import UserError
 
     with pytest.raises(UserError, match="run `dnrpipe prepare` first"):
-        run_stage("select", workspace, told(), Console())
+        run_stage("select", Run(workspace, told(), Console()))

@@ -187,8 +187,8 @@ def _status(path: Path) -> None:
 def _selection(path: Path) -> None:
     import numpy as np
 
+    from dnrpipe.core.scene_files import read_selection
     from dnrpipe.core.workspace import Manifest, Source, Workspace
-    from dnrpipe.stages.trainer import read_selection
     from dnrtrain.contract import View, write_cameras
 
     workspace = Workspace(path.parent, Manifest(source=Source(path="/a", sha256="0")))  # pyright: ignore[reportCallIssue]

@@ -25,9 +25,8 @@ from dnrtrain.exr import read_exr
 
 from ..core.console import Console
 from ..core.errors import UserError
-from ..core.scene_files import read_frame, split_views
+from ..core.scene_files import read_frame, read_selection, split_views
 from ..core.workspace import Workspace
-from ..stages.trainer import read_selection
 from .folder import claim, finish
 
 POINTS = 100_000

@@ -12,7 +12,7 @@ from ..core.console import Console
 from ..core.errors import UserError
 from ..core.workspace import Workspace
 from ..raytrace.variants import choose_variant
-from ..workers.processes import Retry, run_tasks
+from ..workers.answers import only_answer
 
 SAMPLES = 16
 """Points per texel."""
@@ -44,19 +44,17 @@ def surface_maps(workspace: Workspace, console: Console) -> SurfaceMaps:
     with tempfile.TemporaryDirectory(prefix="dnrpipe-") as folder, console.bar("surface maps", 1) as bar:
         task = {"output": str(Path(folder) / "maps.npz"), "size": size, "samples": SAMPLES, "seed": 0}
         common = {"bundle": str((workspace.scene / "scene.xml").resolve()), "variant": choice.variant}
-        log = Path(folder) / "worker.log"
-        outcomes = run_tasks(
-            "dnrpipe.raytrace.surface_maps", common, [task], workers=1, log=log, environment=choice.environment
+        result = only_answer(
+            "surface maps",
+            "dnrpipe.raytrace.surface_maps",
+            common,
+            task,
+            log=Path(folder) / "worker.log",
+            console=console,
+            environment=choice.environment,
         )
-        for outcome in outcomes:
-            if isinstance(outcome, Retry):
-                console.warn(f"surface maps: {outcome.reason}; trying once more")
-            elif outcome.result is None:
-                raise UserError(f"surface maps failed twice: {outcome.error}")
-            elif outcome.result["lost"]:
-                console.warn(
-                    f"repaired: {outcome.result['lost']} samples of the surface maps were not finite and are left out"
-                )
+        if lost := result["lost"]:
+            console.warn(f"repaired: {lost} samples of the surface maps were not finite and are left out")
         bar.advance(note=f"{size}² texels")
         with np.load(task["output"], allow_pickle=False) as data:
             maps = {name: data[name] for name in data.files}

@@ -25,10 +25,9 @@ from dnrtrain.contract import View
 
 from .. import __version__
 from ..core.console import Console
-from ..core.scene_files import read_frame, read_json
+from ..core.scene_files import read_frame, read_json, read_selection
 from ..core.workspace import Workspace
 from ..stages.session import resolve_settings
-from ..stages.trainer import read_selection
 from .browser import require_chromium
 from .folder import claim, finish
 from .gltf import glb

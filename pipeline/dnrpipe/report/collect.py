@@ -16,9 +16,8 @@ from dnrtrain.contract import ContractError, SceneFrame, View, read_cameras
 from dnrtrain.records import ModelRecord
 from dnrtrain.records import Selection as SelectionRecord
 
-from ..cli.information import costs
 from ..core.errors import UserError
-from ..core.ledger import Ledger, break_even_frames, summarise, traced_views, upfront_seconds
+from ..core.ledger import CostRecord, Ledger, break_even_frames, summarise, traced_views, upfront_seconds
 from .advice import missing, notes
 from .budget import build_budget
 from .coverage import coverage_maps
@@ -81,7 +80,7 @@ def collect(root: Path, *, made_at: datetime | None = None) -> ReportData:
     cameras = {split: _read_views(root, split) for split in ("train", "val", "test")}
     metrics = _read_model(root / "evaluation" / "metrics.json", Metrics, "evaluate")
     chosen = _read_model(root / "selection.json", SelectionRecord, "select")
-    ledger = costs.Ledger(root / "costs.jsonl")
+    ledger = Ledger(root / "costs.jsonl")
     records, torn = ledger.read(), ledger.torn_lines()
 
     selected = {f"train/{name}" for name in chosen.views} if chosen else None
@@ -159,7 +158,7 @@ def _read_views(root: Path, split: str) -> list[View]:
 
 
 def _selection(
-    root: Path, chosen: SelectionRecord, records: Sequence[costs.CostRecord], candidates: Sequence[View]
+    root: Path, chosen: SelectionRecord, records: Sequence[CostRecord], candidates: Sequence[View]
 ) -> Selection:
     frame = _read_model(root / "scene" / "frame.json", SceneFrame, "prepare")
     try:

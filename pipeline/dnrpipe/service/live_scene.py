@@ -15,13 +15,12 @@ from dnrtrain.contract import View, read_cameras
 
 from ..core.cameras import framing, look_at_view
 from ..core.errors import UserError
-from ..core.scene_files import read_frame, read_summary
+from ..core.scene_files import read_frame, read_selection, read_summary
 from ..core.settings import Settings
 from ..core.workspace import Workspace
 from ..effects.store import plan_of, trace_config, variant_for
-from ..stages.base_images import RENDERED, ready_inputs
+from ..stages.base_images import RENDERED, ready_renderer
 from ..stages.session import resolve_settings
-from ..stages.trainer import read_selection
 
 SIZES = (64, 1024)
 STEEPEST = math.radians(89.0)
@@ -100,7 +99,10 @@ def open_scene(root: Path) -> LiveScene:
     plan = plan_of(workspace, settings)
     choice = variant_for(plan, settings)
     config = trace_config(workspace, plan, choice.variant)
-    base, environment = ready_inputs(workspace, settings) if kind in RENDERED else (None, choice.environment)
+    base, environment = None, choice.environment
+    if kind in RENDERED:
+        renderer = ready_renderer(workspace, settings)
+        base, environment = renderer.common, renderer.environment
     frame, summary = read_frame(workspace), read_summary(workspace)
     radius = float(summary["bounds"]["radius"])
     pixels, distance = framing(summary, settings.cameras, radius)

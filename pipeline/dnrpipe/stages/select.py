@@ -15,13 +15,10 @@ from dnrtrain.selector.protocol import Candidates
 
 from ..core.console import Bar, Console
 from ..core.errors import UserError
-from ..core.ledger import CostRecord
 from ..core.scene_files import split_views
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest, file_sha256
-from ..effects.store import plan_of
-from .pipeline import STAGES, fingerprint
-from .stage import Outcome
+from .stage import Outcome, Run
 from .trainer import epochs_done, follow, load, torch_device
 
 if TYPE_CHECKING:
@@ -29,15 +26,16 @@ if TYPE_CHECKING:
     from dnrtrain.selector.sightings import Sightings
 
 
-def run(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
+def select_views(run: Run) -> Outcome:
     """Choose ``budget`` views and write ``selection.json``; train the coarse DNR on the way where it is wanted."""
+    workspace, settings = run.workspace, run.settings
     views = split_views(workspace)["train"]
     check_budget(settings.select.budget, len(views))
     if settings.trains_step1:
-        chosen = _train_and_choose(workspace, settings, console, run_id, views)
+        chosen = _train_and_choose(run, views)
         made: list[object] = [chosen.views, file_sha256(workspace.checkpoints("step1") / "model.safetensors")]
     else:
-        chosen = _choose(workspace, settings, console, run_id, views)
+        chosen = _choose(run, views)
         made = [chosen.views]
     selection = Selection(
         policy=chosen.policy,
@@ -69,30 +67,28 @@ def check_budget(budget: int, candidates: int) -> None:
         )
 
 
-def _choose(workspace: Workspace, settings: Settings, console: Console, run_id: str, views: list[View]) -> Selected:
-    policy = settings.select.policy
-    console.say(f"select: no training; policy {policy} needs none, and step 2 starts fresh")
+def _choose(run: Run, views: list[View]) -> Selected:
+    workspace, policy = run.workspace, run.settings.select.policy
+    run.console.say(f"select: no training; policy {policy} needs none, and step 2 starts fresh")
     rule = untrained(policy)
     assert rule is not None  # settings.trains_step1 is False
-    choice = _choose_by(rule, workspace, settings, console, run_id, views)
+    choice = _choose_by(rule, run, views)
     # A model of another policy's run would pass for this one's in the report.
     if workspace.checkpoints("step1").exists():
         shutil.rmtree(workspace.checkpoints("step1"))
     return Selected([views[i].name for i in choice.views], policy, choice.details, choice.gains, choice.why)
 
 
-def _choose_by(
-    rule: Policy, workspace: Workspace, settings: Settings, console: Console, run_id: str, views: list[View]
-) -> Choice:
+def _choose_by(rule: Policy, run: Run, views: list[View]) -> Choice:
     """The rule's choice; what it took is booked."""
-    select = settings.select
+    select = run.settings.select
     clock, cpu = time.monotonic(), time.process_time()
-    candidates = Candidates.of_views(views, look(workspace, console, views) if rule.looks else None)
-    with console.bar(f"choosing by {select.policy}", len(views) * rule.effort) as bar:
+    candidates = Candidates.of_views(views, look(run.workspace, run.console, views) if rule.looks else None)
+    with run.console.bar(f"choosing by {select.policy}", len(views) * rule.effort) as bar:
         tick = functools.partial(_advance, bar)
         choice = rule.choose(candidates, select.budget, select.seed, tick)
         tick(bar.total)
-    _book(workspace, run_id, time.monotonic() - clock, time.process_time() - cpu)
+    _book(run, time.monotonic() - clock, time.process_time() - cpu)
     return choice
 
 
@@ -100,56 +96,40 @@ def _advance(bar: Bar, weighed: int) -> None:
     bar.advance(min(weighed, bar.total - bar.done))  # a policy's effort is an estimate
 
 
-def _book(workspace: Workspace, run_id: str, seconds: float, cpu_seconds: float) -> None:
+def _book(run: Run, seconds: float, cpu_seconds: float) -> None:
     """Book what choosing took."""
-    workspace.ledger.append(
-        CostRecord(
-            time=time.time(),
-            run=run_id,
-            stage="select",
-            purpose="training",
-            unit="scene",
-            name="selection",
-            seconds=seconds,
-            cpu_seconds=cpu_seconds,
-            device="cpu",
-        )
-    )
+    run.book("training", "scene", "selection", seconds, cpu_seconds=cpu_seconds, device="cpu")
 
 
-def _train_and_choose(
-    workspace: Workspace, settings: Settings, console: Console, run_id: str, views: list[View]
-) -> Selected:
+def _train_and_choose(run: Run, views: list[View]) -> Selected:
     from dnrtrain.step1 import run_step1
 
-    select = settings.select
+    workspace, settings, select = run.workspace, run.settings, run.settings.select
     rule = untrained(select.policy)
     choice: Choice | None = None
     if rule is not None:
-        console.say(f"select: policy {select.policy} needs no training, but step 2 starts from the coarse model")
-        choice = _choose_by(rule, workspace, settings, console, run_id, views)
+        run.console.say(f"select: policy {select.policy} needs no training, but step 2 starts from the coarse model")
+        choice = _choose_by(rule, run, views)
     validation = split_views(workspace)["val"]
-    inputs = fingerprint(STAGES["select"], workspace, settings)
-    assert inputs is not None  # its inputs were required
     chosen: Selected | None = None
     events = run_step1(
         load(workspace, views, "train"),
         load(workspace, validation, "val") if validation else None,
-        plan_of(workspace, settings).model(settings.model),
+        run.effect_plan.model(settings.model),
         select.step1,
         policy=select.policy,
         budget=select.budget,
         seed=select.seed,
         device=torch_device(settings),
         checkpoints=workspace.checkpoints("step1"),
-        fingerprint=inputs,
+        fingerprint=run.fingerprint,
         choice=choice,
     )
-    for event in follow(events, "select", select.step1.epochs, workspace, console, run_id):
+    for event in follow(run, events, select.step1.epochs):
         if isinstance(event, Selected):
             chosen = event
             if event.seconds and choice is None:  # 0 where a finished run was found
-                _book(workspace, run_id, event.seconds, event.cpu_seconds)
+                _book(run, event.seconds, event.cpu_seconds)
     assert chosen is not None  # run_step1 ends with Selected
     return chosen
 

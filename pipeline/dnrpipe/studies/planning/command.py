@@ -17,7 +17,7 @@ from ...core.scene_files import read_json, split_views
 from ...core.settings import Settings
 from ...core.workspace import Workspace
 from ...effects.store import plan_of
-from ...stages.base_images import light_is_baked, renderer_inputs
+from ...stages.base_images import base_renderer
 from .choose import Predictor, best_within, budgets, cheapest_reaching
 from .pilot import FOLDER, run_pilot
 from .quality import Gain, Prior, load_prior, measured_gains, scene_gain, views_error, with_noise
@@ -85,8 +85,9 @@ def make_predictor(workspace: Workspace, settings: Settings, pilot: Pilot, prior
     """Costs and quality of any choice in this workspace, by its pilot."""
     assert pilot.frames is not None and pilot.training is not None  # the pilot is complete
     plan = plan_of(workspace, settings)
-    _, _, light, _ = renderer_inputs(workspace, settings, plan)
-    due = None if light is None or light_is_baked(light) else (light["size"], light["spp"])
+    renderer = base_renderer(workspace, settings, plan)
+    light = renderer.light
+    due = None if light is None or renderer.light_is_baked else (light["size"], light["spp"])
     width, height = settings.cameras.width, settings.cameras.height
     patch = settings.finetune.step2.patch or max(width, height)
     frames, training = pilot.frames, pilot.training

@@ -29,7 +29,7 @@ from ...stages.trainer import perceptual_weights
 from ..cells.cell import CELL_VERSION
 from ..cells.provenance import code_state
 from ..cells.scenes import base_file, make_bases, trace_references, trace_train
-from ..cells.worker_pool import Crew
+from ..cells.worker_pool import WorkerPool
 from .active.settings import ActiveSettings
 from .policies import Contender, Kind, rules_fingerprint, settings_of
 from .pools import Placed, Pool, place_pool, share_light
@@ -71,7 +71,7 @@ class Bench:
 
     request: Request
     console: Console
-    crew: Crew
+    worker_pool: WorkerPool
     perceptual: bool = False
     pools: list[Pool] = field(default_factory=list)
     references: dict[str, list[str]] = field(default_factory=dict)
@@ -121,13 +121,15 @@ class Bench:
                         own = contender.kind == "step1"
                         starts[place] = chosen[place] if own else self._step1(pool, settings, SHARED_COARSE, seed)
         label = f", seed {seed}"
-        self.crew.work(f"selections{label}", "dnrpipe.studies.selectbench.choosing", _once(work["rule"]))
-        self.crew.work(f"active selections{label}", "dnrpipe.studies.selectbench.active.worker", _once(work["active"]))
-        self.crew.work(f"step 1{label}", "dnrpipe.studies.cells.cell", _once([*work["step1"], *starts.values()]))
+        self.worker_pool.work(f"selections{label}", "dnrpipe.studies.selectbench.choosing", _once(work["rule"]))
+        self.worker_pool.work(
+            f"active selections{label}", "dnrpipe.studies.selectbench.active.worker", _once(work["active"])
+        )
+        self.worker_pool.work(f"step 1{label}", "dnrpipe.studies.cells.cell", _once([*work["step1"], *starts.values()]))
         for pool in self.pools:
             places = [place for place in chosen if (place.scene, place.pool) == (pool.scene, pool.name)]
             self._trace_and_plan(pool, {place: chosen[place] for place in places}, starts)
-        self.crew.work(
+        self.worker_pool.work(
             f"cells{label}",
             "dnrpipe.studies.cells.cell",
             _once([task for place, task in self.cells.items() if place.seed == seed]),
@@ -154,7 +156,7 @@ class Bench:
         key = digest(
             [
                 *(CHOICE_VERSION, CELL_VERSION, __version__, pool.data.inputs, model.model_dump(), step1.model_dump()),
-                *(asdict(ActiveSettings()), policy, budget, seed, self.crew.device, self.crew.threads),
+                *(asdict(ActiveSettings()), policy, budget, seed, self.worker_pool.device, self.worker_pool.threads),
             ]
         )
         folder = self.request.out / "selections" / pool.folder / key
@@ -175,7 +177,7 @@ class Bench:
         key = digest(
             [
                 *(CELL_VERSION, __version__, pool.data.inputs, model.model_dump(), step1.model_dump()),
-                *(policy, budget, seed, self.crew.device, self.crew.threads),
+                *(policy, budget, seed, self.worker_pool.device, self.worker_pool.threads),
             ]
         )
         folder = self.request.out / "step1" / pool.folder / key
@@ -230,13 +232,13 @@ class Bench:
     ) -> dict[str, Any]:
         """The cell's task (:class:`..ablation.cells.Worker`); its key is a hash of all that decides what comes out."""
         model, step2 = settings.model.model_dump(mode="json"), settings.finetune.step2.model_dump(mode="json")
-        crew, data = self.crew, pool.data
+        worker_pool, data = self.worker_pool, pool.data
         used = [f"train/{name}" for name in views] + [f"test/{name}" for name in data.test]
         shown = [CELL_VERSION, __version__, data.inputs, self.references[pool.folder], model]
         shown.append([bases[name] for name in used] if bases else None)
         train = [place.seed, [traced[name] for name in views], step2, coarse and coarse["key"], self.request.seconds]
-        key = digest([*shown, train, crew.device, crew.threads, self.perceptual])
-        pace = [*shown[:5], len(views), step2, crew.device, crew.threads]
+        key = digest([*shown, train, worker_pool.device, worker_pool.threads, self.perceptual])
+        pace = [*shown[:5], len(views), step2, worker_pool.device, worker_pool.threads]
         folder = self.request.out / "cells" / pool.folder
         return {
             "kind": "cell",
@@ -271,7 +273,7 @@ class Bench:
     def view_seconds(self, pool: Pool, names: Sequence[str]) -> float:
         """Seconds of ray tracing the views and their base images, by the files: processor time on a CPU."""
         kind, workspace = self._settings(pool).model.base, pool.data.workspace
-        clock = "cpu_seconds" if self.crew.device == "cpu" else "seconds"
+        clock = "cpu_seconds" if self.worker_pool.device == "cpu" else "seconds"
         files = [workspace.raytraced("train", name) for name in names]
         if kind not in ("none", "raster"):
             files += [base_file(workspace, kind, "train", name) for name in names]
