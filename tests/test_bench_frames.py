@@ -9,11 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tools.bench_frames.motion import Surface, changes, flicker, project, reproject
+from tools.bench_frames.standing import classes, standing
 from tools.bench_frames.upfront import at_equal_time, break_even, lines, upfront
 
 from dnrpipe.cameras import orbit_views
 from dnrpipe.costs import CostRecord
-from dnrpipe.frames.ladder import classes, crossover, frontier, quality_at, standing
+from dnrpipe.frames.ladder import crossover, frontier, quality_at
 from dnrpipe.settings import CameraSettings
 from dnrtrain.contract import View
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from playwright.sync_api import Page
 from tests.service.harness import Server, empty_workspace
 from tests.service.test_planned import prediction
 from websockets.sync.client import connect
@@ -163,20 +164,26 @@ def test_pace() -> None:
     assert first.level == START and first._mean is None
 
 
+def wait_for(page: Page, expression: str, seconds: float = 120) -> None:
+    """Until the expression is true. `Page.wait_for_function` needs the eval that the pages' policy forbids."""
+    deadline = time.monotonic() + seconds
+    while not page.evaluate(expression):
+        assert time.monotonic() < deadline, f"{expression}; the page says:\n{page.inner_text('body')}"
+        page.wait_for_timeout(50)
+
+
 @needs_chromium
 def test_dashboard_and_viewer_in_a_browser(server: Server, trained: str) -> None:
     """Jobs and a workspace are shown, the slider slides, the sphere turns, and a drag changes the picture."""
     with open_page(server.url, width=1280) as (page, errors):
-        page.wait_for_function(
-            f"[...document.querySelectorAll('#jobs td')].some(td => td.textContent === 'run {trained}')"
-        )
+        wait_for(page, f"[...document.querySelectorAll('#jobs td')].some(td => td.textContent === 'run {trained}')")
         page.evaluate(
             f"[...document.querySelectorAll('#jobs tr')].find(r => r.textContent.includes('run {trained}')).click()"
         )
-        page.wait_for_function("document.querySelectorAll('#curves svg polyline').length > 0")
-        page.wait_for_function("document.querySelector('#truth').naturalWidth > 0")
-        page.wait_for_function("document.querySelector('#note').textContent === 'done'")
-        page.wait_for_function("document.querySelector('#live-prediction').naturalWidth === 48")
+        wait_for(page, "document.querySelectorAll('#curves svg polyline').length > 0")
+        wait_for(page, "document.querySelector('#truth').naturalWidth > 0")
+        wait_for(page, "document.querySelector('#note').textContent === 'done'")
+        wait_for(page, "document.querySelector('#live-prediction').naturalWidth === 48")
         caption = page.evaluate("document.querySelector('#live-caption').textContent")
         assert caption.startswith("Test view ") and "epoch 40 of 40" in caption and "will ray-trace" in caption
         assert page.evaluate("document.querySelector('#live-beside').hidden && !document.querySelector('#live').hidden")
@@ -201,7 +208,7 @@ def test_dashboard_and_viewer_in_a_browser(server: Server, trained: str) -> None
         assert errors == []
 
         page.goto(f"{server.url}/static/viewer.html?w={trained}")
-        page.wait_for_function("document.querySelector('#picture')?.dataset.fine === 'yes'")
+        wait_for(page, "document.querySelector('#picture')?.dataset.fine === 'yes'")
         first = page.evaluate("document.querySelector('#picture').toDataURL()")
         shown = int(page.evaluate("document.querySelector('#picture').dataset.frames"))
         x, y = page.evaluate(
@@ -213,13 +220,13 @@ def test_dashboard_and_viewer_in_a_browser(server: Server, trained: str) -> None
         for step in range(1, 12):
             page.mouse.move(x + 12 * step, y + 3 * step)
             time.sleep(0.03)
-        page.wait_for_function(f"Number(document.querySelector('#picture').dataset.frames) > {shown}")
+        wait_for(page, f"Number(document.querySelector('#picture').dataset.frames) > {shown}")
         page.mouse.up()
-        page.wait_for_function("document.querySelector('#picture').dataset.fine === 'yes'")
+        wait_for(page, "document.querySelector('#picture').dataset.fine === 'yes'")
         assert page.evaluate("document.querySelector('#picture').toDataURL()") != first
         assert "base image" in page.evaluate("document.querySelector('#times').textContent")
         page.evaluate("document.querySelector('input[value=depth]').click()")
-        page.wait_for_function("document.querySelector('#picture').dataset.mode === 'depth'")
+        wait_for(page, "document.querySelector('#picture').dataset.mode === 'depth'")
         assert errors == []
 
 
@@ -236,16 +243,16 @@ def test_what_changes_while_a_job_runs_in_a_browser(server: Server, trained: str
     epoch = "Number(document.querySelector('#live').dataset.epoch)"
     with server.client() as client, open_page(server.url, width=1280) as (page, errors):
         job = client.submit(JobRequest(command="finetune", workspace="watched", settings=settings)).id
-        page.wait_for_function(f"!!document.querySelector('#jobs tr[data-job=\"{job}\"]')")
+        wait_for(page, f"!!document.querySelector('#jobs tr[data-job=\"{job}\"]')")
         page.evaluate(f"document.querySelector('#jobs tr[data-job=\"{job}\"]').click()")
-        page.wait_for_function(f"!document.querySelector('#live').hidden && {epoch}")
+        wait_for(page, f"!document.querySelector('#live').hidden && {epoch}")
         first = page.evaluate(epoch)
         picture = page.evaluate("document.querySelector('#live-prediction').src")
-        page.wait_for_function(f"{epoch} > {first}")
+        wait_for(page, f"{epoch} > {first}")
         assert page.evaluate("document.querySelector('#live-prediction').src") != picture
         assert page.evaluate("document.querySelector('#live-truth').naturalWidth") == 48
         assert " dB" in page.evaluate("document.querySelector('#live-caption').textContent")
-        page.wait_for_function("!document.querySelector('#plan').hidden")
+        wait_for(page, "!document.querySelector('#plan').hidden")
         rows = page.evaluate(
             "[...document.querySelectorAll('#plan tbody tr')].map(r => [...r.children].map(c => c.textContent))"
         )
@@ -254,9 +261,9 @@ def test_what_changes_while_a_job_runs_in_a_browser(server: Server, trained: str
         assert "2 views, 8 spp, 60 epochs" in page.evaluate("document.querySelector('#plan caption').textContent")
         for _ in client.events(job):
             pass
-        page.wait_for_function(f"{epoch} === 60")
+        wait_for(page, f"{epoch} === 60")
         spent = "document.querySelector('#plan tbody tr:nth-child(3) td:nth-child(3)').textContent"
-        page.wait_for_function(f"/^\\d+:\\d\\d$/.test({spent})")  # no longer "so far"
+        wait_for(page, f"/^\\d+:\\d\\d$/.test({spent})")  # no longer "so far"
         assert errors == []
 
 
@@ -270,13 +277,13 @@ def test_a_page_without_the_token_asks_for_it(tmp_path: Path) -> None:
     try:
         empty_workspace(server.root, "hidden")
         with open_page(server.url, width=1280) as (page, _):
-            page.wait_for_function("document.querySelector('#token-form')?.hidden === false")
+            wait_for(page, "document.querySelector('#token-form')?.hidden === false")
             assert "hidden" not in page.evaluate("document.querySelector('#workspaces').textContent")
             page.evaluate(
                 f"document.querySelector('#token').value = '{token}';"
                 " document.querySelector('#token-form button').click()"
             )
-            page.wait_for_function("document.querySelector('#workspaces').textContent.includes('hidden')")
+            wait_for(page, "document.querySelector('#workspaces').textContent.includes('hidden')")
             assert token not in page.evaluate("location.href + document.body.innerHTML")
         assert token not in server.log.read_text()
     finally:

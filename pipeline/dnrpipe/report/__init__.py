@@ -9,10 +9,6 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from .data import ReportData
 
 
 def build_report(workspace_dir: Path, *, made_at: datetime | None = None) -> Path:
@@ -35,20 +31,3 @@ def build_report(workspace_dir: Path, *, made_at: datetime | None = None) -> Pat
     write_text(path, render_html(data))
     write_json(path.with_suffix(".json"), data.figures())
     return path
-
-
-def build_report_data(workspace_dir: Path) -> dict[str, Any]:
-    """The figures of the report as JSON-able values, without pictures. Raises UserError."""
-    from .collect import collect
-
-    return collect(Path(workspace_dir)).figures()
-
-
-def render_html(data: ReportData) -> str:
-    """The page for collected data; see :func:`.render.render_html`."""
-    from .render import render_html as render
-
-    return render(data)
-
-
-__all__ = ["build_report", "build_report_data", "render_html"]

@@ -23,7 +23,6 @@ from pydantic import BaseModel, TypeAdapter
 
 from ..errors import UserError
 from .models import (
-    Health,
     Job,
     JobEvent,
     JobPage,
@@ -83,10 +82,6 @@ class Client:
 
     def close(self) -> None:
         self._http.close()
-
-    def health(self) -> Health:
-        """Whether server and workers live."""
-        return self._get("/healthz", Health)
 
     def submit(self, request: JobRequest) -> Job:
         """Queue a job. Sent again after a broken connection it is still one job."""

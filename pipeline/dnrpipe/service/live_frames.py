@@ -36,7 +36,6 @@ from dnrtrain.dataset import view_in_memory
 from dnrtrain.display import DisplayTransform
 from dnrtrain.exr import read_exr
 
-MODES = ("neural", "base", "reference", "error", "normal", "depth", "uv", "albedo", "coverage", "nearest")
 BASE_ONLY = ("base", "albedo")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 from fastapi import Depends, HTTPException
@@ -64,7 +64,6 @@ class State:
     live: LivePool
     feed: Feed
     streams: int = 0
-    totals: dict[str, int] = field(default_factory=dict)
 
     @contextlib.contextmanager
     def stream(self) -> Iterator[None]:
