@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from dnrpipe.costs import CostRecord, Ledger
+from dnrpipe.core.ledger import CostRecord, Ledger
 from dnrtrain.contract import SceneFrame, View, write_cameras
 from dnrtrain.exr import write_exr
 

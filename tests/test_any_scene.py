@@ -23,9 +23,9 @@ from dnrpipe.blender.reading.missing import missing_files  # noqa: E402
 from dnrpipe.blender.reading.names import find_material  # noqa: E402
 from dnrpipe.blender.reading.opening import open_scene  # noqa: E402
 from dnrpipe.blender.reading.packing import pack_everything, save_blend  # noqa: E402
+from dnrpipe.core.errors import UserError  # noqa: E402
+from dnrpipe.core.scene_files import scene_fingerprint  # noqa: E402
 from dnrpipe.effects.plan import plan_effects  # noqa: E402
-from dnrpipe.errors import UserError  # noqa: E402
-from dnrpipe.scene_files import scene_fingerprint  # noqa: E402
 
 
 def _neighbour(name: str) -> Any:

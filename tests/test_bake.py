@@ -13,7 +13,6 @@ bpy = pytest.importorskip("bpy")
 
 from mathutils import Euler, Matrix  # noqa: E402
 
-from dnrpipe.baking import FOLDER, bake  # noqa: E402
 from dnrpipe.blender.baking import bake as baking  # noqa: E402
 from dnrpipe.blender.baking.bakes import BakeBook  # noqa: E402
 from dnrpipe.blender.baking.mesh import object_positions, object_random  # noqa: E402
@@ -27,8 +26,9 @@ from dnrpipe.blender.shading.sheets import on_region  # noqa: E402
 from dnrpipe.blender.shading.sockets import resolve  # noqa: E402
 from dnrpipe.blender.shading.textures import Constant, ImageReader, Placement, Textured  # noqa: E402
 from dnrpipe.blender.shading.values import Evaluator  # noqa: E402
-from dnrpipe.console import Console  # noqa: E402
-from dnrpipe.workspace import Source, Workspace  # noqa: E402
+from dnrpipe.core.console import Console  # noqa: E402
+from dnrpipe.core.workspace import Source, Workspace  # noqa: E402
+from dnrpipe.stages.baking import FOLDER, bake  # noqa: E402
 
 SIZE = 128
 FULL = baking.SAMPLES

@@ -17,16 +17,16 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from dnrpipe.blender.geometry.frozen import FrozenMesh
-from dnrpipe.cameras import make_cameras
-from dnrpipe.errors import UserError
-from dnrpipe.selectbench.command import choose_budgets
-from dnrpipe.selectbench.figures import Figures
-from dnrpipe.selectbench.intervals import half_width, summarise, t_distribution, t_quantile
-from dnrpipe.selectbench.policies import CONTENDERS, GROUPS, SIMPLE, choose_policies, settings_of
-from dnrpipe.selectbench.pools import POOLS, choose_pools, write_rig
-from dnrpipe.selectbench.rigs import inside, surface_points, walk, winding
-from dnrpipe.selectbench.tables import difference, markdown, together
-from dnrpipe.settings import CameraSettings, resolve
+from dnrpipe.core.cameras import make_cameras
+from dnrpipe.core.errors import UserError
+from dnrpipe.core.settings import CameraSettings, resolve
+from dnrpipe.studies.selectbench.command import choose_budgets
+from dnrpipe.studies.selectbench.figures import Figures
+from dnrpipe.studies.selectbench.intervals import half_width, summarise, t_distribution, t_quantile
+from dnrpipe.studies.selectbench.policies import CONTENDERS, GROUPS, SIMPLE, choose_policies, settings_of
+from dnrpipe.studies.selectbench.pools import POOLS, choose_pools, write_rig
+from dnrpipe.studies.selectbench.rigs import inside, surface_points, walk, winding
+from dnrpipe.studies.selectbench.tables import difference, markdown, together
 from dnrtrain.contract import View
 from dnrtrain.selector.names import NAMES, TRAINED_NAMES
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from dnrpipe.blender.geometry.frozen import FrozenMesh, load_geometry, save_geometry
-from dnrpipe.errors import UserError
+from dnrpipe.core.errors import UserError
 
 pytest.importorskip("bpy")
 HELPER = Path(__file__).with_name("blender_scene.py")
@@ -190,7 +190,7 @@ def test_unusable_files_are_refused_in_one_line(tmp_path: Path, kind: str) -> No
     done = helper("freeze", path, tmp_path)
     last = done.stderr.strip().splitlines()[-1]
     assert done.returncode == 1
-    assert last.startswith("dnrpipe.errors.UserError: ")
+    assert last.startswith("dnrpipe.core.errors.UserError: ")
     assert message in last
     assert path.name in last
 

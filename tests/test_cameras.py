@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dnrpipe.cameras import depth_range, make_cameras, orbit_views, split_views
-from dnrpipe.errors import UserError
-from dnrpipe.settings import CameraSettings
+from dnrpipe.core.cameras import depth_range, make_cameras, orbit_views, split_views
+from dnrpipe.core.errors import UserError
+from dnrpipe.core.settings import CameraSettings
 from dnrtrain.contract import ContractError, View, parse_transforms, read_cameras, write_cameras
 
 SUMMARY = {"bounds": {"center": [1.0, -2.0, 0.5], "radius": 1.5}, "cameras": [], "animation": []}

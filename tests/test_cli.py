@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from dnrpipe.workspace import SCHEMA, Manifest, Source, Workspace, locked
+from dnrpipe.core.workspace import SCHEMA, Manifest, Source, Workspace, locked
 
 
 def _run(*arguments: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -155,7 +155,7 @@ def test_nan_in_a_camera_file_is_refused_before_any_work(tmp_path: Path) -> None
 def test_work_done_without_weights_is_stale_once_they_are_here(
     workspace: Workspace, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    from dnrpipe.stages import weights_cached
+    from dnrpipe.stages.pipeline import weights_cached
 
     monkeypatch.setenv("DNRPIPE_CACHE", str(tmp_path / "cache"))
     assert not weights_cached()

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from dnrpipe.costs import (
+from dnrpipe.core.errors import UserError
+from dnrpipe.core.ledger import (
     CostRecord,
     Ledger,
     break_even_frames,
@@ -24,7 +25,6 @@ from dnrpipe.costs import (
     tracing_all_would_cost,
     upfront_seconds,
 )
-from dnrpipe.errors import UserError
 
 
 def record(**changes: Any) -> CostRecord:
@@ -124,7 +124,7 @@ def test_concurrent_appends_lose_nothing(tmp_path: Path) -> None:
     path = tmp_path / "costs.jsonl"
     code = (
         "import sys\n"
-        "from dnrpipe.costs import CostRecord, Ledger\n"
+        "from dnrpipe.core.ledger import CostRecord, Ledger\n"
         "for i in range(50):\n"
         "    Ledger(sys.argv[1]).append(CostRecord(time=0, run='r', stage='raytrace', purpose='training',"
         " unit='view', name=f'{sys.argv[2]}/{i}', seconds=1))\n"

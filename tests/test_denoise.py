@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from dnrpipe.cameras import make_cameras
-from dnrpipe.errors import UserError
-from dnrpipe.executors import TaskResult, run_tasks
+from dnrpipe.core.cameras import make_cameras
+from dnrpipe.core.errors import UserError
+from dnrpipe.core.settings import CameraSettings
 from dnrpipe.raytrace.denoise import denoise, denoise_lightmap, filled, prefiltered
 from dnrpipe.raytrace.variants import choose_variant
-from dnrpipe.settings import CameraSettings
+from dnrpipe.workers.processes import TaskResult, run_tasks
 from dnrtrain.exr import read_exr
 
 SUMMARY = {"bounds": {"center": [0.0, 0.0, 0.0], "radius": 1.2}, "cameras": [], "animation": []}

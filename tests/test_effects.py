@@ -11,14 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dnrpipe.cameras import view_lenses
+from dnrpipe.core.cameras import view_lenses
+from dnrpipe.core.effect_names import FORCEABLE, LAMPS, NAMES, NEURAL
+from dnrpipe.core.errors import UserError
+from dnrpipe.core.settings import CameraSettings, Settings, resolve
 from dnrpipe.effects.bundle import bundle_facts, write_without
-from dnrpipe.effects.command import override_settings, table
-from dnrpipe.effects.plan import FORCEABLE, LAMPS, NAMES, NEURAL, DepthPilot, DepthStep, EffectPlan, plan_effects
-from dnrpipe.effects.statistics import difference, enough, remaining, significance
-from dnrpipe.errors import UserError
+from dnrpipe.effects.plan import DepthPilot, EffectPlan, plan_effects
 from dnrpipe.raytrace.sensors import _centred
-from dnrpipe.settings import CameraSettings, Settings, resolve
+from dnrpipe.raytrace.statistics import DepthStep, difference, enough, remaining, significance
+from dnrpipe.studies.effect_costs import override_settings, table
 from dnrtrain.settings import ModelSettings
 
 MATT: dict[str, Any] = {
@@ -199,7 +200,7 @@ def test_flags_replace_each_other_and_unknown_names_are_refused() -> None:
 
 
 def test_an_override_makes_stale_only_what_it_touches() -> None:
-    from dnrpipe.stages import STAGES
+    from dnrpipe.stages.pipeline import STAGES
 
     def told(stage: str, **effects: Any) -> Any:
         chosen = {"effects": effects, "select": {"policy": "rl-paper"}}  # which trains a model

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from dnrpipe.cameras import make_cameras
+from dnrpipe.core.cameras import make_cameras
+from dnrpipe.core.settings import CameraSettings
 from dnrpipe.effects.bundle import write_without
-from dnrpipe.executors import TaskResult, run_tasks
 from dnrpipe.raytrace.variants import choose_variant
-from dnrpipe.settings import CameraSettings
+from dnrpipe.workers.processes import TaskResult, run_tasks
 
 SUMMARY = {"bounds": {"center": [0.0, 0.0, 0.3], "radius": 1.5}, "cameras": [], "animation": []}
 SIZE, SPP = 48, 64

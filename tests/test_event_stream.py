@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from dnrpipe.console import Console
-from dnrpipe.errors import UserError
-from dnrpipe.event_stream import VARIABLE, EventStream
+from dnrpipe.core.console import Console
+from dnrpipe.core.errors import UserError
+from dnrpipe.core.event_stream import VARIABLE, EventStream
 from dnrpipe.service.worker import EventReader
 
 

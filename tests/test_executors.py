@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from dnrpipe import patience as patience_module
-from dnrpipe.errors import UserError
-from dnrpipe.executors import LocalWorker, Retry, TaskFailed, TaskResult, WorkerDied, run_tasks
+from dnrpipe.core.errors import UserError
+from dnrpipe.workers import timeouts as patience_module
+from dnrpipe.workers.processes import LocalWorker, Retry, TaskFailed, TaskResult, WorkerDied, run_tasks
 
 WORKER = """
 import os, pathlib, resource, signal, sys, tempfile, time
@@ -174,7 +174,7 @@ def test_closing_the_iterator_kills_the_workers(module: str, tmp_path: Path) -> 
 @pytest.mark.skipif(sys.platform != "linux", reason="PR_SET_PDEATHSIG is Linux's")
 def test_workers_die_with_their_parent(module: str, tmp_path: Path) -> None:
     script = (
-        "from dnrpipe.executors import run_tasks; from pathlib import Path;"
+        "from dnrpipe.workers.processes import run_tasks; from pathlib import Path;"
         f"list(run_tasks('{module}', {{'folder': '.'}}, [{{'kind': 'hang', 'n': 0}}], workers=1,"
         f" log=Path('{tmp_path}/log.txt')))"
     )
@@ -203,7 +203,7 @@ def test_a_worker_whose_parent_died_before_it_could_ask_ends_at_once(module: str
     """Its task is in the pipe already; it must not be begun, for nobody will take the answer."""
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
-    command = [sys.executable, "-m", "dnrpipe.executors", module]
+    command = [sys.executable, "-m", "dnrpipe.workers.processes", module]
     line = json.dumps({"folder": str(tmp_path)}) + "\n" + json.dumps({"kind": "ok", "n": 0}) + "\n"
     orphan = subprocess.run([*command, str(dead.pid)], input=line, capture_output=True, text=True, timeout=60)
     assert (orphan.returncode, orphan.stdout) == (1, "")
@@ -244,8 +244,8 @@ def test_a_scene_that_opened_at_the_second_try_is_said(
     from types import SimpleNamespace
     from typing import Any
 
-    from dnrpipe import prepare
-    from dnrpipe.console import Console
+    from dnrpipe.core.console import Console
+    from dnrpipe.stages import prepare
 
     workspace: Any = SimpleNamespace(log=lambda stage: tmp_path / "log")
     for last in (TaskResult({}, {"warnings": []}), TaskResult({}, None, "worker hung for 60 s", 2, died=True)):

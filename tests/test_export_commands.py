@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from dnrpipe.cli import cli
-from dnrpipe.errors import UserError
+from dnrpipe.core.errors import UserError
 from dnrpipe.export import vendor
 
 COMMANDS = ("export-nerf", "export-onnx", "export-gltf", "export-web")

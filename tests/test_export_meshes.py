@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dnrpipe.blender.bundle.ply import weld, write_ply
-from dnrpipe.errors import UserError
+from dnrpipe.core.errors import UserError
 from dnrpipe.export.folder import claim, finish
 from dnrpipe.export.gltf import Y_UP, glb
 from dnrpipe.export.meshes import BundleMesh, read_meshes, read_ply

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from dnrpipe.finding_lines import LISTED, finding_lines
+from dnrpipe.blender.finding_lines import LISTED, finding_lines
 
 
 def _row(feature: str, note: str, **names: str) -> dict[str, Any]:

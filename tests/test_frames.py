@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from dnrpipe.cameras import make_cameras
+from dnrpipe.core.cameras import make_cameras
+from dnrpipe.core.settings import CameraSettings
 from dnrpipe.raytrace.variants import choose_variant
-from dnrpipe.settings import CameraSettings
 
 SUMMARY = {"bounds": {"center": [0.0, 0.0, 0.0], "radius": 1.2}, "cameras": [], "animation": []}
 SPHERE = """<scene version="3.0.0">

@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dnrpipe.errors import UserError
-from dnrpipe.frontier.account import break_evens, pareto, settle_frames, total_seconds
-from dnrpipe.frontier.command import numbers
-from dnrpipe.frontier.run import Sweep
-from dnrpipe.frontier.words import markdown, verdict
-from dnrpipe.settings import resolve
+from dnrpipe.core.errors import UserError
+from dnrpipe.core.settings import resolve
+from dnrpipe.studies.frontier.account import break_evens, pareto, settle_frames, total_seconds
+from dnrpipe.studies.frontier.command import numbers
+from dnrpipe.studies.frontier.run import Sweep
+from dnrpipe.studies.frontier.words import markdown, verdict
 
 
 def point(name: str, upfront: float, frame_ms: float, psnr: float, kind: str = "ours") -> dict[str, Any]:

@@ -14,11 +14,11 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 from dnrpipe.blender.reading.opening import open_scene  # noqa: E402
-from dnrpipe.cameras import make_cameras  # noqa: E402
-from dnrpipe.executors import TaskResult, run_tasks  # noqa: E402
+from dnrpipe.core.cameras import make_cameras  # noqa: E402
+from dnrpipe.core.scene_files import read_json  # noqa: E402
+from dnrpipe.core.settings import CameraSettings  # noqa: E402
 from dnrpipe.raytrace.variants import choose_variant  # noqa: E402
-from dnrpipe.scene_files import read_json  # noqa: E402
-from dnrpipe.settings import CameraSettings  # noqa: E402
+from dnrpipe.workers.processes import TaskResult, run_tasks  # noqa: E402
 from dnrtrain.contract import GBUFFER_CHANNELS, View  # noqa: E402
 from dnrtrain.exr import read_exr  # noqa: E402
 

@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from dnrpipe.cameras import read_camera_file
-from dnrpipe.errors import UserError
-from dnrpipe.settings import CameraSettings
-from dnrpipe.stages import owner_of
-from dnrpipe.training import read_selection
-from dnrpipe.workspace import Manifest, Source, Workspace
+from dnrpipe.core.cameras import read_camera_file
+from dnrpipe.core.errors import UserError
+from dnrpipe.core.settings import CameraSettings
+from dnrpipe.core.workspace import Manifest, Source, Workspace
+from dnrpipe.stages.pipeline import owner_of
+from dnrpipe.stages.trainer import read_selection
 from dnrtrain.contract import ContractError, DamagedFile, SceneFrame, View, file_name, parse_transforms, write_cameras
 from dnrtrain.display import DisplayTransform
 from dnrtrain.exr import read_exr, write_exr

@@ -49,7 +49,7 @@ def test_dnrtrain_imports_with_torch_alone() -> None:
 
 
 def test_the_check_finds_a_forbidden_import(tmp_path: Path) -> None:
-    for forbidden in ("bpy", "mitsuba", "dnrpipe.settings"):
+    for forbidden in ("bpy", "mitsuba", "dnrpipe.core.settings"):
         root = tmp_path / forbidden
         shutil.copytree(PACKAGE, root / "dnrtrain")
         with (root / "dnrtrain" / "metrics.py").open("a") as file:

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dnrpipe.amounts import parse_seconds, parse_share
-from dnrpipe.effects.statistics import display
+from dnrpipe.core.units import parse_seconds, parse_share
 from dnrpipe.raytrace.noise import GROUPS, denoised_error, group_noise, half_noise
 from dnrpipe.raytrace.samples import Facts, Samples, read_facts, read_samples
+from dnrpipe.raytrace.statistics import display
 
 SIDE = 48
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dnrpipe.cameras import make_cameras
-from dnrpipe.executors import TaskResult, run_tasks
+from dnrpipe.core.cameras import make_cameras
+from dnrpipe.core.settings import CameraSettings
 from dnrpipe.raytrace.grouped import launch_sizes
 from dnrpipe.raytrace.pictures import repair
 from dnrpipe.raytrace.samples import read_samples
 from dnrpipe.raytrace.variants import choose_variant
-from dnrpipe.settings import CameraSettings
+from dnrpipe.workers.processes import TaskResult, run_tasks
 from dnrtrain.exr import read_exr
 
 SUMMARY = {"bounds": {"center": [0.0, 0.0, 0.0], "radius": 1.2}, "cameras": [], "animation": []}
@@ -119,7 +119,7 @@ def test_the_noise_of_a_rendered_view_is_estimated_without_bias(folder: Path) ->
         {**_task(folder, f"long-{name}", seed=999, spp=8192), **changes} for name, changes in pictures.items()
     ]
     _run(folder, references, "tracer")
-    from dnrpipe.effects.statistics import display
+    from dnrpipe.raytrace.statistics import display
 
     truth = display(_picture(folder / "long-0.exr"))
     level = np.sqrt(np.mean(truth**2))
@@ -177,5 +177,5 @@ def test_launches_are_few_and_even(samples: int, largest: int) -> None:
 
 
 def test_planning_a_target_needs_no_mitsuba() -> None:
-    code = "import sys, dnrpipe.trace; sys.exit('mitsuba' in sys.modules)"
+    code = "import sys, dnrpipe.stages.raytrace; sys.exit('mitsuba' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -10,7 +10,7 @@ import pytest
 from tools.plan_equal import markdown
 from tools.plan_prior import collect, fit, fit_prior, without
 
-from dnrpipe.planning.quality import Prior, predict, scene_gain, with_noise
+from dnrpipe.studies.planning.quality import Prior, predict, scene_gain, with_noise
 
 SCENES = {"quick": (3.0, 0.08), "slow": (6.0, 0.28), "even": (4.0, 0.15), "plain": (2.0, 0.12)}
 """Scenes that learn by the formula: their G and b."""

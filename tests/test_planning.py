@@ -14,10 +14,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dnrpipe.planning.carry_out import steps_that_fit, steps_within
-from dnrpipe.planning.choose import NEAR, Predictor, best_within, budgets, cheapest_reaching
-from dnrpipe.planning.pilot import pilot_path, read_pilot
-from dnrpipe.planning.quality import (
+from dnrpipe.core.workspace import Source, Workspace
+from dnrpipe.studies.planning.carry_out import steps_that_fit, steps_within
+from dnrpipe.studies.planning.choose import NEAR, Predictor, best_within, budgets, cheapest_reaching
+from dnrpipe.studies.planning.pilot import pilot_path, read_pilot
+from dnrpipe.studies.planning.quality import (
     Gain,
     Measured,
     load_prior,
@@ -28,7 +29,7 @@ from dnrpipe.planning.quality import (
     with_noise,
     without_noise,
 )
-from dnrpipe.planning.records import (
+from dnrpipe.studies.planning.records import (
     BasePart,
     FramePart,
     FramePoint,
@@ -40,10 +41,9 @@ from dnrpipe.planning.records import (
     TracePart,
     TrainingPart,
 )
-from dnrpipe.planning.routes import as_reported, break_even, rival_line, routes, seconds_for
-from dnrpipe.planning.seconds import Costs, Work, noise_at, view_line
-from dnrpipe.planning.worker import without_reference
-from dnrpipe.workspace import Source, Workspace
+from dnrpipe.studies.planning.routes import as_reported, break_even, rival_line, routes, seconds_for
+from dnrpipe.studies.planning.seconds import Costs, Work, noise_at, view_line
+from dnrpipe.studies.planning.worker import without_reference
 
 PRIOR = load_prior()
 POSITIVE = st.floats(1e-8, 1e-5)
@@ -346,8 +346,8 @@ def test_a_scene_is_planned_and_the_plan_carried_out(
     tmp_path: Path, demo_blend: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from dnrpipe.cli import _main
-    from dnrpipe.planning import carry_out, choose
-    from dnrpipe.planning import pilot_parts as pilot
+    from dnrpipe.studies.planning import carry_out, choose
+    from dnrpipe.studies.planning import pilot_parts as pilot
 
     monkeypatch.chdir(tmp_path)
     for module, name, value in (

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dnrpipe.cameras import make_cameras
-from dnrpipe.errors import UserError
-from dnrpipe.executors import TaskResult, run_tasks
+from dnrpipe.core.cameras import make_cameras
+from dnrpipe.core.errors import UserError
+from dnrpipe.core.settings import CameraSettings
 from dnrpipe.raytrace.noise import half_noise
 from dnrpipe.raytrace.variants import choose_variant, llvm_libraries
-from dnrpipe.settings import CameraSettings
+from dnrpipe.workers.processes import TaskResult, run_tasks
 from dnrtrain.exr import read_exr
 
 SUMMARY = {"bounds": {"center": [0.0, 0.0, 0.0], "radius": 1.2}, "cameras": [], "animation": []}

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dnrpipe.console import Console
-from dnrpipe.executors import TaskResult
+from dnrpipe.core.console import Console
 from dnrpipe.raytrace.finite import masked, masked_channels
 from dnrpipe.raytrace.noise import half_noise
 from dnrpipe.raytrace.pictures import repair
-from dnrpipe.tasks import warn_repairs
+from dnrpipe.workers.processes import TaskResult
+from dnrpipe.workers.view_tasks import warn_repairs
 from dnrtrain.contract import ContractError, View
 from dnrtrain.exr import read_exr, write_exr
 
@@ -125,7 +125,7 @@ def test_light_that_is_not_finite_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The baker's count reaches the terminal and the ledger."""
-    from dnrpipe import base
+    from dnrpipe.stages import base_images as base
 
     task = {"output": str(tmp_path / "light.npz"), "fingerprint": "f", "size": 16, "spp": 4}
     result = {"seconds": 1.0, "cpu_seconds": 1.0, "peak_mb": 1.0, "texels": 9, "lost": 12}

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dnrpipe.errors import UserError
+from dnrpipe.core.errors import UserError
 from dnrpipe.export.browser import find_chromium, open_page
 from dnrpipe.report import build_report, charts, words
 from dnrpipe.report.collect import collect

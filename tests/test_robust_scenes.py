@@ -15,9 +15,9 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
-from dnrpipe.cameras import depth_range, make_cameras  # noqa: E402
-from dnrpipe.executors import TaskResult, run_tasks  # noqa: E402
-from dnrpipe.settings import CameraSettings  # noqa: E402
+from dnrpipe.core.cameras import depth_range, make_cameras  # noqa: E402
+from dnrpipe.core.settings import CameraSettings  # noqa: E402
+from dnrpipe.workers.processes import TaskResult, run_tasks  # noqa: E402
 from dnrtrain.exr import read_exr  # noqa: E402
 
 pytestmark = pytest.mark.slow

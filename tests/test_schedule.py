@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dnrpipe.schedule import FIRST, STEP, Goal, Schedule, ViewProgress
+from dnrpipe.raytrace.sample_schedule import FIRST, STEP, Goal, Schedule, ViewProgress
 
 
 @dataclass

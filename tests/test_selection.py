@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 
-from dnrpipe.console import Console
-from dnrpipe.selection import epochs_of_step1, progress
-from dnrpipe.settings import Settings, resolve
-from dnrpipe.stages import STAGES, fingerprint, run_stage
-from dnrpipe.training import read_selection
-from dnrpipe.workspace import Source, Workspace
+from dnrpipe.core.console import Console
+from dnrpipe.core.settings import Settings, resolve
+from dnrpipe.core.workspace import Source, Workspace
+from dnrpipe.stages.pipeline import STAGES, fingerprint, run_stage
+from dnrpipe.stages.select import epochs_of_step1, progress
+from dnrpipe.stages.trainer import read_selection
 from dnrtrain.contract import write_cameras
 from dnrtrain.selector.names import ACTIVE_NAMES
 from dnrtrain.settings import ModelSettings
@@ -52,7 +52,7 @@ def workspace(tmp_path: Path) -> Workspace:
 
 def choose(workspace: Workspace, settings: Settings, capsys: pytest.CaptureFixture[str]) -> tuple[dict[str, Any], str]:
     """The stage's own work (its inputs' state is another test's) -> selection.json and what was said."""
-    from dnrpipe.selection import run
+    from dnrpipe.stages.select import run
 
     outcome = run(workspace, settings, Console(), "select-0")
     stamp = fingerprint(STAGES["select"], workspace, settings)
@@ -106,7 +106,7 @@ def test_a_policy_with_models_of_its_own(
     workspace: Workspace, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, policy: str
 ) -> None:
     """Its epochs and its choosing are booked; no epoch goes to the training that step 2 does not start from."""
-    import dnrpipe.selection
+    import dnrpipe.stages.select
 
     class Everything:
         """A plan of effects that leaves nothing off: there is no converted scene to plan for."""
@@ -114,7 +114,7 @@ def test_a_policy_with_models_of_its_own(
         def model(self, model: ModelSettings) -> ModelSettings:
             return model
 
-    monkeypatch.setattr(dnrpipe.selection, "plan_of", lambda *_: Everything())
+    monkeypatch.setattr(dnrpipe.stages.select, "plan_of", lambda *_: Everything())
     workspace.scene.mkdir(parents=True)
     (workspace.scene / "frame.json").write_text(synthetic.FRAME.model_dump_json())
     held = synthetic.dome(1, 24, seed=1)
@@ -187,12 +187,12 @@ NO_BASE = {"model": {"base": "none", "output": "display", "filter": 0, "chain": 
 def test_rounds_trace_a_part_and_go_on(
     workspace: Workspace, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import dnrpipe.selection
+    import dnrpipe.stages.select
 
     workspace.scene.mkdir(parents=True)
     (workspace.scene / "frame.json").write_text(synthetic.FRAME.model_dump_json())
     traced: list[list[str]] = []
-    monkeypatch.setattr(dnrpipe.selection, "trace_round", trace_by_hand(workspace, traced))
+    monkeypatch.setattr(dnrpipe.stages.select, "trace_round", trace_by_hand(workspace, traced))
     settings = resolve(None, {"select": {"budget": 5, "policy": "auto", "rounds": 3}, **NO_BASE}, environment={})
     found, _ = choose(workspace, settings, capsys)
     assert found["rounds"] == 3 and len(set(found["views"])) == 5
@@ -214,7 +214,7 @@ def test_a_choice_beside_a_coarse_model_is_made_once(
     workspace: Workspace, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Step 1 trains with the views that were chosen in rounds, and its record names them."""
-    import dnrpipe.selection
+    import dnrpipe.stages.select
     from dnrtrain.selector.auto import AutoPolicy
 
     workspace.scene.mkdir(parents=True)
@@ -226,8 +226,8 @@ def test_a_choice_beside_a_coarse_model_is_made_once(
     target.parent.mkdir(parents=True)
     made.rename(target)
     traced: list[list[str]] = []
-    monkeypatch.setattr(dnrpipe.selection, "trace_round", trace_by_hand(workspace, traced))
-    monkeypatch.setattr(dnrpipe.selection, "plan_of", lambda *_: SimpleNamespace(model=lambda settings: settings))
+    monkeypatch.setattr(dnrpipe.stages.select, "trace_round", trace_by_hand(workspace, traced))
+    monkeypatch.setattr(dnrpipe.stages.select, "plan_of", lambda *_: SimpleNamespace(model=lambda settings: settings))
     asked: list[int] = []
     first_look = AutoPolicy.choose
 
@@ -260,8 +260,8 @@ def test_rounds_make_ray_tracing_count() -> None:
 
 
 def test_impossible_rounds_are_refused() -> None:
-    from dnrpipe.errors import UserError
-    from dnrpipe.rounds import check_rounds, portions
+    from dnrpipe.core.errors import UserError
+    from dnrpipe.stages.rounds import check_rounds, portions
 
     with pytest.raises(UserError, match="--rounds 2: policy kmedoids chooses all views at once; use --policy auto"):
         check_rounds(told("kmedoids").select.model_copy(update={"rounds": 2}))
@@ -272,22 +272,22 @@ def test_impossible_rounds_are_refused() -> None:
 
 
 def test_too_large_a_budget_is_refused(workspace: Workspace) -> None:
-    from dnrpipe.errors import UserError
-    from dnrpipe.selection import run
+    from dnrpipe.core.errors import UserError
+    from dnrpipe.stages.select import run
 
     with pytest.raises(UserError, match="--budget 9: only 8 candidate views exist"):
         run(workspace, told("auto", 9), Console(), "select-0")
 
 
 def test_an_unknown_policy_is_refused() -> None:
-    from dnrpipe.errors import UserError
+    from dnrpipe.core.errors import UserError
 
     with pytest.raises(UserError, match=r"select\.policy.*'auto', 'coverage'"):
         told("best")
 
 
 def test_the_stage_asks_for_its_inputs(workspace: Workspace) -> None:
-    from dnrpipe.errors import UserError
+    from dnrpipe.core.errors import UserError
 
     with pytest.raises(UserError, match="run `dnrpipe prepare` first"):
         run_stage("select", workspace, told(), Console())

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dnrpipe.errors import UserError
-from dnrpipe.settings import PRESETS, merge, parse_assignment, resolve
+from dnrpipe.core.errors import UserError
+from dnrpipe.core.settings import PRESETS, merge, parse_assignment, resolve
 
 
 def test_layers_win_in_order(tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def test_merge_leaves_its_arguments_alone_and_the_later_wins(base: dict, extra: 
 
 
 def test_paths_per_texel_of_the_baked_light() -> None:
-    from dnrpipe.base import light_size, light_spp
+    from dnrpipe.stages.base_images import light_size, light_spp
 
     def of(side: int, **base: object) -> tuple[int, int]:
         settings = resolve("draft", {"cameras": {"width": side, "height": side}, "base": base}, environment={})
@@ -175,7 +175,7 @@ def test_bad_targets_are_named(noise: str | None, time: str | None, spp: int | N
 
 def test_a_target_of_tracing_changes_no_fingerprint_where_there_is_none() -> None:
     """Workspaces made before there were targets stay done; with one, the plain count no longer matters."""
-    from dnrpipe.stages import STAGES
+    from dnrpipe.stages.pipeline import STAGES
 
     def tracing(**changes: object) -> list[object]:
         settings = resolve("draft", {"raytrace": changes}, environment={})

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from dnrpipe.costs import Ledger
+from dnrpipe.core.ledger import Ledger
 
 SIZES = (256, 800)
 REPEATS = 7
@@ -127,10 +127,9 @@ def _time_calls(module: Any, seconds: list[float], wait: Callable[[], None]) -> 
 
 def _first_view(workspace: Path, base: Any) -> Any:
     """The first test view that has all files the model needs, as a batch."""
-    from dnrpipe.base import RENDERED, base_path
-    from dnrpipe.prepare import split_views
-    from dnrpipe.scene_files import read_frame
-    from dnrpipe.workspace import Workspace
+    from dnrpipe.core.scene_files import read_frame, split_views
+    from dnrpipe.core.workspace import Workspace
+    from dnrpipe.stages.base_images import RENDERED, base_path
     from dnrtrain.dataset import load_views
 
     opened = Workspace.open(workspace)

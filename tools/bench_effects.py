@@ -19,11 +19,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from dnrpipe.console import Console
+from dnrpipe.core.console import Console
+from dnrpipe.core.workspace import Source, Workspace, file_sha256
 from dnrpipe.effects.store import pilot_views, resolve_plan, run_pilots, trace_config, variant_for
-from dnrpipe.prepare import scene_and_views
-from dnrpipe.session import resolve_settings
-from dnrpipe.workspace import Source, Workspace, file_sha256
+from dnrpipe.stages.prepare import scene_and_views
+from dnrpipe.stages.session import resolve_settings
 
 EVERYTHING = {"integrator": "volpath", "max_depth": 32, "passes": True}
 

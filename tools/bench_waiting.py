@@ -19,10 +19,9 @@ VIEWS, EPOCHS, WARM = 6, 9, 2
 
 def step_ms(root: Path) -> tuple[float, float]:
     """(wall, processor) milliseconds of an optimiser step of the workspace's step 2, first epochs left out."""
-    from dnrpipe.prepare import split_views
-    from dnrpipe.scene_files import read_frame
-    from dnrpipe.session import resolve_settings
-    from dnrpipe.workspace import Workspace
+    from dnrpipe.core.scene_files import read_frame, split_views
+    from dnrpipe.core.workspace import Workspace
+    from dnrpipe.stages.session import resolve_settings
     from dnrtrain.checkpoint import read_record
     from dnrtrain.dataset import load_views
     from dnrtrain.step2 import run_step2

@@ -23,13 +23,13 @@ from typing import Any
 from tools.plan_equal import predictor_in
 from tools.plan_prior import read_cells, without
 
-from dnrpipe.ablation.results import made_by
-from dnrpipe.errors import UserError
-from dnrpipe.frames.ladder import crossover, frontier
-from dnrpipe.frontier.command import read_frontier
-from dnrpipe.planning.choose import VIEWS, Predictor
-from dnrpipe.planning.records import Choice, Interval, Route
-from dnrpipe.planning.routes import as_reported, routes
+from dnrpipe.core.errors import UserError
+from dnrpipe.studies.cells.provenance import made_by
+from dnrpipe.studies.frames.ladder import crossover, frontier
+from dnrpipe.studies.frontier.command import read_frontier
+from dnrpipe.studies.planning.choose import VIEWS, Predictor
+from dnrpipe.studies.planning.records import Choice, Interval, Route
+from dnrpipe.studies.planning.routes import as_reported, routes
 from dnrtrain.atomic import write_json
 
 FRAMES = (200, 2000)

@@ -24,18 +24,17 @@ from typing import Any
 
 from tools.plan_prior import read_cells, without
 
-from dnrpipe.ablation.results import made_by
-from dnrpipe.errors import UserError
-from dnrpipe.planning.carry_out import apply, steps_within
-from dnrpipe.planning.choose import Predictor
-from dnrpipe.planning.command import Wanted, make_plan, make_predictor
-from dnrpipe.planning.pilot import read_pilot
-from dnrpipe.planning.records import Prediction
-from dnrpipe.planning.seconds import TIME_SPREAD
-from dnrpipe.prepare import split_views
-from dnrpipe.scene_files import read_json
-from dnrpipe.session import Session, resolve_settings
-from dnrpipe.workspace import Workspace
+from dnrpipe.core.errors import UserError
+from dnrpipe.core.scene_files import read_json, split_views
+from dnrpipe.core.workspace import Workspace
+from dnrpipe.stages.session import Session, resolve_settings
+from dnrpipe.studies.cells.provenance import made_by
+from dnrpipe.studies.planning.carry_out import apply, steps_within
+from dnrpipe.studies.planning.choose import Predictor
+from dnrpipe.studies.planning.command import Wanted, make_plan, make_predictor
+from dnrpipe.studies.planning.pilot import read_pilot
+from dnrpipe.studies.planning.records import Prediction
+from dnrpipe.studies.planning.seconds import TIME_SPREAD
 from dnrtrain.atomic import write_json
 
 KEPT = (

@@ -5,8 +5,8 @@
 
 ``collect`` gathers cells (views, samples, steps, PSNR, PSNR of the base image, noise of training pictures and of
 references) of `dnrpipe frontier`, of `dnrpipe ablate`, and of its own older output; and the pilots beside frontiers.
-``fit`` reads that, fits :mod:`dnrpipe.planning.quality`, leaves every scene that has a pilot out in turn, predicts its
-frontier (the same test views) from that pilot, and prints how far off that is.
+``fit`` reads that, fits `dnrpipe.studies.planning.quality`, leaves every scene that has a pilot out in turn, predicts
+its frontier (the same test views) from that pilot, and prints how far off that is.
 """
 
 from __future__ import annotations
@@ -21,17 +21,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from dnrpipe.planning.pilot import read_pilot
-from dnrpipe.planning.quality import (
-    Prior,
-    load_prior,
-    measured_gains,
-    predict,
-    scene_gain,
-    without_noise,
-)
-from dnrpipe.planning.seconds import noise_at
-from dnrpipe.workspace import Workspace
+from dnrpipe.core.workspace import Workspace
+from dnrpipe.studies.planning.pilot import read_pilot
+from dnrpipe.studies.planning.quality import Prior, load_prior, measured_gains, predict, scene_gain, without_noise
+from dnrpipe.studies.planning.seconds import noise_at
 from dnrtrain.atomic import write_json
 from dnrtrain.exr import read_metadata
 

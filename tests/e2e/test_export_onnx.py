@@ -20,9 +20,9 @@ def test_the_file_renders_what_evaluate_rendered(tiny: Path, tmp_path: Path) -> 
     """From the EXR files to evaluation's own PNG, without torch (which evaluated in bfloat16 where that is fast)."""
     import onnxruntime
 
+    from dnrpipe.core.scene_files import split_views
+    from dnrpipe.core.workspace import Workspace
     from dnrpipe.export.onnx import view_inputs
-    from dnrpipe.prepare import split_views
-    from dnrpipe.workspace import Workspace
 
     out = tmp_path / "m.onnx"
     answer = json.loads(run("export-onnx", str(tiny), "--out", str(out), "--json", folder=tmp_path).stdout)
@@ -39,10 +39,10 @@ def test_the_file_renders_what_evaluate_rendered(tiny: Path, tmp_path: Path) -> 
 
 def test_a_file_that_differs_is_not_written(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The check is real: with another tolerance it refuses, and leaves nothing."""
-    from dnrpipe.console import Console
-    from dnrpipe.errors import UserError
+    from dnrpipe.core.console import Console
+    from dnrpipe.core.errors import UserError
+    from dnrpipe.core.workspace import Workspace
     from dnrpipe.export import onnx
-    from dnrpipe.workspace import Workspace
 
     monkeypatch.setattr(onnx, "TOLERANCE", 0.0)
     with pytest.raises(UserError, match="differ from torch"):

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from e2e_harness import run
 
-from dnrpipe.errors import UserError
+from dnrpipe.core.errors import UserError
 from dnrpipe.export.browser import find_chromium, open_page, wait_for
 from dnrpipe.export.gltf import Y_UP
 from dnrpipe.export.vendor import runtime
@@ -120,12 +120,12 @@ def test_a_static_server_serves_it_too(exported: tuple[Path, dict[str, Any]], se
 
 def test_the_base_image_is_the_ray_traced_diffuse_light(tiny: Path) -> None:
     """Textures looked up at the G-buffer against the diffuse part of Mitsuba's base images."""
-    from dnrpipe.base import base_path
-    from dnrpipe.console import Console
+    from dnrpipe.core.console import Console
+    from dnrpipe.core.workspace import Workspace
     from dnrpipe.export.nerf import raytraced_views
     from dnrpipe.export.surface import surface_maps
     from dnrpipe.export.web_model import web_views
-    from dnrpipe.workspace import Workspace
+    from dnrpipe.stages.base_images import base_path
     from dnrtrain.exr import read_exr
 
     workspace = Workspace.open(tiny)

@@ -14,7 +14,7 @@ import pytest
 from e2e_harness import STAGES, command, contents, environment, image, run
 from tools.faults.workspaces import forget, torn
 
-from dnrpipe.costs import Ledger
+from dnrpipe.core.ledger import Ledger
 from dnrtrain.exr import read_exr
 
 pytestmark = [pytest.mark.slow, pytest.mark.e2e]

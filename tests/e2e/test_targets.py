@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from e2e_harness import command, environment, run
 
-from dnrpipe.costs import Ledger, traced_views
+from dnrpipe.core.ledger import Ledger, traced_views
 from dnrtrain.exr import read_exr, read_metadata
 
 pytestmark = [pytest.mark.slow, pytest.mark.e2e]

@@ -8,8 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+from dnrpipe.core.workspace import Source, Workspace
 from dnrpipe.service.client import Client
-from dnrpipe.workspace import Source, Workspace
 
 # 48², 4 candidates, some epochs: everything runs, nothing takes long.
 TINY: dict[str, bool | int | float | str] = {

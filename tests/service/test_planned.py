@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from dnrpipe.costs import CostRecord
-from dnrpipe.errors import UserError
+from dnrpipe.core.errors import UserError
+from dnrpipe.core.ledger import CostRecord
+from dnrpipe.core.settings import resolve
+from dnrpipe.core.workspace import Source, Workspace
 from dnrpipe.service.models import PlanState
 from dnrpipe.service.planned import plan_state
-from dnrpipe.settings import resolve
-from dnrpipe.workspace import Source, Workspace
 
 MADE = 1_000_000.0
 

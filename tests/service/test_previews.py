@@ -18,8 +18,8 @@ import pytest
 from PIL import Image
 from tests.service.harness import Server, empty_workspace
 
-from dnrpipe.costs import Ledger
-from dnrpipe.event_stream import VARIABLE
+from dnrpipe.core.event_stream import VARIABLE
+from dnrpipe.core.ledger import Ledger
 from dnrpipe.service.client import Refused
 from dnrpipe.service.models import JobRequest
 
@@ -132,10 +132,11 @@ def test_what_is_not_a_picture(server: Server) -> None:
 
 def test_large_views_are_not_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Training goes by squares of them; the whole of one would want several times the memory."""
-    from dnrpipe.console import Console
-    from dnrpipe.previews import LivePicture
-    from dnrpipe.settings import resolve
-    from dnrpipe.workspace import Workspace
+    from dnrpipe.stages.previews import LivePicture
+
+    from dnrpipe.core.console import Console
+    from dnrpipe.core.settings import resolve
+    from dnrpipe.core.workspace import Workspace
 
     large: Any = SimpleNamespace(size=(2048, 2048))
     empty_workspace(tmp_path, "large")

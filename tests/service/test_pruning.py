@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from tests.service.harness import Server, empty_workspace
 
-from dnrpipe.errors import UserError
+from dnrpipe.core.errors import UserError
 from dnrpipe.service.config import ServerConfig
 from dnrpipe.service.models import FINAL, JobRequest
 from dnrpipe.service.pruning import DAY, prune

@@ -15,7 +15,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from dnrpipe.errors import UserError
+from dnrpipe.core.errors import UserError
 from dnrpipe.service.models import FINAL, JobRequest
 from dnrpipe.service.queue import MAX_STARTS, Queue, QueueFull, WrongState
 

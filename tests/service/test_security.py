@@ -13,7 +13,7 @@ from tests.service.harness import Server, empty_workspace
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from dnrpipe.errors import UserError
+from dnrpipe.core.errors import UserError
 from dnrpipe.service.client import Refused
 from dnrpipe.service.models import JobRequest
 from dnrpipe.service.root import ServiceRoot, UnknownName

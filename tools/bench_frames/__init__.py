@@ -5,5 +5,5 @@ motion     reprojection by known motion, flicker (numpy only)
 stability  an orbit of close frames
 document   JSON and Markdown
 
-The renderers themselves are in :mod:`dnrpipe.frames`.
+The renderers themselves are in :mod:`dnrpipe.studies.frames`.
 """

@@ -10,9 +10,9 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from dnrpipe.errors import UserError
+from dnrpipe.cli.thread_waiting import set_thread_waiting
+from dnrpipe.core.errors import UserError
 from dnrpipe.raytrace.variants import choose_variant
-from dnrpipe.thread_waiting import set_thread_waiting
 
 
 def main() -> int:

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from dnrpipe.frames.ours import BASE, NEURAL
+from dnrpipe.studies.frames.ours import BASE, NEURAL
 from dnrtrain.atomic import atomic_path, write_json
 
 from . import upfront

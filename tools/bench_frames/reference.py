@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from dnrpipe.frames.scene import BenchScene
+from dnrpipe.core.workspace import digest
 from dnrpipe.raytrace.denoise import denoise
-from dnrpipe.trace import view_seed
-from dnrpipe.workspace import digest
+from dnrpipe.stages.raytrace import view_seed
+from dnrpipe.studies.frames.scene import BenchScene
 from dnrtrain.contract import View
 from dnrtrain.exr import read_exr, read_metadata, write_exr
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from dnrpipe.frames.ladder import frontier
-from dnrpipe.frames.ours import Ours
-from dnrpipe.frames.rival import METHODS, climb, make_rungs
-from dnrpipe.frames.scene import BenchScene, Clock, open_scene
+from dnrpipe.studies.frames.ladder import frontier
+from dnrpipe.studies.frames.ours import Ours
+from dnrpipe.studies.frames.rival import METHODS, climb, make_rungs
+from dnrpipe.studies.frames.scene import BenchScene, Clock, open_scene
 from dnrtrain.metrics import image_metrics
 from dnrtrain.perceptual import build_lpips
 from dnrtrain.weights import WeightsMissing, load_weights

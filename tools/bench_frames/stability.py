@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from dnrpipe.cameras import orbit_views
-from dnrpipe.frames.ours import Ours
-from dnrpipe.frames.rival import climb, make_rungs
-from dnrpipe.frames.scene import BenchScene, Clock
+from dnrpipe.core.cameras import orbit_views
+from dnrpipe.studies.frames.ours import Ours
+from dnrpipe.studies.frames.rival import climb, make_rungs
+from dnrpipe.studies.frames.scene import BenchScene, Clock
 from dnrtrain.contract import View
 
 from .motion import Surface, flicker

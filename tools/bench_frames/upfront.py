@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from dnrpipe.costs import CostRecord, break_even_frames
-from dnrpipe.frames.ladder import quality_at
-from dnrpipe.frames.ours import NEURAL
+from dnrpipe.core.ledger import CostRecord, break_even_frames
+from dnrpipe.studies.frames.ladder import quality_at
+from dnrpipe.studies.frames.ours import NEURAL
 
 COUNTS = (200, 2000)
 """Numbers of frames that the tables speak of."""

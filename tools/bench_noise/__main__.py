@@ -11,8 +11,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from dnrpipe.amounts import parse_share
-from dnrpipe.errors import UserError
+from dnrpipe.core.errors import UserError
+from dnrpipe.core.units import parse_share
 from dnrtrain.atomic import write_json
 
 

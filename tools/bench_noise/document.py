@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from dnrpipe.schedule import FIRST
+from dnrpipe.raytrace.sample_schedule import FIRST
 
 WITHIN = 0.15
 

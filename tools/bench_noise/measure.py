@@ -17,20 +17,19 @@ from typing import Any
 
 import numpy as np
 
-from dnrpipe.cameras import scaled_to
-from dnrpipe.effects.statistics import display
+from dnrpipe.core.cameras import scaled_to
+from dnrpipe.core.errors import UserError
+from dnrpipe.core.scene_files import read_json, split_views
+from dnrpipe.core.workspace import Workspace
 from dnrpipe.effects.store import plan_of, trace_config, variant_for
-from dnrpipe.errors import UserError
-from dnrpipe.prepare import split_views
 from dnrpipe.raytrace.grouped import GroupedSensor
 from dnrpipe.raytrace.noise import GROUPS, group_noise
 from dnrpipe.raytrace.pass_worker import Worker
+from dnrpipe.raytrace.sample_schedule import Goal, Schedule, ViewProgress
 from dnrpipe.raytrace.samples import read_samples
-from dnrpipe.scene_files import read_json
-from dnrpipe.schedule import Goal, Schedule, ViewProgress
-from dnrpipe.session import resolve_settings
-from dnrpipe.trace import view_seed
-from dnrpipe.workspace import Workspace
+from dnrpipe.raytrace.statistics import display
+from dnrpipe.stages.raytrace import view_seed
+from dnrpipe.stages.session import resolve_settings
 from dnrtrain.contract import View
 
 

@@ -44,14 +44,14 @@ def targets(folder: Path) -> dict[str, Target]:
     import numpy as np
     import torch
 
-    from dnrpipe.base import _light_print
     from dnrpipe.blender.geometry.frozen import load_geometry
-    from dnrpipe.cameras import own_splits, read_camera_file
-    from dnrpipe.costs import Ledger
+    from dnrpipe.core.cameras import own_splits, read_camera_file
+    from dnrpipe.core.ledger import Ledger
+    from dnrpipe.core.settings import CameraSettings
+    from dnrpipe.core.workspace import Manifest, Source, Workspace
     from dnrpipe.raytrace.light_worker import read_light
-    from dnrpipe.settings import CameraSettings
-    from dnrpipe.verify import _picture
-    from dnrpipe.workspace import Manifest, Source, Workspace
+    from dnrpipe.stages.base_images import _light_print
+    from dnrpipe.stages.verify import _picture
     from dnrtrain import checkpoint
     from dnrtrain.contract import SceneFrame, View, read_cameras, write_cameras
     from dnrtrain.display import DisplayTransform
@@ -96,7 +96,7 @@ def targets(folder: Path) -> dict[str, Target]:
     keep("display", folder / "display.npz", lambda p: DisplayTransform(frame.model_copy(), p.parent))
 
     def scene_frame(p: Path) -> None:
-        from dnrpipe.scene_files import read_frame
+        from dnrpipe.core.scene_files import read_frame
 
         place = p.parent / "scene"
         place.mkdir(exist_ok=True)
@@ -171,9 +171,9 @@ def _geometry(folder: Path) -> bytes:
 
 def _status(path: Path) -> None:
     """What `dnrpipe status` and `costs` do with a manifest."""
-    from dnrpipe.session import resolve_settings
-    from dnrpipe.stages import status
-    from dnrpipe.workspace import Workspace
+    from dnrpipe.core.workspace import Workspace
+    from dnrpipe.stages.pipeline import status
+    from dnrpipe.stages.session import resolve_settings
 
     workspace = Workspace.open(path.parent)
     status(workspace, resolve_settings(workspace, {}, None))
@@ -182,8 +182,8 @@ def _status(path: Path) -> None:
 def _selection(path: Path) -> None:
     import numpy as np
 
-    from dnrpipe.training import read_selection
-    from dnrpipe.workspace import Manifest, Source, Workspace
+    from dnrpipe.core.workspace import Manifest, Source, Workspace
+    from dnrpipe.stages.trainer import read_selection
     from dnrtrain.contract import View, write_cameras
 
     workspace = Workspace(path.parent, Manifest(source=Source(path="/a", sha256="0")))  # pyright: ignore[reportCallIssue]
@@ -195,7 +195,7 @@ def _selection(path: Path) -> None:
 
 def fuzz(kind: str, target: Target, folder: Path, count: int, seed: int) -> dict[str, Any]:
     """Read ``count`` mutations; how many were read, refused, escaped (with the first errors that did)."""
-    from dnrpipe.errors import UserError
+    from dnrpipe.core.errors import UserError
     from dnrtrain.contract import ContractError
 
     folder.mkdir(parents=True, exist_ok=True)

@@ -228,7 +228,7 @@ def _workers(parent: int) -> list[int]:
         with contextlib.suppress(OSError):
             for child in listing.read_text().split():
                 command = Path(f"/proc/{child}/cmdline").read_text()
-                if "dnrpipe.executors" in command:
+                if "dnrpipe.workers.processes" in command:
                     found.append(int(child))
     return found
 

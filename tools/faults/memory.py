@@ -172,8 +172,8 @@ def many_candidates(folder: Path, count: int, timeout: float) -> list[Reading]:
 
 def cameras_of(count: int) -> list[View]:
     """Views of a dome around the unit sphere."""
-    from dnrpipe.cameras import make_cameras
-    from dnrpipe.settings import CameraSettings
+    from dnrpipe.core.cameras import make_cameras
+    from dnrpipe.core.settings import CameraSettings
 
     summary = {"bounds": {"center": [0.0, 0.0, 0.0], "radius": 1.0}, "cameras": [], "animation": []}
     chosen = CameraSettings(source="dome", train=count, val=0, test=0, width=SMALL, height=SMALL)

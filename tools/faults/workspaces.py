@@ -29,8 +29,8 @@ def contents(workspace: Path) -> dict[str, object]:
 
 def forget(workspace: Path, stage: str) -> None:
     """Bring a finished workspace back to before ``stage``."""
-    from dnrpipe.stages import STAGES, clear
-    from dnrpipe.workspace import Workspace
+    from dnrpipe.core.workspace import Workspace
+    from dnrpipe.stages.pipeline import STAGES, clear
 
     clear(STAGES[stage], Workspace.open(workspace))
 

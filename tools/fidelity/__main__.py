@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from dnrpipe.console import Console
+from dnrpipe.core.console import Console
 
 from .catalogue import all_cases
 from .run import Plan, load_records, run_cases

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from dnrpipe.console import Console
-from dnrpipe.executors import TaskResult, run_tasks
-from dnrpipe.workspace import file_sha256
+from dnrpipe.core.console import Console
+from dnrpipe.core.workspace import file_sha256
+from dnrpipe.workers.processes import TaskResult, run_tasks
 from dnrtrain.atomic import atomic_path, write_json, write_text
 
 from . import ours

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from dnrpipe.evaluate import flip_error
+from dnrpipe.core.images import flip_error
 from dnrtrain.display import srgb_oetf
 from dnrtrain.metrics import PSNR_CEILING, psnr_masked, ssim
 

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 import dnrpipe
-from dnrpipe import prepare
-from dnrpipe.cameras import make_cameras, view_lenses
-from dnrpipe.console import Console
-from dnrpipe.executors import Retry, TaskResult, run_tasks
+from dnrpipe.core.cameras import make_cameras, view_lenses
+from dnrpipe.core.console import Console
+from dnrpipe.core.settings import CameraSettings, resolve
+from dnrpipe.core.workspace import Source, Workspace, file_sha256
 from dnrpipe.raytrace.variants import choose_variant
-from dnrpipe.settings import CameraSettings, resolve
-from dnrpipe.workspace import Source, Workspace, file_sha256
+from dnrpipe.stages import prepare
+from dnrpipe.workers.processes import Retry, TaskResult, run_tasks
 from dnrtrain.exr import read_exr
 
 from .reference_settings import PATH_DEPTH

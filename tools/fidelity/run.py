@@ -15,9 +15,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from dnrpipe.console import Console
-from dnrpipe.executors import TaskResult, run_tasks
+from dnrpipe.core.console import Console
 from dnrpipe.raytrace.variants import choose_variant
+from dnrpipe.workers.processes import TaskResult, run_tasks
 from dnrtrain.atomic import write_json
 
 from . import ours, reference_settings

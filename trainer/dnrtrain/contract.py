@@ -102,7 +102,7 @@ class ContractError(ValueError):
 class DamagedFile(ContractError):
     """A file that a stage wrote does not read, or not as it was written. ``path`` is the file.
 
-    The pipeline makes such a file again (:func:`dnrpipe.stages.run_stage`); the message is for those who read it alone.
+    The pipeline makes such a file again (`stages.pipeline.run_stage`); the message is for those who read it alone.
     """
 
     def __init__(self, path: Path | str, reason: str) -> None:

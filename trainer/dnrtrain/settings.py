@@ -1,4 +1,4 @@
-"""Settings of the trainer, one model per part. Presets set them in :mod:`dnrpipe.settings`."""
+"""Settings of the trainer, one model per part. Presets set them in :mod:`dnrpipe.core.settings`."""
 
 from __future__ import annotations
 

@@ -7,8 +7,7 @@ from typing import Any
 
 import bpy
 
-from dnrpipe.effects.bundle import bundle_facts
-from dnrpipe.errors import NothingVisible
+from dnrpipe.core.errors import NothingVisible
 
 from .baking.rehearsal import BakeOptions, convert_materials, place_atlas
 from .bundle.export import export_bundle
@@ -39,7 +38,7 @@ class Worker:
         converter = convert_materials(meshes, folder, findings, BakeOptions(folder / "bakes", int(task["bake_size"])))
         export_bundle(meshes, folder, findings, converter)
         census["findings"] = findings.to_list()
-        return {"census": census, "bundle": bundle_facts(folder / "scene.xml"), "warnings": loaded.warnings}
+        return {"census": census, "warnings": loaded.warnings}
 
 
 def _without_surface(reason: str) -> dict[str, Any]:
@@ -49,4 +48,4 @@ def _without_surface(reason: str) -> dict[str, Any]:
     note_drivers(findings)
     census = take_census(bpy.context.scene, findings, [])
     census["findings"] = findings.to_list()
-    return {"census": census, "bundle": {}, "warnings": [reason]}
+    return {"census": census, "warnings": [reason]}

@@ -7,7 +7,7 @@ from typing import Any
 
 import bpy
 
-from dnrpipe.workspace import file_sha256
+from dnrpipe.core.workspace import file_sha256
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import SceneFrame
 

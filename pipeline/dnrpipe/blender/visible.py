@@ -7,7 +7,7 @@ from collections import Counter
 import bpy
 import numpy as np
 
-from dnrpipe.errors import NothingVisible, UserError
+from dnrpipe.core.errors import NothingVisible, UserError
 
 from .geometry.freeze import Frozen, freeze_scene
 

@@ -82,7 +82,7 @@ for _command in (
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point: runs the command and turns every expected failure into one line and an exit code."""
-    from ..thread_waiting import set_thread_waiting
+    from .thread_waiting import set_thread_waiting
 
     set_thread_waiting(os.environ)
     code = _main(arguments)
@@ -91,7 +91,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _main(arguments: list[str] | None) -> int:
-    from ..interrupts import interrupt_as_keyboard
+    from .interrupts import interrupt_as_keyboard
 
     try:
         with interrupt_as_keyboard():
@@ -103,7 +103,7 @@ def _main(arguments: list[str] | None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # a reader such as `head` left: no noise at exit
     except Exception as error:
-        from ..failures import explain
+        from .failures import explain
 
         explained = explain(error)
         if explained is None:

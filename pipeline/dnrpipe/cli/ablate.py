@@ -44,8 +44,8 @@ def ablate(as_json: bool, quiet: bool, out: Path, **options: Any) -> None:
       dnrpipe ablate --scenes materials,interior --rows ingredients --seeds 1
       dnrpipe ablate --scenes my.blend --rows vanilla,dnr --out my-ablation
     """
-    from ..ablation.command import run_ablation
-    from ..console import Console
+    from ..core.console import Console
+    from ..studies.ablation.command import run_ablation
 
     console = Console(json_mode=as_json, quiet=quiet)
     results = run_ablation(out=out, console=console, **options)

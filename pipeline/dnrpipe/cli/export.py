@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import UserError
+from ..core.errors import UserError
 
 if TYPE_CHECKING:
-    from ..console import Console
-    from ..workspace import Workspace
+    from ..core.console import Console
+    from ..core.workspace import Workspace
 
 
 def _common(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -30,8 +30,8 @@ def _common(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _opened(workspace: str | None, named: str | None, as_json: bool, quiet: bool) -> tuple[Workspace, Console]:
-    from ..console import Console
-    from ..workspace import Workspace, find_workspace
+    from ..core.console import Console
+    from ..core.workspace import Workspace, find_workspace
 
     if workspace and named and workspace != named:
         raise UserError(f"two workspaces are named, {workspace} and {named}; name one")

@@ -55,8 +55,8 @@ def frontier(
       dnrpipe frontier -w scene.dnr --budgets 5,10,25 --spp 8,64 --iterations 200,800 --frames 100,1000
       dnrpipe frontier scene.blend --also none --ladder 1,4,16 --json
     """
-    from ..errors import UserError
-    from ..frontier.command import run_frontier
+    from ..core.errors import UserError
+    from ..studies.frontier.command import run_frontier
 
     if options.pop("force"):
         raise UserError("--force: remove the workspace's folder frontier/ to measure everything anew")

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from ..errors import UserError
+from ..core.errors import UserError
 
 
 @click.command()
@@ -21,10 +21,10 @@ def status(workspace: str | None, as_json: bool) -> None:
       dnrpipe status
       dnrpipe status --json
     """
-    from .. import stages
-    from ..console import clock
-    from ..session import resolve_settings
-    from ..workspace import Workspace, find_workspace
+    from ..core.console import clock
+    from ..core.workspace import Workspace, find_workspace
+    from ..stages import pipeline as stages
+    from ..stages.session import resolve_settings
 
     found = Workspace.open(find_workspace(workspace))
     rows = stages.status(found, resolve_settings(found, {}, None))
@@ -52,8 +52,8 @@ def costs(workspace: str | None, as_json: bool) -> None:
       dnrpipe costs
       dnrpipe costs --json | jq .
     """
-    from ..costs import summarise
-    from ..workspace import Workspace, find_workspace
+    from ..core.ledger import summarise
+    from ..core.workspace import Workspace, find_workspace
 
     found = Workspace.open(find_workspace(workspace))
     prepared = found.manifest.stages.get("prepare")
@@ -68,7 +68,7 @@ def costs(workspace: str | None, as_json: bool) -> None:
 
 
 def _costs_table(summary: dict[str, Any]) -> str:
-    from ..console import clock
+    from ..core.console import clock
 
     lines = [f"{'stage':10} {'for':12} {'units':>6} {'wall':>8} {'cpu':>8}"]
     for stage, purposes in summary["by_stage_and_purpose"].items():
@@ -100,7 +100,7 @@ def doctor(as_json: bool) -> None:
       dnrpipe doctor
       dnrpipe doctor --json
     """
-    from ..doctor import examine
+    from .doctor import examine
 
     checks = examine()
     if as_json:

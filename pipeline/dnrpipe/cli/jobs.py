@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import UserError
+from ..core.errors import UserError
 from .options import options as with_options
 
 if TYPE_CHECKING:
-    from ..console import Bar, Console
+    from ..core.console import Bar, Console
     from ..service.client import Client
     from ..service.models import Job
 
@@ -84,7 +84,7 @@ def submit(
     """
     import pydantic
 
-    from ..console import Console
+    from ..core.console import Console
     from ..service.models import JobRequest, Limits
 
     console = Console(json_mode=as_json)

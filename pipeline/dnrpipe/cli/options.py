@@ -10,11 +10,11 @@ import click
 
 from dnrtrain.selector.names import ALIASES, NAMES
 
-from ..errors import UserError
+from ..core.errors import UserError
 
 if TYPE_CHECKING:
-    from ..session import Session
-    from ..settings import Settings
+    from ..core.settings import Settings
+    from ..stages.session import Session
 
 SAMPLES_AT_ONCE = 8
 """The least that is traced towards a target: schedule.STEP, which is not imported for --help."""
@@ -97,7 +97,7 @@ def open_session(
     late: Callable[[Settings], dict[str, Any]] | None = None,
 ) -> Session:
     """The command's hold on its workspace. ``late``: overrides that depend on the settings as they are."""
-    from ..session import Session
+    from ..stages.session import Session
 
     return Session(command, options, scene, overrides or {}, late)
 
@@ -106,14 +106,14 @@ def camera_overrides(options: dict[str, Any]) -> dict[str, Any]:
     cameras: dict[str, Any] = {}
     source = options.pop("cameras")
     if source is not None:
-        from ..cameras import KEYWORDS
+        from ..core.cameras import KEYWORDS
 
         if source not in KEYWORDS and not Path(source).is_file():
             raise UserError(f"--cameras {source}: neither {', '.join(KEYWORDS)} nor a camera file")
         if source in KEYWORDS:
             cameras |= {"source": source, "source_sha256": ""}
         else:
-            from ..workspace import file_sha256
+            from ..core.workspace import file_sha256
 
             cameras |= {"source": str(Path(source).resolve()), "source_sha256": file_sha256(Path(source))}
     views, resolution, raster = options.pop("views"), options.pop("resolution"), options.pop("raster")
@@ -139,7 +139,7 @@ def select_overrides(options: dict[str, Any]) -> dict[str, Any]:
 
 def tracing_overrides(noise: str | None, time: str | None, spp: int | None, denoise: str | None) -> dict[str, Any]:
     """How far views are traced. Flags name one wish together: what they leave out of it is forgotten."""
-    from ..amounts import parse_seconds, parse_share
+    from ..core.units import parse_seconds, parse_share
 
     raytrace: dict[str, Any] = {}
     if noise is not None or time is not None:

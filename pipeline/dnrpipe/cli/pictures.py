@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import UserError
+from ..core.errors import UserError
 from .options import common, open_session
+
+if TYPE_CHECKING:
+    from ..stages.session import Session
 
 
 @click.command()
@@ -41,7 +44,7 @@ def render(
     if orbit is not None and camera_file is not None:
         raise UserError("render: give --orbit or --cameras, not both")
     with open_session("render", options) as session:
-        session.render(orbit or 60, elevation, camera_file, frames, movie, resolution)
+        _render(session, orbit or 60, elevation, camera_file, frames, movie, resolution)
 
 
 @click.command()
@@ -55,4 +58,47 @@ def report(**options: Any) -> None:
       dnrpipe report -w scene.dnr --json
     """
     with open_session("report", options) as session:
-        session.report()
+        write_report(session)
+
+
+def _render(
+    session: Session,
+    orbit: int,
+    elevation: float,
+    camera_file: Path | None,
+    frames: str,
+    movie: str,
+    resolution: int | None,
+) -> None:
+    from dnrtrain.contract import parse_transforms
+
+    from ..core.cameras import orbit_views
+    from ..core.scene_files import read_summary
+    from ..stages.pipeline import STAGES, require_inputs
+    from ..stages.render import render_novel
+
+    require_inputs(STAGES["evaluate"], session.workspace, session.settings)
+    cameras = session.settings.cameras
+    if camera_file is not None:
+        views = parse_transforms(camera_file, (cameras.width, cameras.height))
+        name = camera_file.stem
+    else:
+        if resolution is not None:
+            cameras = cameras.model_copy(update={"width": resolution, "height": resolution})
+        views = orbit_views(read_summary(session.workspace), cameras, orbit, elevation)
+        name = f"orbit-{orbit}"
+    console = session.console
+    answer = render_novel(session.workspace, session.settings, console, views, name=name, frames=frames, movie=movie)
+    console.say(f"{answer['frames']} frames, {answer['neural_ms']:.1f} ms each for the network")
+    console.say(answer["movie"] or answer["folder"])
+    console.result(answer)
+
+
+def write_report(session: Session) -> None:
+    """Write the report of the session's workspace; the answers of its stages go into ``--json``."""
+    from ..report import build_report
+
+    root = session.workspace.root
+    path = build_report(root)
+    session.console.say(f"report: {path}")
+    session.console.result({"workspace": str(root), **session.answers, "report": str(path)})

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from ..errors import UserError
+from ..core.errors import UserError
 from .options import CAMERA_OPTIONS, STRICT, amount, camera_overrides, common, open_session, options, strict_override
 
 
@@ -47,12 +47,12 @@ def plan(
         raise UserError(f"--frames {frames}: at least 1")
     if carry_out and duration is None and target_psnr is None:
         raise UserError("--apply: what shall be carried out? give --time or --target-psnr")
-    from ..amounts import parse_seconds
-    from ..planning.carry_out import apply
-    from ..planning.command import Wanted, make_plan
-    from ..planning.pilot import pilot_path
-    from ..planning.words import actual_lines, lines
-    from ..tasks import worker_count
+    from ..core.units import parse_seconds
+    from ..studies.planning.carry_out import apply
+    from ..studies.planning.command import Wanted, make_plan
+    from ..studies.planning.pilot import pilot_path
+    from ..studies.planning.words import actual_lines, lines
+    from ..workers.view_tasks import worker_count
 
     wanted = Wanted(amount("--time", duration, parse_seconds), target_psnr, frames)
     if scene is not None and (scene / "manifest.json").exists():

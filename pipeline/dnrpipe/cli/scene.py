@@ -27,7 +27,7 @@ def inspect(scene: Path, as_json: bool) -> None:
       dnrpipe inspect scene.blend
       dnrpipe inspect scene.blend --json | jq .findings.ignored
     """
-    from ..inspection import describe, inspect_scene
+    from ..stages.inspect_scene import describe, inspect_scene
 
     found = inspect_scene(scene)
     click.echo(json.dumps(found, indent=2) if as_json else describe(found))
@@ -60,7 +60,7 @@ def effects(
       dnrpipe effects --auto caustics
       dnrpipe effects --json | jq '.effects[] | select(.on) | .name'
     """
-    from ..effects.command import override_settings, show_effects
+    from ..studies.effect_costs import override_settings, show_effects
 
     with open_session("effects", options, late=override_settings(enable, disable, auto)) as session:
         show_effects(session, measure=measure)

@@ -19,6 +19,7 @@ from .options import (
     strict_override,
     tracing_overrides,
 )
+from .pictures import write_report
 
 
 @click.command()
@@ -144,10 +145,10 @@ def run(scene: Path | None, strict: bool, **options: Any) -> None:
       dnrpipe run scene.blend --budget 25
       dnrpipe run scene.blend --preset paper
     """
-    from ..settings import merge
+    from ..core.settings import merge
 
     overrides = merge(camera_overrides(options), select_overrides(options))
     overrides |= strict_override(strict)
     with open_session("run", options, scene=scene, overrides=overrides) as session:
         session.stages("prepare", "select", "raytrace", "finetune", "evaluate")
-        session.report()
+        write_report(session)

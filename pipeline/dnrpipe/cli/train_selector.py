@@ -29,8 +29,8 @@ def train_selector(as_json: bool, quiet: bool, **options: Any) -> None:
       dnrpipe train-selector scenes/*.dnr --leave-out interior --out without-interior.safetensors
       dnrpipe select --policy dqn --set select.weights=without-interior.safetensors -w interior.dnr
     """
-    from ..console import Console
-    from ..learning import train_weights
+    from ..core.console import Console
+    from ..stages.learning import train_weights
 
     console = Console(json_mode=as_json, quiet=quiet)
     made = train_weights(console=console, **options)

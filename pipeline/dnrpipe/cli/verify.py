@@ -25,10 +25,10 @@ def verify(workspace: str | None, named: str | None, repair: bool, as_json: bool
       dnrpipe verify scene.dnr --repair
       dnrpipe verify --json | jq .faults
     """
-    from ..console import Console
-    from ..verify import examine
-    from ..verify import repair as discard_damaged
-    from ..workspace import Workspace, find_workspace, locked
+    from ..core.console import Console
+    from ..core.workspace import Workspace, find_workspace, locked
+    from ..stages.verify import examine
+    from ..stages.verify import repair as discard_damaged
 
     console = Console(json_mode=as_json)
     root = find_workspace(named or workspace)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from dnrtrain.atomic import write_text
 
-from ..errors import UserError
+from ..core.errors import UserError
 
 LAMP_PREFIX = "light-"
 ENVIRONMENTS = {"envmap", "constant", "sunsky", "sky"}

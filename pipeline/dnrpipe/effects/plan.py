@@ -8,90 +8,19 @@ that a measurement (see :mod:`.statistics`), handed in as a :class:`DepthPilot`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from pydantic import Field
 
 from dnrtrain.settings import ModelSettings, Strict
 
+from ..core.effect_names import FORCEABLE, LAMPS, NAMES, NEURAL, REMOVABLE, TITLES, EffectName
+from ..raytrace.statistics import REFERENCE_DEPTH, DepthStep, Measured
 from .evidence import NOTHING, Evidence, gather
 
-EffectName = Literal[
-    "indirect",
-    "refraction",
-    "caustics",
-    "volumes",
-    "subsurface",
-    "alpha",
-    "environment",
-    "area-lights",
-    "point-lights",
-    "glow",
-    "hair",
-    "depth-of-field",
-    "spectral",
-    "motion",
-    "view-dependence",
-    "depth",
-    "normal",
-]
-NAMES: tuple[EffectName, ...] = get_args(EffectName)
-TITLES: dict[EffectName, str] = {
-    "indirect": "indirect light",
-    "refraction": "refraction",
-    "caustics": "caustics",
-    "volumes": "volumes",
-    "subsurface": "subsurface",
-    "alpha": "alpha masks",
-    "environment": "environment light",
-    "area-lights": "area lights",
-    "point-lights": "point, spot and sun lights",
-    "glow": "glowing surfaces",
-    "hair": "hair strands",
-    "depth-of-field": "depth of field",
-    "spectral": "spectral rendering",
-    "motion": "motion blur",
-    "view-dependence": "spherical harmonics of the view",
-    "depth": "texture by depth",
-    "normal": "texture by normal",
-}
-NEURAL: frozenset[str] = frozenset({"view-dependence", "depth", "normal"})
-FORCEABLE: frozenset[str] = NEURAL | {"indirect", "volumes", "spectral"}
-"""Effects that can be simulated where nothing calls for them; the others need something in the scene."""
-REMOVABLE: frozenset[str] = frozenset(
-    {
-        "refraction",
-        "subsurface",
-        "alpha",
-        "environment",
-        "area-lights",
-        "point-lights",
-        "glow",
-        "hair",
-    }
-)
-"""Effects that are left out by editing the bundle (:mod:`.bundle`)."""
-LAMPS: tuple[EffectName, ...] = ("area-lights", "point-lights", "glow")
-REFERENCE_DEPTH = 64
 DIRECT_DEPTH = 2
 
 Integrator = Literal["direct", "path", "path-without-caustics", "volpath"]
-
-
-class Measured(Strict):
-    """A mean over views and half the width of its 95% confidence interval."""
-
-    mean: float
-    half_width: float
-
-
-class DepthStep(Strict):
-    """What paths cut at ``depth`` leave out, as shares of the mean radiance (see :mod:`.statistics`)."""
-
-    depth: int
-    mean: float
-    mean_error: float
-    pixel: float
 
 
 class DepthPilot(Strict):

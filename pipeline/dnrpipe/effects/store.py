@@ -11,17 +11,19 @@ from pydantic import ValidationError
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import read_cameras
 
-from ..cameras import scaled_to, view_lenses
-from ..console import Console
-from ..costs import CostRecord
-from ..errors import UserError
-from ..executors import Retry, run_tasks
+from ..core.cameras import scaled_to, view_lenses
+from ..core.console import Console
+from ..core.effect_names import EffectName
+from ..core.errors import UserError
+from ..core.ledger import CostRecord
+from ..core.scene_files import read_json, read_summary, scene_fingerprint
+from ..core.settings import Settings
+from ..core.workspace import Workspace, digest
+from ..raytrace.statistics import REFERENCE_DEPTH, Measured
 from ..raytrace.variants import VariantChoice, choose_variant
-from ..scene_files import read_json, read_summary, scene_fingerprint
-from ..settings import Settings
-from ..workspace import Workspace, digest
+from ..workers.processes import Retry, run_tasks
 from .bundle import bundle_facts, write_without
-from .plan import REFERENCE_DEPTH, DepthPilot, EffectName, EffectPlan, Measured, plan_effects
+from .plan import DepthPilot, EffectPlan, plan_effects
 
 PILOT_VERSION = 1
 PILOT_VIEWS = 4

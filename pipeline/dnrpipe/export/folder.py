@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dnrtrain.atomic import write_text
 
-from ..errors import UserError
+from ..core.errors import UserError
 
 MARKER = ".dnrpipe-export"
 """Lists the files of the last export, one a line. Not JSON: instant-ngp reads every ``*.json`` of a folder."""

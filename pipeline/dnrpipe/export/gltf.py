@@ -19,9 +19,9 @@ import numpy as np
 from dnrtrain.atomic import atomic_path
 
 from .. import __version__
-from ..console import Console
-from ..errors import UserError
-from ..workspace import Workspace
+from ..core.console import Console
+from ..core.errors import UserError
+from ..core.workspace import Workspace
 from .meshes import BundleMesh, read_meshes
 
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -57,7 +57,7 @@ def light_picture(workspace: Workspace, console: Console) -> np.ndarray:
 
     from dnrtrain.display import DisplayTransform
 
-    from ..scene_files import read_frame
+    from ..core.scene_files import read_frame
     from .surface import surface_maps
 
     radiance = torch.from_numpy(surface_maps(workspace, console).radiance[0, ..., :3].copy()).permute(2, 0, 1)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import UserError
+from ..core.errors import UserError
 
 SKIPPED = ("light-", "unseen-")
 """Shapes whose ids begin so are invisible to the camera: lamps, and what Ray Visibility hides from it."""

@@ -23,12 +23,11 @@ from dnrtrain.atomic import atomic_path, write_json
 from dnrtrain.contract import RASTER_CHANNELS, SceneFrame, View, require_channels
 from dnrtrain.exr import read_exr
 
-from ..console import Console
-from ..errors import UserError
-from ..prepare import split_views
-from ..scene_files import read_frame
-from ..training import read_selection
-from ..workspace import Workspace
+from ..core.console import Console
+from ..core.errors import UserError
+from ..core.scene_files import read_frame, split_views
+from ..core.workspace import Workspace
+from ..stages.trainer import read_selection
 from .folder import claim, finish
 
 POINTS = 100_000

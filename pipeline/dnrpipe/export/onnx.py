@@ -14,12 +14,11 @@ from dnrtrain.contract import View
 from dnrtrain.exr import read_exr
 
 from .. import __version__
-from ..base import RENDERED, base_path
-from ..console import Console
-from ..errors import UserError
-from ..prepare import split_views
-from ..scene_files import read_frame
-from ..workspace import Workspace
+from ..core.console import Console
+from ..core.errors import UserError
+from ..core.scene_files import read_frame, split_views
+from ..core.workspace import Workspace
+from ..stages.base_images import RENDERED, base_path
 
 if TYPE_CHECKING:
     from dnrtrain.contract import SceneFrame

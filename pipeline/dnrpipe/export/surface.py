@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..console import Console
-from ..errors import UserError
-from ..executors import Retry, run_tasks
+from ..core.console import Console
+from ..core.errors import UserError
+from ..core.workspace import Workspace
 from ..raytrace.variants import choose_variant
-from ..workspace import Workspace
+from ..workers.processes import Retry, run_tasks
 
 SAMPLES = 16
 """Points per texel."""

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from dnrtrain.atomic import atomic_path, write_text
 
-from ..errors import UserError
+from ..core.errors import UserError
 
 VERSION = "1.30.0"
 SHA256 = "d2228df7e4616bc3348bf504ee888f3bec43789a273f0a63f3e68d203ce3bf71"

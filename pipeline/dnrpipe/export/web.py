@@ -24,11 +24,11 @@ from dnrtrain.atomic import atomic_path, write_json, write_text
 from dnrtrain.contract import View
 
 from .. import __version__
-from ..console import Console
-from ..scene_files import read_frame, read_json
-from ..session import resolve_settings
-from ..training import read_selection
-from ..workspace import Workspace
+from ..core.console import Console
+from ..core.scene_files import read_frame, read_json
+from ..core.workspace import Workspace
+from ..stages.session import resolve_settings
+from ..stages.trainer import read_selection
 from .browser import require_chromium
 from .folder import claim, finish
 from .gltf import glb

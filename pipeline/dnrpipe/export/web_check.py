@@ -12,7 +12,7 @@ import numpy as np
 
 from dnrtrain.contract import View
 
-from ..console import Console
+from ..core.console import Console
 from .browser import open_page, wait_for
 
 if TYPE_CHECKING:

@@ -18,11 +18,11 @@ from dnrtrain.contract import View
 from dnrtrain.events import EpochEnd, Note
 from dnrtrain.settings import ModelSettings, Step2Settings
 
-from ..console import Console
-from ..scene_files import read_frame
-from ..settings import PRESETS, Settings
-from ..training import epochs_done, load, perceptual_weights, torch_device
-from ..workspace import Workspace, digest
+from ..core.console import Console
+from ..core.scene_files import read_frame
+from ..core.settings import PRESETS, Settings
+from ..core.workspace import Workspace, digest
+from ..stages.trainer import epochs_done, load, perceptual_weights, torch_device
 from .surface import SurfaceMaps
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dnrpipe.errors import UserError
+from dnrpipe.core.errors import UserError
 from dnrtrain.contract import View
 from dnrtrain.exr import write_exr
 

@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from dnrpipe.errors import UserError
+from dnrpipe.core.errors import UserError
 
 Quality = Literal["high", "balanced", "fast"]
 QUALITIES: tuple[Quality, ...] = ("high", "balanced", "fast")

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from dnrpipe.errors import UserError
+from dnrpipe.core.errors import UserError
 from dnrtrain.contract import View
 
 from .auxiliary import shown_first

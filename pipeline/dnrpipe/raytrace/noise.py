@@ -1,7 +1,7 @@
 """How noisy a path-traced picture is, from the picture's own samples, and how sure that is. numpy only.
 
 Notation
-    f        linear RGBA -> sRGB over white (:func:`dnrpipe.effects.statistics.display`): where noise is measured
+    f        linear RGBA -> sRGB over white (:func:`dnrpipe.raytrace.statistics.display`): where noise is measured
     X_k      means of G disjoint groups of samples, equally many in each, independent of each other; M their mean
     M_-k     the mean of all groups but the k-th
     v        jackknife estimate of Var f(M) at a pixel: (G-1)/G sum_k (f(M_-k) - mean_j f(M_-j))²
@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dnrpipe.effects.statistics import display
+from dnrpipe.raytrace.statistics import display
 
 GROUPS = 8
 

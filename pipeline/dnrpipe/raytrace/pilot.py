@@ -8,8 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from dnrpipe.effects.plan import REFERENCE_DEPTH, DepthStep
-from dnrpipe.effects.statistics import cost, difference, display, enough, remaining, significance
+from dnrpipe.raytrace.statistics import (
+    REFERENCE_DEPTH,
+    DepthStep,
+    cost,
+    difference,
+    display,
+    enough,
+    remaining,
+    significance,
+)
 from dnrtrain.contract import View
 
 from .engine import Engine

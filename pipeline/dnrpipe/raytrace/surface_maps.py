@@ -1,7 +1,7 @@
 """What the scene's surfaces are, over the atlas: diffuse reflectance, emission, opacity, geometric normal.
 
-A worker (see :mod:`dnrpipe.executors`). Together with the light map this is all that a rasteriser needs to show the
-scene's diffuse light: radiance = albedo · light + emission (:mod:`.base` says the same of rays).
+A worker (see `dnrpipe.workers.processes`). Together with the light map this is all that a rasteriser needs to show
+the scene's diffuse light: radiance = albedo · light + emission (:mod:`.base` says the same of rays).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from dnrpipe.errors import UserError
+from dnrpipe.core.errors import UserError
 from dnrtrain.atomic import atomic_path
 
 from .denoise import filled

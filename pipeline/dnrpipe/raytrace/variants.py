@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from ..errors import UserError
+from ..core.errors import UserError
 
 ORDER = ("cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
 PROBE_TIMEOUT = 120.0

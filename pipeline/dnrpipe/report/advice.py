@@ -9,9 +9,9 @@ from typing import Any
 
 from dnrtrain.contract import View
 
+from ..core.units import duration, several
 from .data import Missing, Quality, Selection, Training
 from .quality import perceptual_note
-from .words import duration, several
 
 
 def missing(

@@ -14,20 +14,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dnrtrain.contract import ContractError, SceneFrame, View, read_cameras
 
-from .. import costs
-from ..errors import UserError
+from ..core.errors import UserError
+from ..core.ledger import CostRecord, Ledger, break_even_frames, summarise, traced_views, upfront_seconds
 from .advice import missing, notes
 from .budget import build_budget
 from .coverage import coverage_maps
-from .data import (
-    ChosenView,
-    FindingGroup,
-    ReportData,
-    Selection,
-    Sphere,
-    SphereView,
-    Training,
-)
+from .data import ChosenView, FindingGroup, ReportData, Selection, Sphere, SphereView, Training
 from .pictures import ExrPictures
 from .quality import Metrics, build_quality
 from .words import verdict
@@ -83,7 +75,7 @@ class _Checkpoint(BaseModel):
 class Outline(BaseModel):
     """What a workspace holds, without pictures: quick enough to ask for while a stage runs.
 
-    psnr: dB by test view, in the order of the evaluation. costs: see :func:`dnrpipe.costs.summarise`.
+    psnr: dB by test view, in the order of the evaluation. costs: see `core.ledger.summarise`.
     """
 
     sphere: Sphere | None
@@ -102,9 +94,7 @@ def outline(root: Path) -> Outline:
         sphere=_sphere(root, views, chosen, metrics),
         training=[t for t in (_training(root, step) for step in (1, 2)) if t],
         psnr={view.name: view.psnr for view in metrics.views} if metrics else {},
-        costs=costs.summarise(
-            costs.Ledger(root / "costs.jsonl").read(), n_candidates=len(views["train"]) or None, only=selected
-        ),
+        costs=summarise(Ledger(root / "costs.jsonl").read(), n_candidates=len(views["train"]) or None, only=selected),
     )
 
 
@@ -121,18 +111,18 @@ def collect(root: Path, *, made_at: datetime | None = None) -> ReportData:
     cameras = {split: _read_views(root, split) for split in ("train", "val", "test")}
     metrics = _read_model(root / "evaluation" / "metrics.json", Metrics, "evaluate")
     chosen = _read_model(root / "selection.json", _Selection, "select")
-    ledger = costs.Ledger(root / "costs.jsonl")
+    ledger = Ledger(root / "costs.jsonl")
     records, torn = ledger.read(), ledger.torn_lines()
 
     selected = {f"train/{name}" for name in chosen.views} if chosen else None
-    summary = costs.summarise(records, n_candidates=len(cameras["train"]) or None, only=selected, torn_lines=torn)
+    summary = summarise(records, n_candidates=len(cameras["train"]) or None, only=selected, torn_lines=torn)
     quality = build_quality(root, metrics, records) if metrics else None
     selection = _selection(root, chosen, records, cameras["train"]) if chosen else None
     training = [t for t in (_training(root, step) for step in (1, 2)) if t]
-    upfront = costs.upfront_seconds(records, selected) if records else None
+    upfront = upfront_seconds(records, selected) if records else None
     break_even = None
     if quality and upfront and quality.traced_seconds and quality.frame_seconds:
-        break_even = costs.break_even_frames(upfront, quality.traced_seconds, quality.frame_seconds)
+        break_even = break_even_frames(upfront, quality.traced_seconds, quality.frame_seconds)
     sizes = {(v.width, v.height) for views in cameras.values() for v in views}
     source = manifest.get("source", {})
     source_name = Path(str(source.get("path", ""))).name or root.stem
@@ -198,15 +188,13 @@ def _read_views(root: Path, split: str) -> list[View]:
         raise UserError(str(error)) from None
 
 
-def _selection(
-    root: Path, chosen: _Selection, records: Sequence[costs.CostRecord], candidates: Sequence[View]
-) -> Selection:
+def _selection(root: Path, chosen: _Selection, records: Sequence[CostRecord], candidates: Sequence[View]) -> Selection:
     frame = _read_model(root / "scene" / "frame.json", SceneFrame, "prepare")
     try:
         exr = ExrPictures(root, frame) if frame else None
     except ContractError as error:
         raise UserError(str(error)) from None
-    booked = {r.name: r for r in costs.traced_views(records, "training")}
+    booked = {r.name: r for r in traced_views(records, "training")}
     views = []
     for order, name in enumerate(chosen.views, start=1):
         record = booked.get(f"train/{name}")

@@ -12,7 +12,7 @@ from PIL import Image, UnidentifiedImageError
 from dnrtrain.contract import RASTER_CHANNELS, ContractError, SceneFrame
 from dnrtrain.exr import read_exr
 
-from ..errors import UserError
+from ..core.errors import UserError
 from .data import Picture
 
 FEATURED_SIDE = 800  # the paper's resolution, pixel for pixel

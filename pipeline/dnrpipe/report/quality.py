@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from ..costs import CostRecord, traced_views
+from ..core.ledger import CostRecord, traced_views
 from .data import MetricRow, Quality, TestView
 from .pictures import FEATURED_SIDE, THUMBNAIL_SIDE, load_png
 

@@ -9,7 +9,8 @@ from importlib import resources
 from jinja2 import DictLoader, Environment, StrictUndefined
 from markupsafe import Markup
 
-from . import charts, words
+from ..core.units import count, duration, several
+from . import charts
 from .data import MetricRow, Quality, ReportData, Selection, Training
 from .quality import METRICS
 from .sphere import AZIMUTH, ELEVATION, sphere_svg
@@ -43,7 +44,7 @@ def render_html(data: ReportData) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(duration=words.duration, count=words.count, several=words.several)
+    environment.filters.update(duration=duration, count=count, several=several)
     script = "".join((files / name).read_text(encoding="utf-8") for name in ("sphere.js", "report.js"))
     script_hash = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     quality, selection = data.quality, data.selection
@@ -129,12 +130,12 @@ def _stage_chart(data: ReportData) -> Markup:
             charts.Segment(
                 f"bar-{purpose}",
                 value["wall_seconds"],
-                f"{stage}, {PURPOSE_NAMES[purpose]}: {words.duration(value['wall_seconds'])}",
+                f"{stage}, {PURPOSE_NAMES[purpose]}: {duration(value['wall_seconds'])}",
             )
             for purpose, value in purposes.items()
         ]
         whole = sum(segment.value for segment in segments)
-        bars.append(charts.Bar(stage, segments, words.duration(whole)))
+        bars.append(charts.Bar(stage, segments, duration(whole)))
     return charts.bar_chart(bars, "Wall seconds per stage")
 
 
@@ -144,22 +145,22 @@ def _tracing_chart(data: ReportData) -> Markup:
         return Markup("")
     chosen = [
         charts.Segment(
-            "bar-training", tracing["actual_seconds"], f"ray tracing: {words.duration(tracing['actual_seconds'])}"
+            "bar-training", tracing["actual_seconds"], f"ray tracing: {duration(tracing['actual_seconds'])}"
         ),
         charts.Segment(
             "bar-choosing",
             tracing["selection_seconds"],
-            f"choosing: {words.duration(tracing['selection_seconds'])}",
+            f"choosing: {duration(tracing['selection_seconds'])}",
         ),
     ]
     everything = charts.Segment(
-        "bar-training", tracing["all_seconds"], f"ray tracing: {words.duration(tracing['all_seconds'])}"
+        "bar-training", tracing["all_seconds"], f"ray tracing: {duration(tracing['all_seconds'])}"
     )
     spent = tracing["actual_seconds"] + tracing["selection_seconds"]
     return charts.bar_chart(
         [
-            charts.Bar(f"{tracing['views']} chosen", chosen, words.duration(spent)),
-            charts.Bar(f"all {tracing['candidates']}", [everything], words.duration(tracing["all_seconds"])),
+            charts.Bar(f"{tracing['views']} chosen", chosen, duration(spent)),
+            charts.Bar(f"all {tracing['candidates']}", [everything], duration(tracing["all_seconds"])),
         ],
         "Ray tracing the chosen views against ray tracing all candidates",
     )
@@ -170,7 +171,7 @@ def _views_chart(selection: Selection) -> Markup:
         charts.Dot(
             label=str(view.order),
             value=view.seconds,
-            title=f"{view.name}: {words.duration(view.seconds)}"
+            title=f"{view.name}: {duration(view.seconds)}"
             + (f" at {view.spp} spp" if view.spp else "")
             + (f", relative error {100 * view.noise:.1f} %" if view.noise is not None else ""),
         )

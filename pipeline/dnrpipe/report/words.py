@@ -2,44 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
+from ..core.units import duration, ratio
 from .data import Quality, Selection
-
-
-def duration(seconds: float) -> str:
-    """``13 ms``, ``2.41 s``, ``48 s``, ``3 min 05 s``, ``2 h 10 min``; a minus sign where negative."""
-    if seconds < 0:
-        return "−" + duration(-seconds)
-    if seconds == 0:
-        return "0 s"
-    if seconds < 0.9995:
-        return f"{seconds * 1000:.3g} ms" if seconds < 0.01 else f"{seconds * 1000:.0f} ms"
-    if seconds < 9.995:
-        return f"{seconds:.2f} s"
-    if seconds < 99.95:
-        return f"{seconds:.1f} s"
-    whole = round(seconds)
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    minutes = round(seconds / 60)
-    return f"{minutes // 60} h {minutes % 60:02d} min"
-
-
-def count(number: int) -> str:
-    """Thousands set apart by thin spaces."""
-    return f"{number:,}".replace(",", "\u2009")
-
-
-def several(numbers: Sequence[int]) -> str:
-    """``64``, ``64, 128``, or from least to most where views have each their own number: ``80 to 664``."""
-    return ", ".join(map(str, numbers)) if len(numbers) <= 3 else f"{min(numbers)} to {max(numbers)}"
-
-
-def ratio(slow: float, fast: float) -> str:
-    """How many times faster, with two significant digits."""
-    value = slow / fast
-    return f"{value:.1f}" if value < 10 else f"{float(f'{value:.2g}'):.0f}"
 
 
 def verdict(quality: Quality | None, selection: Selection | None) -> str:

@@ -13,7 +13,7 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
 from .. import __version__
-from ..errors import UserError
+from ..core.errors import UserError
 from . import routes_jobs, routes_live, routes_server, routes_workspaces
 from .config import LOOPBACK, ServerConfig
 from .guard import Guard

@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 import httpx
 from pydantic import BaseModel, TypeAdapter
 
-from ..errors import UserError
+from ..core.errors import UserError
 from .models import (
     Job,
     JobEvent,

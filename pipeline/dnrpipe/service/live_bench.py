@@ -18,9 +18,9 @@ from typing import Any
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
-from ..console import Console
-from ..errors import UserError
-from ..workspace import SUFFIX
+from ..core.console import Console
+from ..core.errors import UserError
+from ..core.workspace import SUFFIX
 from .guard import SUBPROTOCOL
 from .models import NAME_PATTERN
 from .routes_live import unpack

@@ -1,6 +1,6 @@
 """The frame process: one view at a time, as a picture, in one process that keeps scene, kernels and network.
 
-A worker of :mod:`dnrpipe.executors`. What is shown (``mode``):
+A worker of :mod:`dnrpipe.workers.processes`. What is shown (``mode``):
 
     neural      the neural renderer's picture                 base      what it corrects
     normal, depth, uv, albedo, coverage                       the G-buffer
@@ -20,16 +20,16 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from dnrpipe.errors import UserError
-from dnrpipe.evaluate import flip_error
+from dnrpipe.core.errors import UserError
+from dnrpipe.core.images import flip_error
+from dnrpipe.core.settings import Settings
 from dnrpipe.raytrace.base import BaseRenderer
 from dnrpipe.raytrace.base_worker import Worker as BaseWorker
 from dnrpipe.raytrace.engine import Engine
 from dnrpipe.raytrace.finite import masked, masked_channels
 from dnrpipe.raytrace.frames import Frames
 from dnrpipe.raytrace.light_worker import read_light
-from dnrpipe.settings import Settings
-from dnrpipe.training import torch_device
+from dnrpipe.stages.trainer import torch_device
 from dnrtrain.checkpoint import load_model
 from dnrtrain.contract import RASTER_CHANNELS, SceneFrame, View, require_channels
 from dnrtrain.dataset import view_in_memory

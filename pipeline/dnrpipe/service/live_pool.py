@@ -9,8 +9,8 @@ from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from ..errors import UserError
-from ..executors import MAX_ATTEMPTS, LocalWorker, TaskFailed, WorkerDied
+from ..core.errors import UserError
+from ..workers.processes import MAX_ATTEMPTS, LocalWorker, TaskFailed, WorkerDied
 from .config import ServerConfig
 from .live_pace import Pace
 from .live_scene import LiveRequest, LiveScene, open_scene

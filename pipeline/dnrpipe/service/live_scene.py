@@ -13,15 +13,15 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from dnrtrain.contract import View, read_cameras
 
-from ..base import RENDERED, ready_inputs
-from ..cameras import framing, look_at_view
+from ..core.cameras import framing, look_at_view
+from ..core.errors import UserError
+from ..core.scene_files import read_frame, read_summary
+from ..core.settings import Settings
+from ..core.workspace import Workspace
 from ..effects.store import plan_of, trace_config, variant_for
-from ..errors import UserError
-from ..scene_files import read_frame, read_summary
-from ..session import resolve_settings
-from ..settings import Settings
-from ..training import read_selection
-from ..workspace import Workspace
+from ..stages.base_images import RENDERED, ready_inputs
+from ..stages.session import resolve_settings
+from ..stages.trainer import read_selection
 
 SIZES = (64, 1024)
 STEEPEST = math.radians(89.0)

@@ -88,7 +88,7 @@ class JobPage(_Wire):
 
 
 class JobEvent(_Wire):
-    """One event of a job: those of the event stream (dnrpipe.event_stream), and ``state`` with its new state."""
+    """One event of a job: those of the event stream (dnrpipe.core.event_stream), and ``state`` with its new state."""
 
     id: int
     job: int

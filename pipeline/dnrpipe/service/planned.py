@@ -8,12 +8,12 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from ..costs import total
-from ..errors import UserError
-from ..planning.command import plan_path
-from ..planning.records import Choice, Prediction
-from ..settings import Settings
-from ..workspace import Workspace
+from ..core.errors import UserError
+from ..core.ledger import total
+from ..core.settings import Settings
+from ..core.workspace import Workspace
+from ..studies.planning.command import plan_path
+from ..studies.planning.records import Choice, Prediction
 from .models import PlannedStage, PlanState
 
 UNTIL_THE_RENDERER = ("select", "raytrace", "finetune")

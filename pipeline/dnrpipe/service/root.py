@@ -13,8 +13,8 @@ import contextlib
 import re
 from pathlib import Path
 
-from ..errors import UserError
-from ..workspace import SUFFIX
+from ..core.errors import UserError
+from ..core.workspace import SUFFIX
 from .models import NAME_PATTERN, SCENE_PATTERN
 
 

@@ -11,8 +11,8 @@ from fastapi import APIRouter, Header, HTTPException, Path, Query
 from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
-from ..errors import UserError
-from ..settings import merge, parse_assignment, resolve
+from ..core.errors import UserError
+from ..core.settings import merge, parse_assignment, resolve
 from .models import FINAL, TAKES_SCENE, Job, JobEvent, JobPage, JobRequest, LogPage, Name, Problem, State
 from .queue import QueueFull, WrongState
 from .root import UnknownName
@@ -206,7 +206,7 @@ def check_request(request: JobRequest, service: Service) -> None:
         text = value if isinstance(value, str) else json.dumps(value)
         overrides = merge(overrides, parse_assignment(f"{key}={text}"))
     settings = resolve(request.preset, overrides, environment={})
-    from ..cameras import KEYWORDS
+    from ..core.cameras import KEYWORDS
 
     if settings.cameras.source not in KEYWORDS:
         raise HTTPException(422, f"settings: cameras.source must be one of {', '.join(KEYWORDS)} on a server")

@@ -22,7 +22,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, HTTPException, Path, WebSocket, WebSocketDisconnect
 from pydantic import ValidationError
 
-from ..errors import UserError
+from ..core.errors import UserError
 from .guard import SUBPROTOCOL
 from .live_pool import MOST_SPP, LiveSession
 from .live_scene import LiveRequest

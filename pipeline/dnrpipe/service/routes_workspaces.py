@@ -13,12 +13,12 @@ from fastapi.responses import FileResponse
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
-from ..errors import UserError
+from ..core.errors import UserError
+from ..core.workspace import Workspace
 from ..report.collect import outline
 from ..report.sphere import AZIMUTH, ELEVATION, sphere_svg
-from ..session import resolve_settings
-from ..stages import status
-from ..workspace import Workspace
+from ..stages.pipeline import status
+from ..stages.session import resolve_settings
 from .models import (
     NAME_PATTERN,
     SCENE_PATTERN,

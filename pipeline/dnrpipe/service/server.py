@@ -14,7 +14,7 @@ from typing import Any
 import uvicorn
 from filelock import FileLock, Timeout
 
-from ..errors import UserError
+from ..core.errors import UserError
 from .app import create_app
 from .config import ServerConfig
 from .live_pool import LivePool

@@ -6,7 +6,7 @@ import re
 import stat
 from pathlib import Path
 
-from ..errors import UserError
+from ..core.errors import UserError
 
 PATTERN = r"[A-Za-z0-9_-]{16,256}"
 

@@ -20,11 +20,11 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from ..errors import UserError
-from ..event_stream import VARIABLE
-from ..executors import die_with_parent
-from ..patience import TIMEOUT_VARIABLE
-from ..workspace import LOCK_FILES
+from ..core.errors import UserError
+from ..core.event_stream import VARIABLE
+from ..core.workspace import LOCK_FILES
+from ..workers.processes import die_with_parent
+from ..workers.timeouts import TIMEOUT_VARIABLE
 from .config import ServerConfig, tightest
 from .models import Job, Limits
 from .processes import end_group, folder_mb, session_memory_mb

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import bpy
 import numpy as np
 
-from dnrpipe.errors import UserError
+from dnrpipe.core.errors import UserError
 
 from ..findings import Findings
 from .frozen import FrozenMesh

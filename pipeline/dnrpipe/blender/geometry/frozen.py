@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from dnrpipe.errors import UserError
+from dnrpipe.core.errors import UserError
 from dnrtrain.atomic import atomic_path
 from dnrtrain.contract import NPZ_ERRORS
 

@@ -9,7 +9,7 @@ import subprocess
 import sys
 from typing import Any
 
-from dnrpipe.errors import UserError
+from dnrpipe.core.errors import UserError
 
 ENGINES = ("eevee", "workbench", "cycles-direct")
 TIMEOUT = 120.0  # seconds

@@ -8,7 +8,7 @@ from typing import Any
 
 import bpy
 
-from dnrpipe.errors import UserError
+from dnrpipe.core.errors import UserError
 from dnrtrain.contract import View
 
 from ..reading.opening import open_blend

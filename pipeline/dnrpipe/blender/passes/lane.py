@@ -19,8 +19,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Literal
 
-from dnrpipe.errors import UserError
-from dnrpipe.executors import die_with_parent
+from dnrpipe.core.errors import UserError
+from dnrpipe.workers.processes import die_with_parent
 from dnrtrain.contract import View
 
 Kind = Literal["gbuffer", "coverage", "raster"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from dnrpipe.errors import UserError
+from dnrpipe.core.errors import UserError
 
 from ..geometry.freeze import render_layer
 from .rendering import output_exr

@@ -9,7 +9,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from dnrpipe.errors import UserError
+from dnrpipe.core.errors import UserError
 
 from ..findings import Findings
 from ..geometry.freeze import Frozen

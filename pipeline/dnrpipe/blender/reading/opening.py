@@ -8,7 +8,7 @@ from pathlib import Path
 
 import bpy
 
-from dnrpipe.errors import NothingVisible, UserError
+from dnrpipe.core.errors import NothingVisible, UserError
 
 from .mending import mend_shaders
 from .missing import missing_files, missing_warnings, strict_refusal

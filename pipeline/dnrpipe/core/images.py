@@ -1,0 +1,31 @@
+"""Display-space pictures: write them, compare them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from dnrtrain.atomic import atomic_path
+
+
+def flip_error(truth: np.ndarray, prediction: np.ndarray) -> tuple[float, np.ndarray]:
+    """Mean LDR-FLIP and its heat map [H, W, 3] (magma) of two display-space images [H, W, 3] in [0, 1].
+
+    NVIDIA's flip-evaluator at its default 67 pixels per degree.
+    """
+    import flip_evaluator
+
+    heat, mean, _ = flip_evaluator.evaluate(
+        np.ascontiguousarray(truth, np.float32), np.ascontiguousarray(prediction, np.float32), "LDR"
+    )
+    return float(mean), np.asarray(heat)
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    """Write display-space [H, W, 3] in [0, 1] as 8-bit PNG, atomically."""
+    from PIL import Image
+
+    data = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
+    with atomic_path(path) as temporary:
+        Image.fromarray(data).save(temporary)

@@ -1,0 +1,80 @@
+"""Read ``scene/``: summary, frame, and the fingerprint of what the scene was converted from."""
+
+from __future__ import annotations
+
+import functools
+import json
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from dnrtrain.contract import SPLITS, DamagedFile, SceneFrame, View, read_cameras
+
+from .errors import UserError
+from .workspace import Workspace, digest, file_sha256
+
+SCENE_VERSION = 6  # raise when the conversion or the G-buffer scene changes what it writes
+
+
+def read_json(path: Path) -> Any:
+    """JSON that an earlier stage wrote. Raises UserError when it is missing, DamagedFile when it does not read."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UserError(f"{path}: is missing; run `dnrpipe prepare --force`") from None
+    except (ValueError, RecursionError) as error:
+        raise DamagedFile(path, str(error)) from None
+
+
+def read_summary(workspace: Workspace) -> dict[str, Any]:
+    """``scene/summary.json``: bounds, cameras, counts, external files."""
+    return read_json(workspace.scene / "summary.json")
+
+
+def read_frame(workspace: Workspace) -> SceneFrame:
+    """``scene/frame.json``. Raises UserError when it is missing, DamagedFile when it does not read."""
+    path = workspace.scene / "frame.json"
+    try:
+        return SceneFrame.model_validate(read_json(path))
+    except ValidationError as error:
+        raise DamagedFile(path, error.errors()[0]["msg"]) from None
+
+
+def scene_fingerprint(workspace: Workspace) -> str:
+    """Hash of what the scene is converted from: the scene file and the files it refers to.
+
+    A file that is gone counts as it was: a workspace lives without its sources. A damaged summary counts as none.
+    """
+    summary = workspace.scene / "summary.json"
+    try:
+        content = read_json(summary) if summary.exists() else {}
+    except DamagedFile:
+        content = {}
+    recorded: dict[str, str] = content.get("external", {})
+    current = {name: _sha256_now(Path(name)) if Path(name).is_file() else sha for name, sha in recorded.items()}
+    # Without their folders: moving a scene with its textures changes nothing.
+    files = sorted((Path(name).name, sha) for name, sha in current.items())
+    return digest([SCENE_VERSION, workspace.manifest.source.sha256, files, content.get("bake_size")])
+
+
+def _sha256_now(path: Path) -> str:
+    """Hash of the file as it is; one command asks many times, so it is read again only when it changed."""
+    stat = path.stat()
+    return _sha256_cached(path, stat.st_mtime_ns, stat.st_size)
+
+
+@functools.lru_cache(maxsize=1024)
+def _sha256_cached(path: Path, modified_ns: int, size: int) -> str:
+    del modified_ns, size  # part of the key only
+    return file_sha256(path)
+
+
+def split_views(workspace: Workspace) -> dict[str, list[View]]:
+    """The views of each split, as `prepare` placed them."""
+    return {split: read_cameras(workspace.cameras(split)) for split in SPLITS if workspace.cameras(split).exists()}
+
+
+def has_test_views(workspace: Workspace) -> bool:
+    """Whether there is anything to evaluate on."""
+    return bool(split_views(workspace).get("test"))

@@ -1,0 +1,338 @@
+"""Settings: one nested model per stage; presets; dnrpipe.toml < environment < flags.
+
+Flags are remembered in the workspace, so `dnrpipe select --budget 25` still holds when
+`dnrpipe report` runs. Unknown keys are errors that name the key and its neighbours.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import tomllib
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError, field_validator
+
+from dnrtrain.selector.names import TRAINED_NAMES, PolicyName, full_name
+from dnrtrain.settings import ActiveSettings, LossWeights, ModelSettings, Step1Settings, Step2Settings, Strict
+
+from .effect_names import EffectName
+from .errors import UserError
+from .units import parse_seconds, parse_share
+
+ENVIRONMENT_PREFIX = "DNRPIPE_"
+ENVIRONMENT_OTHER = {
+    *("DNRPIPE_WORKSPACE", "DNRPIPE_CACHE", "DNRPIPE_EVENTS"),
+    *("DNRPIPE_SERVER", "DNRPIPE_TOKEN_FILE", "DNRPIPE_TASK_TIMEOUT"),
+}
+"""Variables that are no settings."""
+
+
+class CameraSettings(Strict):
+    """Which views exist."""
+
+    source: str = Field(
+        default="auto", description="auto (= dome), dome, sphere, scene, animation, or a transforms.json"
+    )
+    source_sha256: str = Field(default="", description="set by --cameras FILE, so that a changed file is noticed")
+    train: int = Field(default=100, ge=1, le=100_000, description="candidate views")
+    val: int = Field(default=100, ge=0, le=100_000)
+    test: int = Field(default=200, ge=0, le=100_000)
+    width: int = Field(default=800, ge=8, le=16384)
+    height: int = Field(default=800, ge=8, le=16384)
+    distance: float = Field(default=1.0, gt=0, description="1 = the bounding sphere just fits the frame")
+    seed: int = Field(default=0, ge=0)
+
+
+class PassSettings(Strict):
+    """Rasterised colour and G-buffers."""
+
+    raster: Literal["auto", "eevee", "workbench", "cycles-direct"] = "auto"
+    raster_samples: int = Field(default=4, ge=1, le=4096)
+    coverage_samples: int = Field(default=64, ge=1, le=4096, description="samples of the coverage pass")
+    bake_size: int = Field(
+        default=2048, ge=64, le=16384, description="texels of the side of the atlas that procedural textures bake into"
+    )
+    workers: int = Field(default=0, ge=0, description="0 = one per core")
+
+
+class RaytraceSettings(Strict):
+    """Path tracing with Mitsuba."""
+
+    spp: int = Field(
+        default=256, ge=1, le=1_000_000, description="samples per pixel, where neither noise nor time is set"
+    )
+    noise: float | None = Field(
+        default=None, gt=0, lt=1, description="trace each view until its relative RMSE in display space is this: 1%"
+    )
+    time: float | None = Field(
+        default=None, gt=0, description="seconds (90s, 10m) for all views together; shared so that noise is least"
+    )
+    max_spp: int = Field(
+        default=16384, ge=8, le=1_000_000, description="samples per pixel at most, where noise or time is the target"
+    )
+    evaluation_spp: int = Field(
+        default=512, ge=1, le=1_000_000, description="samples of held-out references, without evaluation_noise"
+    )
+    evaluation_noise: float | None = Field(
+        default=None, gt=0, lt=1, description="trace held-out references until their noise is this"
+    )
+    max_depth: Annotated[int, Field(ge=1, le=10_000)] | Literal["auto"] = Field(
+        default="auto", description="path vertices, 2 = direct light; auto: as deep as the scene needs, by a pilot"
+    )
+    variant: Literal["auto", "cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb"] = "auto"
+    denoise: bool = Field(default=False, description="denoise the views that are trained on (Open Image Denoise)")
+    evaluation_denoise: bool = Field(default=False, description="denoise the held-out references")
+    seed: int = Field(default=0, ge=0)
+    workers: int = Field(default=0, ge=0, description="0 = one per core")
+
+    @field_validator("noise", "evaluation_noise", mode="before")
+    @classmethod
+    def _share(cls, value: Any) -> Any:
+        return parse_share(value) if isinstance(value, str) else value
+
+    @field_validator("time", mode="before")
+    @classmethod
+    def _seconds(cls, value: Any) -> Any:
+        return parse_seconds(value) if isinstance(value, str) else value
+
+
+class BaseSettings(Strict):
+    """The image that the network corrects, where `model.base` is rendered (baked, direct, path)."""
+
+    light_size: Annotated[int, Field(ge=16, le=16384)] | Literal["auto"] = Field(
+        default="auto", description="texels of the baked light's side; auto: about one a pixel"
+    )
+    light_spp: Annotated[int, Field(ge=1, le=1_000_000)] | Literal["auto"] = Field(
+        default="auto", description="paths per texel of the baked light; auto: 128 up to 512 texels a side, then fewer"
+    )
+    samples: int = Field(default=8, ge=1, le=64, description="rays per pixel of a base image")
+    denoise: bool = Field(
+        default=False, description="take the grain off base images of kind baked; the network does it as well"
+    )
+    spp: int = Field(default=4, ge=1, le=1_000_000, description="path-traced samples of the kinds direct and path")
+
+
+class EffectSettings(Strict):
+    """Which effects are simulated where the plan (`dnrpipe effects`) decides otherwise, and how deep paths go."""
+
+    enable: tuple[EffectName, ...] = Field(
+        default=(), description="effects to simulate although nothing calls for them"
+    )
+    disable: tuple[EffectName, ...] = Field(default=(), description="effects to leave out; wins over enable")
+    tolerance: float = Field(
+        default=0.005, gt=0, le=1, description="light that the path depth may miss, as a share of the mean radiance"
+    )
+    pixel_tolerance: float = Field(default=0.02, gt=0, le=1, description="the same at the 99th percentile pixel")
+
+
+class SelectSettings(Strict):
+    """Which of the candidates are ray-traced."""
+
+    budget: int = Field(default=25, ge=1, description="views to ray-trace")
+    policy: PolicyName = Field(default="auto", description="how they are chosen (docs/method.md)")
+    weights: str = Field(
+        default="", description="file of `dnrpipe train-selector` for policy dqn; empty: the shipped one"
+    )
+    rounds: int = Field(
+        default=1, ge=1, description="2 or more: trace a part, look where the base image is wrong, choose the rest"
+    )
+    seed: int = Field(default=0, ge=0)
+    step1: Step1Settings = Step1Settings()
+    active: ActiveSettings = ActiveSettings()
+
+    @field_validator("policy", mode="before")
+    @classmethod
+    def _in_full(cls, value: Any) -> Any:
+        return full_name(value) if isinstance(value, str) else value
+
+
+class FinetuneSettings(Strict):
+    """Step 2."""
+
+    seed: int = Field(default=0, ge=0)
+    preview_seconds: float = Field(
+        default=10.0,
+        ge=0,
+        le=1e6,
+        description="of training between pictures of a held-out view, to look at, at least; 0 = no pictures",
+    )
+    step2: Step2Settings = Step2Settings()
+
+
+class Settings(Strict):
+    """Everything that decides what a run computes."""
+
+    preset: str = "draft"
+    strict: bool = Field(default=False, description="refuse scenes with missing files or anything ignored")
+    cameras: CameraSettings = CameraSettings()
+    passes: PassSettings = PassSettings()
+    model: ModelSettings = ModelSettings()
+    base: BaseSettings = BaseSettings()
+    select: SelectSettings = SelectSettings()
+    raytrace: RaytraceSettings = RaytraceSettings()
+    effects: EffectSettings = EffectSettings()
+    finetune: FinetuneSettings = FinetuneSettings()
+    device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="torch device")
+
+    @property
+    def trains_step1(self) -> bool:
+        """Whether the coarse model is wanted: by the policy, or as the start of step 2."""
+        return self.select.policy in TRAINED_NAMES or self.starts_coarse
+
+    @property
+    def starts_coarse(self) -> bool:
+        """Whether step 2 starts from step 1's model."""
+        return self.finetune.step2.start == "coarse"
+
+
+# The default model, "dnr": it corrects an image of baked light (docs/method.md; figures in docs/experiments.md).
+DNR: dict[str, Any] = {
+    "base": "baked",
+    "guides": True,
+    "filter": 3,
+    "stride": 2,
+    "output": "log",
+    "aggregator": "residual",
+    "modalities": "uv",
+}
+DNR_STEP2: dict[str, Any] = {
+    "start": "fresh",
+    "ema": 0.99,
+    "photometric": "l1",
+    "texture_rate_scale": 3.0,
+    "loss": {"perceptual": 0.03},
+}
+PRESETS: dict[str, dict[str, Any]] = {
+    # Minutes on two CPU cores.
+    "draft": {
+        "cameras": {"train": 40, "val": 4, "test": 12, "width": 128, "height": 128},
+        "passes": {"bake_size": 1024},
+        "raytrace": {"spp": 128, "evaluation_spp": 512, "denoise": True, "evaluation_denoise": True},
+        "model": {**DNR, "texture_size": 128, "width": 24, "depth": 3},
+        "select": {"step1": {"epochs": 12, "texture_rate_scale": 10.0}},
+        "finetune": {"step2": {**DNR_STEP2, "epochs": 40, "perceptual_crop": 32}},
+    },
+    "standard": {
+        "cameras": {"train": 100, "val": 10, "test": 50, "width": 384, "height": 384},
+        "raytrace": {"spp": 256, "evaluation_spp": 512, "denoise": True, "evaluation_denoise": True},
+        "model": {**DNR, "texture_size": 256, "width": 32, "depth": 4},
+        "select": {"step1": {"epochs": 30, "texture_rate_scale": 10.0}},
+        "finetune": {"step2": {**DNR_STEP2, "epochs": 60, "patch": 192, "perceptual_crop": 64}},
+    },
+    # DNR (Thies et al. 2019) at the paper's sizes: what DNRSelect is compared with.
+    "vanilla": {
+        "model": {"modalities": "uv"},
+        "select": {"policy": "rl-paper", "step1": {"reward_scale": "raw", "q_target": "plain"}},
+        "effects": {"enable": ["view-dependence"]},
+        "finetune": {
+            "step2": {
+                "start": "fresh",
+                "augment": False,
+                "photometric": "l1",
+                "texture_rate_scale": 10.0,
+                "loss": {name: 0.0 for name in LossWeights.model_fields if name != "photometric"},
+            }
+        },
+    },
+    # The paper's numbers: every other default of the models above is the paper's.
+    "paper": {
+        "select": {"policy": "rl-paper", "step1": {"reward_scale": "raw", "q_target": "plain"}},
+        "effects": {"enable": ["view-dependence", "depth", "normal"]},
+    },
+}
+
+
+def resolve(
+    preset: str | None,
+    overrides: Mapping[str, Any],
+    *,
+    toml_files: Sequence[Path] = (),
+    environment: Mapping[str, str] = os.environ,
+) -> Settings:
+    """Layer preset < TOML files (in order) < environment < overrides, and validate.
+
+    Args:
+        preset: its name; None: the one that the latest layer names, else draft.
+        overrides: nested dict of what the flags say.
+        toml_files: later ones win.
+        environment: variables such as ``DNRPIPE_FINETUNE__STEP2__EPOCHS=20``.
+
+    Raises:
+        UserError: names the layer and the key, or the key and the value.
+    """
+    layers = [(str(path), _read_toml(path)) for path in toml_files]
+    layers += [("environment", _from_environment(environment)), ("flags", overrides)]
+    given: dict[str, Any] = {}
+    for source, layer in layers:
+        _check_keys(source, layer, Settings)
+        given = merge(given, layer)
+    name = str(preset or given.get("preset") or "draft")
+    if name not in PRESETS:
+        raise UserError(f"unknown preset '{name}'; choose one of {', '.join(PRESETS)}")
+    try:
+        return Settings.model_validate({**merge(PRESETS[name], given), "preset": name})
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise UserError(f"setting {where}: {first['msg'].lower()}, got {first['input']!r}") from None
+
+
+def merge(base: Mapping[str, Any], extra: Mapping[str, Any]) -> dict[str, Any]:
+    """``base`` with ``extra`` merged into a copy, recursively."""
+    result = dict(base)
+    for key, value in extra.items():
+        if isinstance(value, Mapping):
+            below = result.get(key)
+            value = merge(below if isinstance(below, Mapping) else {}, value)
+        result[key] = value
+    return result
+
+
+def parse_assignment(text: str) -> dict[str, Any]:
+    """``finetune.step2.epochs=20`` -> nested dict. The value is read as TOML, else as a string."""
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise UserError(f"--set {text!r}: expected KEY=VALUE, e.g. --set finetune.step2.epochs=20")
+    return _nest(key.strip().split("."), value.strip())
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: not valid TOML ({error})") from None
+
+
+def _from_environment(environment: Mapping[str, str]) -> dict[str, Any]:
+    """``DNRPIPE_FINETUNE__STEP2__EPOCHS=20`` -> nested dict."""
+    result: dict[str, Any] = {}
+    for name, value in sorted(environment.items()):
+        if name.startswith(ENVIRONMENT_PREFIX) and name not in ENVIRONMENT_OTHER:
+            result = merge(result, _nest(name.removeprefix(ENVIRONMENT_PREFIX).lower().split("__"), value))
+    return result
+
+
+def _nest(keys: list[str], text: str) -> dict[str, Any]:
+    value: Any = text
+    with suppress(tomllib.TOMLDecodeError):
+        value = tomllib.loads(f"value = {text}")["value"]
+    for key in reversed(keys):
+        value = {key: value}
+    return value
+
+
+def _check_keys(source: str, layer: Mapping[str, Any], model: type[Strict], prefix: str = "") -> None:
+    for key, value in layer.items():
+        if key not in model.model_fields:
+            near = difflib.get_close_matches(key, model.model_fields, n=1)
+            hint = f"did you mean '{prefix}{near[0]}'?" if near else f"known: {', '.join(model.model_fields)}"
+            raise UserError(f"{source}: unknown setting '{prefix}{key}'; {hint}")
+        nested = model.model_fields[key].annotation
+        if isinstance(value, Mapping):
+            if not (isinstance(nested, type) and issubclass(nested, Strict)):
+                raise UserError(f"{source}: setting '{prefix}{key}' is a single value, not a table")
+            _check_keys(source, value, nested, f"{prefix}{key}.")

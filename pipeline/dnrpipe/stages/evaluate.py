@@ -1,0 +1,179 @@
+"""Stage `evaluate`: held-out test views against path-traced references, booked as evaluation cost."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import numpy as np
+
+from dnrtrain.atomic import write_json
+from dnrtrain.contract import ContractError, View
+from dnrtrain.exr import read_metadata
+
+from ..core.console import Console
+from ..core.errors import UserError
+from ..core.images import flip_error, write_png
+from ..core.ledger import CostRecord
+from ..core.scene_files import split_views
+from ..core.settings import Settings
+from ..core.workspace import Workspace, digest
+from .base_images import RENDERED, base_path, base_views
+from .raytrace import trace_views
+from .stage import Outcome
+from .trainer import load, perceptual_weights, torch_device
+
+NEURAL_REPEATS = 5
+
+
+def run(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
+    """Trace the test views, render them with the DNR, measure, write pictures and ``metrics.json``."""
+    import torch
+
+    from dnrtrain.checkpoint import load_model
+    from dnrtrain.metrics import image_metrics
+    from dnrtrain.model import render_views
+    from dnrtrain.perceptual import Lpips
+
+    views = split_views(workspace)["test"]
+    if not views:
+        raise UserError("evaluate: the workspace has no test views; prepare again with cameras.test > 0")
+    trace_views(
+        workspace,
+        settings,
+        console,
+        run_id,
+        views=views,
+        split="test",
+        spp=settings.raytrace.evaluation_spp,
+        stage="evaluate",
+        purpose="evaluation",
+    )
+    base_views(workspace, settings, console, run_id, views=views, split="test", stage="evaluate", purpose="evaluation")
+    device = torch_device(settings)
+    model = load_model(workspace.checkpoints("step2"), device)
+    perceptual = perceptual_weights(console)
+    lpips = {name: Lpips(name, weights) for name, weights in perceptual.items()} if perceptual else None
+    rendered = settings.model.base in RENDERED
+    rows: list[dict[str, Any]] = []
+    with console.bar("test views", len(views)) as bar:
+        for view in views:
+            data = load(workspace, [view], "test", raytraced=True, base=settings.model.base).to(device)
+            seconds, prediction = _timed_render(lambda data=data: render_views(model, data), device)
+            assert data.target is not None  # loaded with raytraced=True
+            row: dict[str, Any] = dict(image_metrics(prediction, data.target.cpu(), data.mask.cpu(), lpips))
+            truth = _image(data.target)
+            predicted = _image(prediction)
+            error, heat = flip_error(truth, predicted)
+            traced = read_metadata(workspace.raytraced("test", view.name)) or {}
+            base = read_metadata(base_path(workspace, "test", view.name)) or {} if rendered else {}
+            row |= {
+                "name": view.name,
+                "flip": error,
+                "ceiling_psnr": _ceiling(traced.get("noise_rmse")),
+                "reference_noise": traced.get("noise"),
+                "reference_noise_error": traced.get("noise_error"),
+                "seconds_traced": traced.get("seconds"),
+                "seconds_neural": seconds,
+                "seconds_base": base.get("seconds"),
+                "spp": traced.get("spp"),
+            }
+            rows.append(row)
+            files = {}
+            for kind, picture in (("truth", truth), ("prediction", predicted), ("flip", heat)):
+                write_png(workspace.evaluation / f"{view.name}.{kind}.png", picture)
+                files[kind] = f"evaluation/{view.name}.{kind}.png"
+            console.events.send("picture", split="test", view=view.name, files=files, psnr=row["psnr"])
+            workspace.ledger.append(_record(run_id, view, seconds, device))
+            bar.advance(note=f"{row['psnr']:.2f} dB")
+    torch_name = torch.cuda.get_device_name() if device.startswith("cuda") else "cpu"
+    report = {
+        "views": rows,
+        "mean": _mean(rows),
+        "perceptual": perceptual is not None,
+        "trained_with_perceptual": workspace.manifest.stages["finetune"].detail.get("perceptual", False),
+        "device": torch_name,
+        "reference_noise_target": settings.raytrace.evaluation_noise,
+        "neural_ms": 1000 * float(np.median([row["seconds_neural"] for row in rows])),
+    }
+    _remove_strangers(workspace, {view.name for view in views})
+    write_json(workspace.evaluation / "metrics.json", report)
+    mean = report["mean"]
+    console.say(
+        f"held-out over {len(rows)} views: PSNR {mean['psnr']:.2f} dB"
+        + (f" (ceiling {mean['ceiling_psnr']:.1f} dB)" if mean["ceiling_psnr"] is not None else "")
+        + f", SSIM {mean['ssim']:.4f},"
+        f" FLIP {mean['flip']:.4f}"
+        + (f", LPIPS {mean['lpips_alex']:.4f} (alex)" if mean["lpips_alex"] is not None else ", no LPIPS weights")
+    )
+    stable = [{k: v for k, v in row.items() if not k.startswith("seconds")} for row in rows]
+    return Outcome(digest(stable), {"mean": mean, "views": len(rows), "perceptual": perceptual is not None})
+
+
+def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
+    """(test views measured, test views)."""
+    try:
+        views = split_views(workspace).get("test", [])
+    except ContractError:
+        views = []  # damaged: the stage mends it when it runs
+    if not views:
+        return 0, settings.cameras.test
+    done = sum((workspace.evaluation / f"{view.name}.flip.png").exists() for view in views)
+    return (done if (workspace.evaluation / "metrics.json").exists() else 0), len(views)
+
+
+def _timed_render(render: Any, device: str) -> tuple[float, Any]:
+    """(median seconds, picture). The first call warms up and is not counted."""
+    import torch
+
+    picture = render()
+    seconds = []
+    for _ in range(NEURAL_REPEATS):
+        if device.startswith("cuda"):
+            torch.cuda.synchronize()
+        started = time.perf_counter()
+        render()
+        if device.startswith("cuda"):
+            torch.cuda.synchronize()
+        seconds.append(time.perf_counter() - started)
+    return float(np.median(seconds)), picture
+
+
+def _image(tensor: Any) -> np.ndarray:
+    return tensor[0].float().clamp(0, 1).permute(1, 2, 0).cpu().numpy()
+
+
+def _ceiling(noise_rmse: float | None) -> float | None:
+    """The PSNR that a perfect renderer would measure against this noisy reference, dB; a denoiser's bias not in it."""
+    return None if not noise_rmse else -20 * math.log10(noise_rmse)
+
+
+def _mean(rows: list[dict[str, Any]]) -> dict[str, float | None]:
+    result: dict[str, float | None] = {}
+    for key in rows[0]:
+        values = [row[key] for row in rows if isinstance(row[key], int | float)]
+        if key != "name":
+            result[key] = float(np.mean(values)) if values else None
+    return result
+
+
+def _remove_strangers(workspace: Workspace, names: set[str]) -> None:
+    for path in workspace.evaluation.glob("[!.]*.png"):
+        if path.name.rsplit(".", 2)[0] not in names:
+            path.unlink()
+
+
+def _record(run_id: str, view: View, seconds: float, device: str) -> CostRecord:
+    return CostRecord(
+        time=time.time(),
+        run=run_id,
+        stage="evaluate",
+        purpose="evaluation",
+        unit="view",
+        name=f"neural/{view.name}",
+        seconds=seconds,
+        device=device,
+        width=view.width,
+        height=view.height,
+    )

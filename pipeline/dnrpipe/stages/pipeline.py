@@ -1,0 +1,329 @@
+"""The pipeline as data: what each stage reads, writes and depends on, and how to run what is due.
+
+fingerprint(stage) = hash of its version, its settings, the source (prepare) and the outputs of the
+                     stages it needs
+state              = missing | partial | stale | done
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import platform
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+from dnrtrain.selector.names import ACTIVE_NAMES, SHIPPED_WEIGHTS
+
+from .. import __version__
+from ..core.console import Console, clock
+from ..core.effect_names import NEURAL
+from ..core.errors import UserError
+from ..core.scene_files import scene_fingerprint
+from ..core.settings import Settings
+from ..core.workspace import Workspace, digest, file_sha256
+from .stage import Outcome, Stage
+
+
+def _light(settings: Settings) -> dict[str, Any]:
+    """Effect settings that decide what is ray-traced."""
+    chosen = settings.effects.model_dump()
+    return chosen | {key: sorted(set(chosen[key]) - NEURAL) for key in ("enable", "disable")}
+
+
+def _tracing(settings: Settings, *, test: bool) -> dict[str, Any]:
+    """Settings that decide how the views of one kind are ray-traced; targets only where they are set."""
+    raytrace = settings.raytrace
+    names = ["evaluation_noise"] if test else ["noise", "time"]
+    targets = {name: value for name in names if (value := getattr(raytrace, name)) is not None}
+    if targets:
+        targets["max_spp"] = raytrace.max_spp
+    else:
+        names = ["evaluation_spp"] if test else ["spp"]
+        targets = {name: getattr(raytrace, name) for name in names}
+    common = {"max_depth", "evaluation_denoise" if test else "denoise", "seed"}
+    return raytrace.model_dump(include=common) | targets
+
+
+def _base(settings: Settings) -> list[Any]:
+    """Settings that decide the base images."""
+    return [settings.model.base, settings.base.model_dump()]
+
+
+def _selection(settings: Settings) -> list[Any]:
+    """Settings that decide which views are chosen, and the coarse model where there is one."""
+    parts: list[Any] = []
+    if settings.select.rounds > 1:  # what is traced decides what is chosen next
+        parts = [settings.select.rounds, STAGES["raytrace"].settings(settings)]
+    if settings.select.policy == "dqn":
+        parts.append(_selector_weights(settings))
+    if not settings.trains_step1:
+        return [settings.select.model_dump(include={"budget", "policy", "seed"}), *parts]
+    if settings.select.policy in ACTIVE_NAMES:
+        parts.append([settings.select.active.model_dump(), settings.starts_coarse])
+    select = settings.select.model_dump(exclude={"rounds", "weights", "active"})
+    if select["policy"] == "rl-paper":
+        select["policy"] = "rl"  # its first name: what was trained under it stays done
+    return [settings.model.coarse().model_dump(), select, _neural(settings), *parts]
+
+
+def _selector_weights(settings: Settings) -> str:
+    """Hash of the learned selector's weights; "" while there are none."""
+    named = settings.select.weights
+    path = Path(named) if named else SHIPPED_WEIGHTS
+    return file_sha256(path) if path.is_file() else ""
+
+
+def _neural(settings: Settings) -> dict[str, list[str]]:
+    """Effect settings that decide what the neural renderer is made of."""
+    chosen = settings.effects
+    return {key: sorted(set(getattr(chosen, key)) & NEURAL) for key in ("enable", "disable")}
+
+
+STAGES: dict[str, Stage] = {
+    stage.name: stage
+    for stage in (
+        Stage(
+            name="prepare",
+            command="prepare",
+            does="census, Mitsuba bundle, cameras, raster passes and G-buffers",
+            needs=(),
+            reads=("the scene file",),
+            writes=("scene", "cameras", "passes"),
+            settings=lambda s: [
+                s.cameras.model_dump(),
+                s.passes.model_dump(exclude={"workers"}),
+                *(["raster"] if s.model.base == "raster" else []),
+            ],
+            run="dnrpipe.stages.prepare:run",
+            progress="dnrpipe.stages.prepare:progress",
+        ),
+        Stage(
+            name="select",
+            command="select",
+            does="choice of the views to ray-trace; step 1 (coarse DNR) where that or step 2 needs it",
+            needs=("prepare",),
+            reads=("passes", "cameras"),
+            writes=("selection.json", "checkpoints/step1"),
+            settings=_selection,
+            run="dnrpipe.stages.select:run",
+            progress="dnrpipe.stages.select:progress",
+        ),
+        Stage(
+            name="raytrace",
+            command="raytrace-selected",
+            does="path tracing of the selected views, their base images",
+            needs=("prepare", "select"),
+            reads=("scene", "selection.json"),
+            writes=("raytraced/train", "base/train"),
+            settings=lambda s: [
+                _tracing(s, test=False),
+                _light(s),
+                _base(s),
+            ],
+            run="dnrpipe.stages.raytrace:run",
+            progress="dnrpipe.stages.raytrace:progress",
+        ),
+        Stage(
+            name="finetune",
+            command="finetune",
+            does="step 2: six losses on the selected ray-traced views",
+            needs=("select", "raytrace"),
+            reads=("passes", "raytraced/train", "base/train", "checkpoints/step1"),
+            writes=("checkpoints/step2", "preview"),
+            settings=lambda s: [s.model.model_dump(), s.finetune.model_dump(exclude={"preview_seconds"}), _neural(s)],
+            run="dnrpipe.stages.trainer:run_finetune",
+            progress="dnrpipe.stages.trainer:finetune_progress",
+        ),
+        Stage(
+            name="evaluate",
+            command="evaluate",
+            does="held-out test views, ray-traced on demand",
+            needs=("finetune",),
+            reads=("passes/test", "checkpoints/step2"),
+            writes=("raytraced/test", "base/test", "evaluation"),
+            settings=lambda s: [
+                _tracing(s, test=True),
+                _light(s),
+                _base(s),
+            ],
+            run="dnrpipe.stages.evaluate:run",
+            progress="dnrpipe.stages.evaluate:progress",
+        ),
+    )
+}
+
+
+def fingerprint(stage: Stage, workspace: Workspace, settings: Settings) -> str | None:
+    """Hash of all that the stage computes from; None while a stage it needs has never run."""
+    records = workspace.manifest.stages
+    if any(need not in records for need in stage.needs):
+        return None
+    return digest(
+        {
+            "stage": stage.name,
+            "version": stage.version,
+            "settings": stage.settings(settings),
+            "source": None if stage.needs else scene_fingerprint(workspace),
+            "inputs": {need: records[need].output for need in stage.needs},
+        }
+    )
+
+
+def state(stage: Stage, workspace: Workspace, settings: Settings) -> str:
+    """missing: never finished; partial: files are absent; stale: inputs or settings changed; done.
+
+    Work done without perceptual weights is stale once they are here; the other way round it stays.
+    """
+    record = workspace.manifest.stages.get(stage.name)
+    present, wanted = _call(stage.progress, workspace, settings)
+    if record is None:
+        return "partial" if present else "missing"
+    if record.fingerprint != fingerprint(stage, workspace, settings):
+        return "stale"
+    if any(state(STAGES[need], workspace, settings) == "stale" for need in stage.needs):
+        return "stale"
+    if record.detail.get("perceptual") is False and weights_cached():
+        return "stale"
+    return "done" if present >= wanted else "partial"
+
+
+def run_stage(
+    name: str, workspace: Workspace, settings: Settings, console: Console, *, force: bool = False
+) -> dict[str, Any]:
+    """Run one stage if it is due. Returns its facts; ``"ran"`` says whether it did anything.
+
+    Raises UserError: a stage that it needs has not run or is out of date.
+    """
+    stage = STAGES[name]
+    require_inputs(stage, workspace, settings)
+    if not force and state(stage, workspace, settings) == "done":
+        console.say(f"{stage.command}: up to date")
+        return {"stage": name, "ran": False, **workspace.manifest.stages[name].detail}
+    if force:
+        if not stage.needs and not Path(workspace.manifest.source.path).is_file():
+            raise UserError(
+                f"{workspace.manifest.source.path}: the scene file is gone; --force would lose its conversion"
+            )
+        clear(stage, workspace)
+    record = workspace.manifest.stages.get(name)
+    if record is not None and record.fingerprint != fingerprint(stage, workspace, settings):
+        record.fingerprint = ""  # its files are about to change: not done until this run has finished
+    started = time.monotonic()
+    run_id = f"{name}-{int(time.time()):x}"
+    workspace.manifest.versions = {"dnrpipe": __version__, "python": platform.python_version()}
+    workspace.manifest.settings = settings.model_dump(mode="json")
+    workspace.save()
+    outcome = _run_mending(stage, workspace, settings, console, run_id)
+    seconds = time.monotonic() - started
+    done = fingerprint(stage, workspace, settings)
+    assert done is not None  # its inputs were required above
+    workspace.finish_stage(name, fingerprint=done, output=outcome.output, seconds=seconds, detail=outcome.detail)
+    console.say(f"{stage.command}: done in {clock(seconds)}")
+    return {"stage": name, "ran": True, "seconds": seconds, **outcome.detail}
+
+
+def _run_mending(stage: Stage, workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
+    """Run the stage; a damaged file that it meets is named, thrown away and made again by the stage it is from.
+
+    Raises DamagedFile: the file is of no stage, or was damaged again.
+    """
+    from dnrtrain.contract import DamagedFile
+
+    met: set[Path] = set()
+    while True:
+        try:
+            return _call(stage.run, workspace, settings, console, run_id)
+        except DamagedFile as damage:
+            owner = owner_of(damage.path, workspace)
+            if owner is None or damage.path in met:
+                raise
+            met.add(damage.path)
+            console.warn(f"{damage.path}: damaged ({damage.reason}); `dnrpipe {owner.command}` makes it again")
+            discard(damage.path, owner, workspace)
+            if owner.name != stage.name:
+                run_stage(owner.name, workspace, settings, console)
+
+
+def owner_of(path: Path, workspace: Workspace) -> Stage | None:
+    """The stage that writes ``path``, or None for files of no stage and files outside the workspace."""
+    try:
+        inside = path.resolve().relative_to(workspace.root.resolve())
+    except ValueError:
+        return None
+    for stage in STAGES.values():
+        if any(inside.is_relative_to(written) for written in stage.writes):
+            return stage
+    return None
+
+
+def discard(path: Path, owner: Stage, workspace: Workspace) -> None:
+    """Remove a damaged file such that its stage is due. Without its last file a converted scene is none."""
+    path.unlink(missing_ok=True)
+    if path.resolve().is_relative_to(workspace.scene.resolve()):
+        (workspace.scene / "prepared.json").unlink(missing_ok=True)
+    record = workspace.manifest.stages.get(owner.name)
+    if record is not None:
+        record.fingerprint = ""
+        workspace.save()
+
+
+def require_inputs(stage: Stage, workspace: Workspace, settings: Settings) -> None:
+    """Raise UserError naming the first command that must run before this stage can."""
+    for need in stage.needs:
+        upstream = STAGES[need]
+        require_inputs(upstream, workspace, settings)
+        found = state(upstream, workspace, settings)
+        if found != "done":
+            why = {"missing": "has not run", "partial": "is not complete", "stale": "is out of date"}[found]
+            raise UserError(
+                f"{stage.command}: {upstream.command} {why} for {workspace.root};"
+                f" run `dnrpipe {upstream.command}` first"
+            )
+
+
+def clear(stage: Stage, workspace: Workspace) -> None:
+    """``--force``: remove what the stage wrote, so that nothing is reused."""
+    workspace.manifest.stages.pop(stage.name, None)
+    workspace.save()
+    for relative in stage.writes:
+        path = workspace.root / relative
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def weights_cached() -> bool:
+    """Whether `dnrpipe weights` has been here; a look at the folder, without importing torch."""
+    base = os.environ.get("DNRPIPE_CACHE") or Path.home() / ".cache" / "dnrpipe"
+    return (Path(base) / "weights" / "weights.json").is_file()
+
+
+def status(workspace: Workspace, settings: Settings) -> list[dict[str, Any]]:
+    """One row per stage: name, command, state, units present and wanted, seconds of its last run."""
+    rows = []
+    for stage in STAGES.values():
+        present, wanted = _call(stage.progress, workspace, settings)
+        record = workspace.manifest.stages.get(stage.name)
+        rows.append(
+            {
+                "stage": stage.name,
+                "command": stage.command,
+                "does": stage.does,
+                "state": state(stage, workspace, settings),
+                "present": present,
+                "wanted": wanted,
+                "seconds": record.seconds if record else None,
+                "reads": list(stage.reads),
+                "writes": list(stage.writes),
+            }
+        )
+    return rows
+
+
+def _call(target: str, *arguments: Any) -> Any:
+    module, _, function = target.partition(":")
+    return getattr(importlib.import_module(module), function)(*arguments)

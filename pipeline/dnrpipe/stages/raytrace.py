@@ -1,0 +1,190 @@
+"""Stage `raytrace-selected`: path tracing of the selected views, and of test views on demand."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+from typing import Any
+
+from dnrtrain.contract import ContractError, View
+from dnrtrain.exr import read_metadata
+
+from ..core.console import Console
+from ..core.ledger import CostRecord
+from ..core.scene_files import scene_fingerprint, split_views
+from ..core.settings import Settings
+from ..core.workspace import Workspace, digest
+from ..effects.plan import EffectPlan
+from ..effects.store import lenses, plan_of, resolve_plan, trace_config, variant_for
+from ..raytrace.sample_schedule import Goal
+from ..workers.view_tasks import is_made, run_view_tasks, task_name, view_record, warn_repairs, worker_count
+from .adaptive_sampling import run_passes
+from .base_images import RENDERED, base_path, base_views
+from .stage import Outcome
+from .trainer import read_selection
+
+TRACE_VERSION = 3
+SAMPLES_VERSION = 1
+
+
+def run(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
+    """Trace the selected views that are not on disk yet, and render the base images that go with them."""
+    from .previews import shown_view  # which imports this module
+
+    by_name = {view.name: view for view in split_views(workspace)["train"]}
+    selected = [by_name[name] for name in read_selection(workspace)["views"]]
+    tasks = trace_views(
+        workspace,
+        settings,
+        console,
+        run_id,
+        views=selected,
+        split="train",
+        spp=settings.raytrace.spp,
+        stage="raytrace",
+        purpose="training",
+    )
+    bases = base_views(
+        workspace,
+        settings,
+        console,
+        run_id,
+        views=selected,
+        split="train",
+        stage="raytrace",
+        purpose="training",
+        held_out=shown_view(workspace, settings),
+    )
+    made: list[Any] = [task["fingerprint"] for task in [*tasks, *bases]]
+    spp = [(read_metadata(Path(task["output"])) or {}).get("spp") for task in tasks]
+    if goal_of(settings, "train") is not None:
+        made.append(spp)  # with a time, how many samples were taken is not known before
+    traced: Any = settings.raytrace.spp if goal_of(settings, "train") is None else spp
+    return Outcome(digest(made), {"views": [view.name for view in selected], "spp": traced})
+
+
+def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
+    """(selected views on disk, selected views)."""
+    if not workspace.selection.exists():
+        return 0, settings.select.budget
+    try:
+        names = read_selection(workspace)["views"]
+    except ContractError:
+        return 0, settings.select.budget  # damaged: the stage mends it when it runs
+    rendered = settings.model.base in RENDERED
+    made = [
+        workspace.raytraced("train", name).exists() and (not rendered or base_path(workspace, "train", name).exists())
+        for name in names
+    ]
+    return sum(made), len(names)
+
+
+def trace_views(
+    workspace: Workspace,
+    settings: Settings,
+    console: Console,
+    run_id: str,
+    *,
+    views: list[View],
+    split: str,
+    spp: int,
+    stage: str,
+    purpose: str,
+) -> list[dict[str, Any]]:
+    """Path-trace ``views`` into ``raytraced/<split>``; views already there are kept. Returns all tasks.
+
+    spp: samples per pixel, where the settings name no noise or time for the split (:func:`goal_of`).
+    """
+    plan = resolve_plan(workspace, settings, console, run_id, stage)
+    goal = goal_of(settings, split)
+    tasks = _tasks(workspace, settings, plan, views, split, spp)
+    if all(is_made(task) for task in tasks):
+        return tasks
+    choice = variant_for(plan, settings)
+    config = trace_config(workspace, plan, choice.variant)
+    console.say(f"ray tracing with Mitsuba {choice.variant}, {plan.integrator}, depth {plan.max_depth}")
+    workers = 1 if choice.variant.startswith("cuda") else worker_count(settings.raytrace.workers)
+
+    def book(task: dict[str, Any], result: dict[str, Any], count: int) -> CostRecord:
+        return view_record(
+            run=run_id,
+            stage=stage,
+            purpose=purpose,
+            task=task,
+            result=result,
+            workers=count,
+            device=f"mitsuba {choice.variant}",
+        )
+
+    label = "ray tracing" if split == "train" else "ray tracing test views"
+    common = {"bundle": config["bundle"], "variant": choice.variant, "threads": 1}
+    arguments: dict[str, Any] = {
+        "workspace": workspace,
+        "console": console,
+        "stage": stage,
+        "workers": workers,
+        "book": book,
+        "environment": choice.environment,
+    }
+    if goal is None:
+        run_view_tasks(label, "dnrpipe.raytrace.tracer", common, tasks, **arguments)
+    else:
+        run_passes(label, common, tasks, goal, **arguments)
+    warn_repairs(tasks, console)
+    return tasks
+
+
+def reference_is_made(workspace: Workspace, settings: Settings, view: View) -> bool:
+    """Whether a test view's reference is on disk and up to date."""
+    plan = plan_of(workspace, settings)
+    if plan.max_depth is None:
+        return False  # the pilot that decides it has not run, or was of another scene
+    (task,) = _tasks(workspace, settings, plan, [view], "test", settings.raytrace.evaluation_spp)
+    return is_made(task)
+
+
+def _tasks(
+    workspace: Workspace, settings: Settings, plan: EffectPlan, views: list[View], split: str, spp: int
+) -> list[dict[str, Any]]:
+    """What :func:`trace_views` has to do, with the fingerprints of the files that come out."""
+    scene_print = scene_fingerprint(workspace)
+    known = lenses(workspace, settings) if plan.on("depth-of-field") else {}
+    goal = goal_of(settings, split)
+    tasks: list[dict[str, Any]] = [
+        {
+            "view": view.model_dump(mode="json"),
+            "output": str(workspace.raytraced(split, view.name)),
+            "spp": spp,
+            "integrator": plan.integrator,
+            "max_depth": plan.max_depth,
+            "lens": known.get(view.name),
+            "seed": view_seed(settings.raytrace.seed, split, view.name),
+        }
+        for view in views
+    ]
+    light = [sorted(plan.left_out), plan.on("spectral")]
+    wanted = settings.raytrace.evaluation_denoise if split == "test" else settings.raytrace.denoise
+    for task in tasks:
+        decisive = {key: task[key] for key in ("view", "spp", "integrator", "max_depth", "lens", "seed")}
+        if goal is not None:
+            del task["spp"], decisive["spp"]
+            path = workspace.raytraced(split, task_name(task).partition("/")[2])
+            task["samples"] = str(path.parent / "samples" / f"{path.stem}.npz")
+            task["samples_print"] = digest([SAMPLES_VERSION, scene_print, decisive, light])
+            decisive["goal"] = [goal.noise, goal.seconds, goal.limit]
+        if wanted:
+            task["denoise"] = decisive["denoise"] = True
+        task["fingerprint"] = digest([TRACE_VERSION, scene_print, decisive, light])
+    return tasks
+
+
+def goal_of(settings: Settings, split: str) -> Goal | None:
+    """The noise or time that views of the split are traced to; None: the samples per pixel are set."""
+    raytrace = settings.raytrace
+    noise, seconds = (raytrace.evaluation_noise, None) if split == "test" else (raytrace.noise, raytrace.time)
+    return None if noise is None and seconds is None else Goal(noise, seconds, raytrace.max_spp)
+
+
+def view_seed(seed: int, split: str, name: str) -> int:
+    """A seed of its own for every view, stable across runs and machines; below 2^18 (passes add bits)."""
+    return zlib.crc32(f"{seed}/{split}/{name}".encode()) & 0x3FFFF

@@ -1,0 +1,242 @@
+"""`dnrpipe render`: novel views with the neural renderer, as PNG, EXR, MP4 or WebP."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dnrtrain.atomic import atomic_path, write_json
+from dnrtrain.contract import View, write_cameras
+
+from ..core.console import Console
+from ..core.errors import UserError
+from ..core.images import write_png
+from ..core.ledger import CostRecord
+from ..core.scene_files import read_frame, scene_fingerprint
+from ..core.settings import Settings
+from ..core.workspace import Workspace, digest
+from ..workers.view_tasks import run_view_tasks, view_record, worker_count
+from .base_images import RENDERED, base_views
+from .pipeline import STAGES, require_inputs
+from .prepare import pass_common, pass_task
+from .trainer import torch_device
+
+FPS = 24
+
+
+def render_novel(
+    workspace: Workspace,
+    settings: Settings,
+    console: Console,
+    views: Sequence[View],
+    *,
+    name: str,
+    frames: str,
+    movie: str,
+) -> dict[str, Any]:
+    """Render ``views`` into ``renders/<name>/``. frames: png, exr or both; movie: mp4, webp or none.
+
+    Needs a fine-tuned model (UserError otherwise). G-buffers and frames that are there are kept when the
+    cameras and the model are the same; a changed model redoes the frames.
+    """
+    from dnrtrain.checkpoint import load_model
+    from dnrtrain.dataset import load_views
+    from dnrtrain.model import render_radiance, render_views
+
+    require_inputs(STAGES["evaluate"], workspace, settings)  # what evaluate needs is what this needs
+    if movie != "none" and len({(view.width, view.height) for view in views}) > 1:
+        raise UserError("render: the cameras have several image sizes, which no movie can hold; use --movie none")
+    folder = workspace.root / "renders" / name
+    run_id = f"render-{int(time.time()):x}"
+    model_stamp = workspace.manifest.stages["finetune"].output
+    stamp = digest([model_stamp, scene_fingerprint(workspace), [v.model_dump(mode="json") for v in views]])
+    stamp_file = folder / "frames.json"
+    if folder.exists() and (not stamp_file.exists() or stamp_file.read_text().strip() != f'"{stamp}"'):
+        for path in [*folder.glob("frame_*"), *folder.glob(f"{name}.*")]:
+            path.unlink()
+    write_json(stamp_file, stamp)
+    write_cameras(folder / "cameras.json", views, name)
+    paths = _inputs(workspace, settings, console, views, folder, run_id)
+    kind = settings.model.base
+    device = torch_device(settings)
+    model = load_model(workspace.checkpoints("step2"), device)
+    frame = read_frame(workspace)
+    pictures: list[np.ndarray] = []
+    seconds: list[float] = []
+    with console.bar("frames", len(views)) as bar:
+        for view, path in zip(views, paths, strict=True):
+            data = load_views(
+                [path],
+                None,
+                frame,
+                cameras=[view],
+                folder=workspace.scene,
+                target=False,
+                base=kind,
+                base_files=[path] if kind in RENDERED else None,
+            ).to(device)
+            started = time.perf_counter()
+            picture = render_views(model, data)[0].float().clamp(0, 1).permute(1, 2, 0).cpu().numpy()
+            seconds.append(time.perf_counter() - started)
+            if movie != "none":
+                pictures.append((picture * 255 + 0.5).astype(np.uint8))
+            if frames in ("png", "both"):
+                write_png(folder / f"frame_{view.name}.png", picture)
+            if frames in ("exr", "both"):
+                radiance = render_radiance(model, data)
+                write_frame_exr(folder / f"frame_{view.name}.exr", picture, radiance, data, view)
+            workspace.ledger.append(
+                CostRecord(
+                    time=time.time(),
+                    run=run_id,
+                    stage="render",
+                    purpose="inference",
+                    unit="view",
+                    name=f"neural/{view.name}",
+                    seconds=seconds[-1],
+                    device=device,
+                    width=view.width,
+                    height=view.height,
+                )
+            )
+            bar.advance()
+    result: dict[str, Any] = {
+        "folder": str(folder),
+        "frames": len(views),
+        "neural_ms": 1000 * float(np.median(seconds)),
+        "movie": None,
+    }
+    if movie != "none":
+        target = folder / f"{name}.{movie}"
+        (write_mp4 if movie == "mp4" else write_webp)(target, pictures)
+        result["movie"] = str(target)
+    return result
+
+
+def write_frame_exr(path: Path, picture: np.ndarray, radiance: Any, data: Any, view: View) -> None:
+    """Linear Rec.709 with the coverage as alpha, premultiplied.
+
+    radiance: the network's, straight, [1, 3, H, W], highlights included. None where it works in display space: then
+    white is taken out of ``picture`` exactly, and nothing above display white comes back.
+    """
+    from dnrtrain.exr import write_exr
+
+    alpha = data.coverage[0, 0].cpu().numpy()
+    if radiance is not None:
+        linear = radiance[0].float().permute(1, 2, 0).cpu().numpy()
+    else:
+        straight = np.where(
+            alpha[..., None] > 0, (picture - (1 - alpha[..., None])) / np.maximum(alpha[..., None], 1e-3), 0
+        )
+        straight = np.clip(straight, 0, 1)
+        linear = np.where(straight <= 0.04045, straight / 12.92, ((straight + 0.055) / 1.055) ** 2.4)
+    rgba = np.concatenate([linear * alpha[..., None], alpha[..., None]], axis=-1)
+    write_exr(path, {c: rgba[..., i] for i, c in enumerate("RGBA")}, {"view": view.model_dump(mode="json")})
+
+
+def write_mp4(path: Path, pictures: Sequence[np.ndarray]) -> None:
+    """H.264 in MP4 by ffmpeg (imageio-ffmpeg carries it); uint8 [H, W, 3] each. Odd sizes are padded white."""
+    import imageio_ffmpeg
+
+    height, width = pictures[0].shape[:2]
+    pad = ((0, height % 2), (0, width % 2), (0, 0))
+    with atomic_path(path) as temporary:
+        writer = imageio_ffmpeg.write_frames(
+            str(temporary),
+            (width + width % 2, height + height % 2),
+            fps=FPS,
+            quality=8,
+            macro_block_size=2,
+            ffmpeg_log_level="error",
+        )
+        writer.send(None)
+        for picture in pictures:
+            writer.send(np.ascontiguousarray(np.pad(picture, pad, constant_values=255)))
+        writer.close()
+
+
+def write_webp(path: Path, pictures: Sequence[np.ndarray]) -> None:
+    """Animated WebP by Pillow; loops for ever."""
+    from PIL import Image
+
+    first, *rest = [Image.fromarray(picture) for picture in pictures]
+    with atomic_path(path) as temporary:
+        first.save(temporary, save_all=True, append_images=rest, duration=1000 // FPS, loop=0, quality=85)
+
+
+def _inputs(
+    workspace: Workspace, settings: Settings, console: Console, views: Sequence[View], frames: Path, run_id: str
+) -> list[Path]:
+    """Files with what the network sees of each view. Base images that are rendered bring the G-buffer along."""
+    if settings.model.base in RENDERED:
+        paths = [frames / "base" / f"{view.name}.exr" for view in views]
+        _drop_strangers(paths)
+        base_views(
+            workspace,
+            settings,
+            console,
+            run_id,
+            views=views,
+            split="novel",
+            stage="render",
+            purpose="inference",
+            paths=paths,
+        )
+        return paths
+    paths = [frames / "gbuffers" / f"{view.name}.exr" for view in views]
+    _drop_strangers(paths)
+    _gbuffers(workspace, settings, console, views, paths, run_id)
+    return paths
+
+
+def _drop_strangers(paths: Sequence[Path]) -> None:
+    folder = paths[0].parent
+    if folder.exists():
+        wanted = {path.name for path in paths}
+        if any(path.name not in wanted for path in folder.glob("[!.]*.exr")):
+            shutil.rmtree(folder)
+
+
+def _gbuffers(
+    workspace: Workspace,
+    settings: Settings,
+    console: Console,
+    views: Sequence[View],
+    paths: Sequence[Path],
+    run_id: str,
+) -> None:
+    scene_print = scene_fingerprint(workspace)
+    raster = settings.model.base == "raster"
+    engine = workspace.manifest.stages["prepare"].detail["raster_engine"] if raster else "cycles-direct"
+    tasks = [
+        pass_task(workspace, settings, view, "novel", scene_print, engine, raster=raster, output=path)
+        for view, path in zip(views, paths, strict=True)
+    ]
+
+    def book(task: dict[str, Any], result: dict[str, Any], workers: int) -> CostRecord:
+        return view_record(
+            run=run_id,
+            stage="render",
+            purpose="inference",
+            task=task,
+            result=result,
+            workers=workers,
+            device="cpu",
+        )
+
+    run_view_tasks(
+        "G-buffers",
+        "dnrpipe.blender.passes.worker",
+        pass_common(workspace, settings, engine),
+        tasks,
+        workspace=workspace,
+        console=console,
+        stage="render",
+        workers=worker_count(settings.passes.workers),
+        book=book,
+    )

@@ -1,0 +1,189 @@
+"""One command's hold on a workspace: found or made, locked, with its settings resolved."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..core.errors import UserError
+
+if TYPE_CHECKING:
+    from ..core.console import Console
+    from ..core.settings import Settings
+    from ..core.workspace import Manifest, Source, Workspace
+
+
+class Session:
+    """One locked workspace with its settings, for the length of a command."""
+
+    def __init__(
+        self,
+        command: str,
+        options: dict[str, Any],
+        scene: Path | None,
+        overrides: dict[str, Any],
+        late: Callable[[Settings], dict[str, Any]] | None = None,
+    ) -> None:
+        self.command, self.options, self.scene, self.overrides = command, options, scene, overrides
+        self.late = late  # overrides that depend on the settings in force
+        self.stack = ExitStack()
+        self.answers: dict[str, Any] = {}
+        self.before: Manifest | None = None
+        self.fresh = False
+
+    def __enter__(self) -> Session:
+        try:
+            return self._open()
+        except BaseException:
+            self.stack.close()
+            raise
+
+    def _open(self) -> Session:
+        from ..core.console import Console
+        from ..core.settings import merge, parse_assignment
+        from ..core.workspace import Workspace, find_workspace, locked
+
+        self.console: Console = Console(json_mode=self.options["as_json"], quiet=self.options["quiet"])
+        overrides = self.overrides
+        for text in self.options["assignments"]:
+            overrides = merge(overrides, parse_assignment(text))
+        preset = self.options["preset"]
+        if self.scene is not None:
+            source = _source(self.scene)
+            root = _root_for(self.scene, self.options["workspace"])
+            # Bad settings are refused before a folder is made.
+            stored = _stored(root, source, named=self.options["workspace"] is not None)
+            planned = resolve_layers(root, preset or (stored.manifest.preset if stored else None), stored, overrides)
+            self._check(planned, stored)
+            self.fresh = stored is None and not root.exists()
+            self.stack.enter_context(locked(root, self.command))
+            self.before = stored.manifest if stored else None
+            self.workspace: Workspace = Workspace.create(root, source)
+        else:
+            root = find_workspace(self.options["workspace"])
+            Workspace.open(root)
+            self.stack.enter_context(locked(root, self.command))
+            self.workspace = Workspace.open(root)
+            self.before = self.workspace.manifest.model_copy(deep=True)
+        self.settings: Settings = resolve_settings(self.workspace, overrides, preset)
+        if self.late is not None:
+            overrides = merge(overrides, self.late(self.settings))
+            self.settings = resolve_settings(self.workspace, overrides, preset)
+        manifest = self.workspace.manifest
+        self._check(self.settings, self.workspace)
+        manifest.preset = preset or manifest.preset
+        manifest.overrides = merge(manifest.overrides, overrides)
+        return self
+
+    def __exit__(self, *exception: Any) -> None:
+        self.stack.__exit__(*exception)
+
+    def stages(self, *names: str) -> None:
+        """Run stages in order; flags are remembered once the first one's inputs are known to be there."""
+        from ..core.scene_files import has_test_views
+        from .pipeline import STAGES, require_inputs, run_stage
+
+        require_inputs(STAGES[names[0]], self.workspace, self.settings)
+        self.workspace.manifest.settings = self.settings.model_dump(mode="json")
+        self.workspace.save()
+        if "prepare" in names:
+            size = f"{self.settings.cameras.width}x{self.settings.cameras.height}"
+            self.console.say(f"workspace {self.workspace.root}, preset {self.settings.preset} ({size})")
+        for name in names:
+            if name == "evaluate" and self.command == "run" and not has_test_views(self.workspace):
+                self.console.warn("no test views: nothing is evaluated; prepare with cameras.test > 0")
+                continue
+            try:
+                self.answers[name] = run_stage(
+                    name, self.workspace, self.settings, self.console, force=self.options["force"]
+                )
+            except UserError:
+                if name == "prepare":
+                    self._take_back()
+                raise
+        if self.command not in ("run", "plan", "frontier"):  # these have an answer of their own
+            self.console.result({"workspace": str(self.workspace.root), **self.answers})
+
+    def adopt(self, overrides: dict[str, Any]) -> None:
+        """Settings found by the command itself, remembered as flags are."""
+        from ..core.settings import merge
+
+        manifest = self.workspace.manifest
+        manifest.overrides = merge(manifest.overrides, overrides)
+        self.settings = resolve_settings(self.workspace, {}, manifest.preset)
+
+    def _take_back(self) -> None:
+        """A refused scene or camera file leaves the workspace as it was; a folder made for it is removed."""
+        if self.fresh:
+            shutil.rmtree(self.workspace.root, ignore_errors=True)
+        elif self.before is not None:
+            self.workspace.manifest = self.before
+            self.workspace.save()
+
+    def _check(self, settings: Settings, workspace: Workspace | None) -> None:
+        """Refuse bad camera files and a budget above the candidates before any work is done or folder made."""
+        from ..core.cameras import KEYWORDS, read_camera_file
+        from .select import check_budget, check_rounds
+
+        if self.command in ("run", "select"):
+            check_rounds(settings.select)
+        record = workspace.manifest.stages.get("prepare") if workspace else None
+        if settings.cameras.source not in KEYWORDS and (self.command == "prepare" or self.scene is not None):
+            read_camera_file(Path(settings.cameras.source), settings.cameras)
+        if self.command == "run" and settings.cameras.source in ("auto", "dome", "sphere"):
+            check_budget(settings.select.budget, settings.cameras.train)
+        elif self.command == "select" and record is not None:
+            check_budget(settings.select.budget, record.detail["views"]["train"])
+
+
+def _stored(root: Path, source: Source, *, named: bool) -> Workspace | None:
+    """The workspace that is there, or None. A damaged manifest is put aside: the work is found by its files.
+
+    Raises UserError: it belongs to another scene of the same name and was not named with -w.
+    """
+    from ..core.workspace import DamagedManifest, Workspace
+
+    path = root / "manifest.json"
+    if not path.exists():
+        return None
+    try:
+        workspace = Workspace.open(root)
+    except DamagedManifest:
+        path.replace(root / "manifest.json.damaged")
+        return None
+    other = Path(workspace.manifest.source.path)
+    if not named and str(other) != source.path and other.exists():
+        raise UserError(f"{root}: belongs to {other}; name another workspace with -w")
+    return workspace
+
+
+def resolve_settings(workspace: Workspace, overrides: dict[str, Any], preset: str | None) -> Settings:
+    return resolve_layers(workspace.root, preset or workspace.manifest.preset, workspace, overrides)
+
+
+def resolve_layers(root: Path, preset: str | None, stored: Workspace | None, overrides: dict[str, Any]) -> Settings:
+    """preset < ./dnrpipe.toml < workspace's dnrpipe.toml < environment < flags given before < flags."""
+    from ..core.settings import merge, resolve
+
+    files = [path for path in (Path("dnrpipe.toml"), root / "dnrpipe.toml") if path.is_file()]
+    flags = merge(stored.manifest.overrides if stored else {}, overrides)
+    return resolve(preset, flags, toml_files=files)
+
+
+def _source(scene: Path) -> Source:
+    from ..core.workspace import Source, file_sha256
+
+    if scene.is_dir():
+        raise UserError(f"{scene}: is a folder; name the scene file in it")
+    if not scene.exists():
+        raise UserError(f"{scene}: no such file")
+    return Source(path=str(scene.resolve()), sha256=file_sha256(scene))
+
+
+def _root_for(scene: Path, explicit: str | None) -> Path:
+    named = explicit or os.environ.get("DNRPIPE_WORKSPACE")
+    return Path(named) if named else Path(f"{scene.stem}.dnr")

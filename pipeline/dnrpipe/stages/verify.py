@@ -1,0 +1,189 @@
+"""Check every file of a workspace: does it read, is it what was written, do the parts fit together?
+
+EXRs and weights carry checksums of their contents; ``scene/prepared.json`` those of the converted scene. JSON, pictures
+and archives must read. Nothing is rendered and nothing is executed.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dnrtrain.contract import SPLITS, ContractError, DamagedFile
+
+from ..core.console import Console
+from ..core.errors import UserError
+from ..core.workspace import Workspace, file_sha256
+from .pipeline import discard, owner_of
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One file with something wrong. stage: the command that makes it again, or None; leftover: litter of a kill."""
+
+    path: Path
+    reason: str
+    stage: str | None = None
+    leftover: bool = False
+
+
+def examine(workspace: Workspace, console: Console) -> tuple[int, list[Fault]]:
+    """Read all files of the workspace -> (files checked, what is wrong with any). Raises nothing for damage."""
+    work = list(_checks(workspace))
+    faults: list[Fault] = []
+    with console.bar("checking files", len(work)) as bar:
+        for path, check in work:
+            try:
+                bar.advance(note=path.name)
+                check(path)
+            except DamagedFile as damage:
+                if damage.path != path:  # a file that this one refers to; it has its own check
+                    continue
+                owner = owner_of(path, workspace)
+                faults.append(Fault(path, f"damaged ({damage.reason})", owner.command if owner else None))
+            except (ContractError, UserError, OSError) as error:
+                text = str(error).removeprefix(f"{path}: ")
+                owner = owner_of(path, workspace)
+                faults.append(Fault(path, text, owner.command if owner else None))
+    faults += [Fault(path, "left behind by a run that was killed", None, True) for path in _litter(workspace.root)]
+    return len(work), faults
+
+
+def repair(workspace: Workspace, faults: list[Fault]) -> list[str]:
+    """Throw away what is damaged or litter -> the commands that make it again, in pipeline order.
+
+    Files of no stage stay, but for litter: what they are is for their owner to say.
+    """
+    from .pipeline import STAGES
+
+    due = set()
+    for fault in faults:
+        owner = owner_of(fault.path, workspace)
+        if fault.leftover or fault.path == workspace.root / "base" / "light.npz":
+            fault.path.unlink(missing_ok=True)
+        elif owner is not None:
+            discard(fault.path, owner, workspace)
+            due.add(owner.command)
+    return [stage.command for stage in STAGES.values() if stage.command in due]
+
+
+def _checks(workspace: Workspace) -> Iterator[tuple[Path, Callable[[Path], None]]]:
+    """Each file that is there, with the function that raises when something is wrong with it."""
+    root = workspace.root
+    yield from ((path, _cameras) for path in map(workspace.cameras, SPLITS) if path.exists())
+    yield from _scene(workspace)
+    for folder in ("passes", "raytraced", "base", "renders"):
+        yield from ((path, _exr) for path in sorted((root / folder).rglob("[!.]*.exr")))
+    if workspace.selection.exists():
+        yield workspace.selection, lambda _: _selection(workspace)
+    for step in ("step1", "step2"):
+        folder = workspace.checkpoints(step)
+        yield from ((path, _weights) for path in sorted(folder.glob("[!.]*.safetensors")))
+        yield from ((path, _json) for path in sorted(folder.glob("[!.]*.json")))
+    for folder in ("evaluation", "renders"):
+        yield from ((path, _json) for path in sorted((root / folder).rglob("[!.]*.json")))
+        yield from ((path, _picture) for path in sorted((root / folder).rglob("[!.]*.png")))
+    light = root / "base" / "light.npz"
+    if light.exists():
+        yield light, _archive
+    if workspace.ledger.path.exists():
+        yield workspace.ledger.path, lambda path: _ledger(workspace, path)
+
+
+def _scene(workspace: Workspace) -> Iterator[tuple[Path, Callable[[Path], None]]]:
+    marker = workspace.scene / "prepared.json"
+    if not workspace.scene.exists():
+        return
+    yield marker, _json
+    frame = workspace.scene / "frame.json"
+    yield frame, lambda _: _frame(workspace)
+    try:
+        files = json.loads(marker.read_text(encoding="utf-8")).get("files", {})
+    except (OSError, ValueError, AttributeError, RecursionError):
+        return  # said by the check of the marker itself
+    for name, wanted in files.items() if isinstance(files, dict) else ():
+        path = workspace.scene / str(name)
+        if path.resolve().is_relative_to(workspace.scene.resolve()):
+            yield path, lambda path, wanted=wanted: _same(path, wanted)
+
+
+def _same(path: Path, wanted: Any) -> None:
+    if not path.is_file():
+        raise DamagedFile(path, "is gone")
+    if file_sha256(path) != wanted:
+        raise DamagedFile(path, "is not what was written")
+
+
+def _cameras(path: Path) -> None:
+    from dnrtrain.contract import read_cameras
+
+    read_cameras(path)
+
+
+def _exr(path: Path) -> None:
+    from dnrtrain.exr import read_exr
+
+    read_exr(path)
+
+
+def _weights(path: Path) -> None:
+    from dnrtrain.checkpoint import load, read_record
+
+    load(path)
+    if path.name == "model.safetensors" and read_record(path.parent) is None:
+        raise DamagedFile(path, "model.json is missing, damaged or of other weights")
+
+
+def _json(path: Path) -> None:
+    from ..core.scene_files import read_json
+
+    read_json(path)
+
+
+def _frame(workspace: Workspace) -> None:
+    from ..core.scene_files import read_frame
+
+    read_frame(workspace)
+
+
+def _selection(workspace: Workspace) -> None:
+    from .trainer import read_selection
+
+    read_selection(workspace)
+
+
+def _picture(path: Path) -> None:
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            image.load()
+    except (OSError, SyntaxError, ValueError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+        raise DamagedFile(path, f"PNG: {error}") from None
+
+
+def _archive(path: Path) -> None:
+    import numpy as np
+
+    from dnrtrain.contract import NPZ_ERRORS
+
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            for name in data.files:
+                data[name]  # reads it, and compares zip's checksum
+    except NPZ_ERRORS as error:
+        raise DamagedFile(path, str(error)) from None
+
+
+def _ledger(workspace: Workspace, path: Path) -> None:
+    torn = workspace.ledger.torn_lines()
+    if torn:
+        raise DamagedFile(path, f"{torn} lines do not read and are left out of all sums")
+
+
+def _litter(root: Path) -> list[Path]:
+    """Temporary names of :func:`dnrtrain.atomic.atomic_path` whose process has gone."""
+    return sorted(path for path in root.rglob(".*.tmp*") if path.is_file())

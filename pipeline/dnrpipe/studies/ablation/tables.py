@@ -1,0 +1,234 @@
+"""Markdown tables of an ablation: ``python -m dnrpipe.studies.ablation.tables results.json``."""
+
+from __future__ import annotations
+
+import math
+import statistics
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ..cells.scenes import HARD_LIGHT
+from ..cells.tables import NONE, code_of, spread, table
+from .results import known_rows, read_results
+from .rows import ROWS
+
+# Wu, Li, Wei: DNRSelect, table I (25 views, NeRF-Synthetic, 800²): PSNR, SSIM, LPIPS.
+PUBLISHED = {
+    "full": (28.12, 0.8506, 0.0479),
+    "paper-no-augmentation": (26.64, 0.8179, 0.0542),
+    "paper-one-loss": (27.19, 0.8296, 0.0497),
+    "paper-random": (27.14, 0.8314, 0.0498),
+    "paper-uv": (27.84, 0.8470, 0.0503),
+}
+COLUMNS: tuple[tuple[str, str, int], ...] = (
+    ("psnr", "PSNR", 2),
+    ("psnr_mask", "PSNR in mask", 2),
+    ("ssim", "SSIM", 4),
+    ("lpips_vgg", "LPIPS VGG", 4),
+    ("lpips_alex", "LPIPS Alex", 4),
+    ("flip", "FLIP", 4),
+    ("train_seconds", "training, s wall", 0),
+    ("train_cpu_seconds", "s CPU", 0),
+    ("frame_ms", "network, ms/frame", 1),
+    ("base_ms", "base, ms/frame", 1),
+)
+PER_SCENE = (("psnr", "PSNR, dB", 2), ("psnr_mask", "PSNR inside the mask, dB", 2), ("ssim", "SSIM", 4),
+             ("lpips_vgg", "LPIPS (VGG)", 4))  # fmt: skip
+RIVALS = ("vanilla", "paper")
+
+
+class Figures:
+    """Cells by (scene, row, seed), and their means."""
+
+    def __init__(self, results: Mapping[str, Any]) -> None:
+        self.rows = known_rows(results)
+        self.cells = {(cell["scene"], cell["row"], cell["seed"]): cell for cell in results["cells"]}
+        self.scenes = [name for name in results["scenes"] if any(key[0] == name for key in self.cells)]
+        self.seeds = sorted({key[2] for key in self.cells})
+
+    def scene(self, row: str, metric: str, scene: str) -> list[float]:
+        """Values of a row on one scene, one per seed that is there."""
+        values = [self.cells[scene, row, seed][metric] for seed in self.seeds if (scene, row, seed) in self.cells]
+        return [value for value in values if value is not None]
+
+    def mean(self, row: str, metric: str, scenes: Sequence[str]) -> list[float]:
+        """Means of a row over ``scenes``, one per seed; seeds that lack a scene are left out."""
+        means = []
+        for seed in self.seeds:
+            found = [self.cells.get((scene, row, seed), {}).get(metric) for scene in scenes]
+            if found and all(value is not None for value in found):
+                means.append(statistics.fmean(found))  # pyright: ignore[reportArgumentType]
+        return means
+
+    def same(self, row: str, other: str) -> bool:
+        """Whether the rows come to the same settings: their cells are the same."""
+        keys = [{place[::2]: c["key"] for place, c in self.cells.items() if place[1] == name} for name in (row, other)]
+        return keys[0] == keys[1]
+
+    def difference(self, row: str, other: str, metric: str, scenes: Sequence[str]) -> list[float]:
+        """Means over ``scenes`` of row - other, one per seed that both have."""
+        return self._paired(row, other, metric, scenes, lambda a, b: a - b)
+
+    def ratio(self, row: str, other: str, metric: str, scenes: Sequence[str]) -> list[float]:
+        """Means over ``scenes`` of row over other, one per seed that both have."""
+        return self._paired(row, other, metric, scenes, lambda a, b: a / b if b else math.nan)
+
+    def _paired(
+        self, row: str, other: str, metric: str, scenes: Sequence[str], compare: Callable[[float, float], float]
+    ) -> list[float]:
+        found = []
+        for seed in self.seeds:
+            pairs = [
+                (self.cells.get((s, row, seed), {}).get(metric), self.cells.get((s, other, seed), {}).get(metric))
+                for s in scenes
+            ]
+            if pairs and all(a is not None and b is not None for a, b in pairs):
+                found.append(statistics.fmean(compare(a, b) for a, b in pairs))  # pyright: ignore[reportArgumentType]
+        return found
+
+
+def markdown(results: Mapping[str, Any]) -> str:
+    """All tables that the results can fill."""
+    figures = Figures(results)
+    parts = [_provenance(results, figures), _means(figures, figures.scenes, _mean_title(figures.scenes))]
+    easy = [scene for scene in figures.scenes if scene not in HARD_LIGHT]
+    if 1 < len(easy) < len(figures.scenes):
+        parts.append(_means(figures, easy, f"Mean over the {len(easy)} scenes without hard light"))
+    parts += [_per_scene(figures, *column) for column in PER_SCENE]
+    parts += [_gains(figures), _paper(figures), _figure7(figures), _ingredients(figures)]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _mean_title(scenes: Sequence[str]) -> str:
+    return f"Mean over {len(scenes)} scenes" if len(scenes) > 1 else scenes[0]
+
+
+def _provenance(results: Mapping[str, Any], figures: Figures) -> str:
+    box = results["machine"]
+    time = f"about {results['seconds']:g} s of training for every row" if results["seconds"] else "the preset's epochs"
+    return (
+        f"`{results['command']}`, {results['date'][:10]}, {code_of(results)}; {box['processor']},"
+        f" {box['cores']} cores, torch {results['versions']['torch']}. Preset"
+        f" {results['preset']}, {results['resolution']}, {results['budget']}"
+        f" training views, {len(figures.seeds)} seed(s), {time}. PSNR and SSIM over white; ± is the standard deviation"
+        " over seeds; training time includes step 1 where a row has it."
+    )
+
+
+def _means(figures: Figures, scenes: Sequence[str], title: str) -> str:
+    rows = []
+    for row in figures.rows:
+        cells = [spread(figures.mean(row, metric, scenes), digits) for metric, _, digits in COLUMNS]
+        rows.append([f"`{row}`", ROWS[row].what, *cells])
+    body = table(["row", "what", *[title for _, title, _ in COLUMNS]], rows)
+    ceiling = [
+        max(found)
+        for scene in scenes
+        if (found := [v for r in figures.rows for v in figures.scene(r, "ceiling", scene)])
+    ]
+    note = f"\n\nMean ceiling by the noise of the references: {statistics.fmean(ceiling):.1f} dB." if ceiling else ""
+    return f"### {title}\n\n{body}{note}"
+
+
+def _per_scene(figures: Figures, metric: str, title: str, digits: int) -> str:
+    head = ["scene", *[f"`{row}`" for row in figures.rows]]
+    psnr = metric == "psnr"
+    rows = []
+    for scene in figures.scenes:
+        line = [scene, *[spread(figures.scene(row, metric, scene), digits) for row in figures.rows]]
+        rows.append([*line, spread(figures.scene(figures.rows[0], "ceiling", scene)[:1], 1)] if psnr else line)
+    return f"### {title}, per scene\n\n{table([*head, 'ceiling'] if psnr else head, rows)}"
+
+
+def _gains(figures: Figures) -> str:
+    rivals = [row for row in RIVALS if row in figures.rows]
+    if "dnr" not in figures.rows or not rivals:
+        return ""
+    head = ["scene", *[f"{what} `{rival}`" for rival in rivals for what in ("ΔPSNR over", "LPIPS VGG over")]]
+    rows = []
+    for name, scenes in [*[(scene, [scene]) for scene in figures.scenes], ("**mean**", figures.scenes)]:
+        line = [name]
+        for rival in rivals:
+            line.append(spread(figures.difference("dnr", rival, "psnr", scenes), 2, signed=True))
+            line.append(spread(figures.ratio("dnr", rival, "lpips_vgg", scenes), 2))
+        rows.append(line)
+    return f"### `dnr` against its rivals\n\n{table(head, rows)}"
+
+
+def _paper(figures: Figures) -> str:
+    """The paper's table: each mechanism taken away, against the row that has it."""
+    rows = []
+    for row, published in PUBLISHED.items():
+        if row not in figures.rows or (other := ROWS[row].against) not in figures.rows:
+            continue
+        theirs = published[0] - PUBLISHED["full"][0]
+        ours = figures.difference(row, other, "psnr", figures.scenes)
+        rows.append(
+            [
+                ROWS[row].what,
+                f"{theirs:+.2f}",
+                spread(ours, 2, signed=True),
+                spread(figures.difference(row, other, "ssim", figures.scenes), 4, signed=True),
+                spread(figures.difference(row, other, "lpips_vgg", figures.scenes), 4, signed=True),
+                _verdict(theirs, ours),
+            ]
+        )
+    if not rows:
+        return ""
+    head = ["taken away", "ΔPSNR, paper", "ΔPSNR, ours", "ΔSSIM, ours", "ΔLPIPS VGG, ours", "paper's order"]
+    return f"### The paper's table: what each mechanism is worth\n\n{table(head, rows)}"
+
+
+def _verdict(theirs: float, ours: Sequence[float]) -> str:
+    if not ours:
+        return NONE
+    if len(ours) > 1 and abs(statistics.fmean(ours)) <= statistics.stdev(ours):
+        return "within the seeds' spread"
+    return "reproduced" if (statistics.fmean(ours) < 0) == (theirs < 0) else "not reproduced"
+
+
+def _figure7(figures: Figures) -> str:
+    parts = []
+    for title, names in (
+        ("Fig. 7a: how the maps are aggregated", ("paper", "paper-early", "paper-uv")),
+        ("Fig. 7b: which maps are aggregated", ("paper-uv", "paper-uv-depth", "paper-uv-normal", "paper")),
+    ):
+        if not all(name in figures.rows for name in names):
+            continue
+        rows = [
+            [ROWS[name].what, *[spread(figures.mean(name, m, figures.scenes), d) for m, _, d in COLUMNS[:6]]]
+            for name in names
+        ]
+        parts.append(f"### {title}\n\n{table(['', *[head for _, head, _ in COLUMNS[:6]]], rows)}")
+    return "\n\n".join(parts)
+
+
+def _ingredients(figures: Figures) -> str:
+    """Our ingredients, one changed at a time: differences from ``dnr``."""
+    names = [row for row in figures.rows if ROWS[row].family == "dnr" and row != "dnr"]
+    if "dnr" not in figures.rows or not names:
+        return ""
+    rows = []
+    for name in names:
+        line = [f"`{name}`", ROWS[name].what]
+        if figures.same(name, "dnr"):
+            rows.append([*line, "is `dnr`", *[""] * 4])
+            continue
+        for metric, digits in (("psnr", 2), ("ssim", 4), ("lpips_vgg", 4)):
+            line.append(spread(figures.difference(name, "dnr", metric, figures.scenes), digits, signed=True))
+        milliseconds = [spread(figures.mean(name, part, figures.scenes), 1) for part in ("frame_ms", "base_ms")]
+        rows.append([*line, *milliseconds])
+    head = ["row", "what differs from `dnr`", "ΔPSNR", "ΔSSIM", "ΔLPIPS VGG", "network, ms", "base, ms"]
+    return f"### Ingredients of `dnr`, one changed at a time\n\n{table(head, rows)}"
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Print the tables of a results file."""
+    print(markdown(read_results(Path(arguments[0]))), end="")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))

@@ -1,0 +1,7 @@
+"""What studies share: train and measure one (scene, variant, seed).
+
+cell          the worker: one cell
+worker_pool   how many workers, on how many threads
+scenes        a study's workspaces: passes, ray-traced views, references, base images
+measure       pictures -> metrics and milliseconds
+"""

@@ -1,0 +1,93 @@
+"""What a results file says of its making: command, commit, date, machine, versions."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from ...core.errors import UserError
+
+PACKAGES = ("dnrpipe", "torch", "numpy", "mitsuba", "bpy", "flip-evaluator")
+SOURCE = Path(__file__).resolve().parents[4]
+
+
+def read_made(path: Path, command: str, schema: int, part: str) -> dict[str, Any]:
+    """A results file of ``dnrpipe command``, known by its schema and by having ``part``. Raises UserError: is it not,
+    or missing or damaged."""
+    try:
+        results = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file; make it with `dnrpipe {command}`") from None
+    except (json.JSONDecodeError, UnicodeDecodeError):
+        raise UserError(f"{path}: damaged; run `dnrpipe {command}` again") from None
+    if not isinstance(results, dict) or results.get("schema") != schema or part not in results:
+        raise UserError(f"{path}: not results of this version's `dnrpipe {command}`; run it again")
+    return results
+
+
+def made_by() -> dict[str, Any]:
+    """What results say of their making: command, commit, date, machine, versions."""
+    return {
+        "command": shlex.join(["dnrpipe", *sys.argv[1:]]),
+        **code_state(),
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "machine": machine(),
+        "versions": versions(),
+    }
+
+
+@functools.cache
+def code_state() -> dict[str, Any]:
+    """{"commit": hash or None outside of a repository, "dirty": whether tracked files differ from it}."""
+    commit = _git("rev-parse", "HEAD")
+    return {"commit": commit, "dirty": bool(_git("status", "--porcelain", "--untracked-files=no")) if commit else None}
+
+
+def machine() -> dict[str, Any]:
+    """Processor, cores that this process may use, memory in GiB, operating system."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 0
+    return {
+        "processor": _processor(),
+        "cores": cores,
+        "memory_gib": round(memory / 2**30, 1),
+        "system": f"{platform.system()} {platform.machine()}",
+    }
+
+
+def versions() -> dict[str, str | None]:
+    """Versions of Python and of what decides the figures; None where not installed."""
+    found: dict[str, str | None] = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def _git(*arguments: str) -> str | None:
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(SOURCE), *arguments], capture_output=True, text=True, timeout=30, check=True
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()

@@ -1,0 +1,232 @@
+"""What all cells of a scene share: its workspace, ray-traced views, references and base images."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dnrtrain.contract import View
+
+from ...core.console import Console
+from ...core.errors import UserError
+from ...core.ledger import CostRecord
+from ...core.scene_files import read_json, scene_fingerprint, split_views
+from ...core.settings import Settings
+from ...core.workspace import Source, Workspace, file_sha256
+from ...stages.pipeline import run_stage
+from ...stages.prepare import pass_common, pass_task
+from ...stages.raytrace import trace_views
+from ...workers.view_tasks import run_view_tasks, view_record, worker_count
+
+COLLECTION = Path(__file__).resolve().parents[4] / "blender_scenes"
+"""The scenes of the repository; installed from a wheel there are none, and scenes are named by their files."""
+BENCHMARK = (
+    "bricks", "drums", "foliage", "food", "furniture", "materials", "microphone", "ship", "interior", "jewels"
+)  # fmt: skip
+HARD_LIGHT = ("interior", "jewels")
+
+
+@dataclass
+class Scene:
+    """One prepared scene. ``train`` and ``test``: views by name; ``inputs``: hash of passes and cameras."""
+
+    name: str
+    workspace: Workspace
+    train: dict[str, View]
+    test: dict[str, View]
+    inputs: str
+    run_id: str = field(default_factory=lambda: f"ablate-{int(time.time()):x}")
+
+    def farthest(self, budget: int) -> list[str]:
+        """Farthest-point selection: the same views for every seed."""
+        return self._baseline("farthest", budget, 0)
+
+    def random(self, budget: int, seed: int) -> list[str]:
+        """A random selection of the seed."""
+        return self._baseline("random", budget, seed)
+
+    def _baseline(self, policy: str, budget: int, seed: int) -> list[str]:
+        import numpy as np
+
+        from dnrtrain.selector.policies import untrained
+        from dnrtrain.selector.protocol import Candidates
+
+        names = list(self.train)
+        positions = np.stack([self.train[name].position for name in names])
+        directions = np.stack([-self.train[name].matrix[:3, 2] for name in names])
+        rule = untrained(policy)
+        assert rule is not None  # both names above are rules
+        return [names[i] for i in rule.choose(Candidates(positions, directions), budget, seed).views]
+
+
+def find_scenes(text: str | None) -> list[Path]:
+    """Scene files: paths, or names of the repository's scenes; None is the ten benchmark scenes.
+
+    Raises UserError: no such scene, or two of one name.
+    """
+    found: list[Path] = []
+    for name in [part.strip() for part in text.split(",") if part.strip()] if text else BENCHMARK:
+        candidates = (Path(name), COLLECTION / f"{name}.blend", COLLECTION / "hard" / f"{name}.blend")
+        path = next((p for p in candidates if p.is_file()), None)
+        if path is None:
+            raise UserError(f"--scenes {name}: neither a scene file nor a scene of {COLLECTION}")
+        found.append(path.resolve())
+    if not found:
+        raise UserError("--scenes: names no scene")
+    stems = [path.stem for path in found]
+    if twice := {stem for stem in stems if stems.count(stem) > 1}:
+        raise UserError(f"--scenes: two scenes are named {', '.join(sorted(twice))}; results are filed by name")
+    return found
+
+
+def prepare_scene(source: Path, out: Path, settings: Settings, console: Console) -> Scene:
+    """Make or find the scene's workspace ``<out>/scenes/<name>.dnr`` and its passes."""
+    root = out / "scenes" / f"{source.stem}.dnr"
+    workspace = Workspace.create(root, Source(path=str(source), sha256=file_sha256(source)))
+    return prepared(source.stem, workspace, settings, console)
+
+
+def prepared(name: str, workspace: Workspace, settings: Settings, console: Console) -> Scene:
+    """The workspace's passes, made where they are missing. Raises UserError: no test views, too few candidates."""
+    run_stage("prepare", workspace, settings, Console(json_mode=console.json_mode, quiet=True))
+    views = split_views(workspace)
+    if not views.get("test"):
+        raise UserError(f"{name}: has no test views to measure on; set cameras.test > 0")
+    train = {view.name: view for view in views["train"]}
+    if settings.select.budget > len(train):
+        raise UserError(f"a budget of {settings.select.budget} views: {name} has {len(train)} candidate views")
+    return Scene(
+        name,
+        workspace,
+        train,
+        {view.name: view for view in views["test"]},
+        workspace.manifest.stages["prepare"].output,
+    )
+
+
+def trace_train(
+    scene: Scene, settings: Settings, console: Console, names: Iterable[str], spp: int | None = None
+) -> dict[str, str]:
+    """Path-trace the named candidates that are not there yet -> fingerprint of each view's file.
+
+    spp: instead of the settings'; the pictures then lie in a split of their own (:func:`traced_split`).
+    """
+    chosen = set(names)
+    wanted = [view for name, view in scene.train.items() if name in chosen]
+    return _trace(scene, settings, console, wanted, traced_split(settings, spp), spp)
+
+
+def traced_split(settings: Settings, spp: int | None) -> str:
+    """Folder under ``raytraced/`` of training views at ``spp`` samples; the settings' samples lie in ``train``."""
+    return "train" if spp in (None, settings.raytrace.spp) else f"train-{spp}spp"
+
+
+def trace_references(scene: Scene, settings: Settings, console: Console) -> dict[str, str]:
+    """Path-trace the test views, booked as evaluation -> fingerprint of each view's file."""
+    return _trace(scene, settings, console, list(scene.test.values()), "test")
+
+
+def make_bases(scene: Scene, settings: Settings, console: Console, train: Sequence[str]) -> dict[str, str]:
+    """Make the base images that ``settings`` call for, of the named candidates and all test views.
+
+    -> fingerprint of each view's base image by ``train/NAME`` or ``test/NAME``.
+    """
+    workspace = scene.workspace
+    if settings.model.base == "raster":
+        made = {f"test/{name}": stamp for name, stamp in _raster_test_views(scene, settings, console).items()}
+        return made | {f"train/{name}": scene.inputs for name in train}  # `prepare` drew them
+    from ...stages.base_images import base_views
+
+    chosen = {"train": [scene.train[name] for name in train], "test": list(scene.test.values())}
+    made = {}
+    for split, views in chosen.items():
+        test = split == "test"
+        tasks = base_views(
+            workspace,
+            settings,
+            console,
+            scene.run_id,
+            views=views,
+            split=split,
+            stage="evaluate" if test else "finetune",
+            purpose="evaluation" if test else "training",
+            paths=[base_file(workspace, settings.model.base, split, view.name) for view in views],
+        )
+        made |= {f"{split}/{view.name}": task["fingerprint"] for view, task in zip(views, tasks, strict=True)}
+    return made
+
+
+def base_file(workspace: Workspace, kind: str, split: str, view: str) -> Path:
+    """Where a view's base image lies: the workspace's own place for baked ones, beside it for the kinds it is not."""
+    from ...stages.base_images import base_path
+
+    return base_path(workspace, split, view) if kind == "baked" else base_path(workspace, f"{kind}-{split}", view)
+
+
+def raster_file(workspace: Workspace, view: str) -> Path:
+    """Where a test view's passes with rasterised colour lie (`prepare` leaves that colour out)."""
+    return workspace.root / "base" / "raster-test" / f"{view}.exr"
+
+
+def _raster_test_views(scene: Scene, settings: Settings, console: Console) -> dict[str, str]:
+    workspace = scene.workspace
+    engine = read_json(workspace.root / "passes" / "raster.json")["engine"]
+    scene_print = scene_fingerprint(workspace)
+    tasks = [
+        pass_task(
+            workspace,
+            settings,
+            view,
+            "test",
+            scene_print,
+            engine,
+            raster=True,
+            output=raster_file(workspace, view.name),
+        )
+        for view in scene.test.values()
+    ]
+
+    def book(task: dict[str, Any], result: dict[str, Any], workers: int) -> CostRecord:
+        return view_record(
+            run=scene.run_id,
+            stage="prepare",
+            purpose="evaluation",
+            task=task,
+            result=result,
+            workers=workers,
+            device="cpu",
+        )
+
+    run_view_tasks(
+        "rasterised test views",
+        "dnrpipe.blender.passes.worker",
+        pass_common(workspace, settings, engine),
+        tasks,
+        workspace=workspace,
+        console=console,
+        stage="prepare",
+        workers=worker_count(settings.passes.workers),
+        book=book,
+    )
+    return {name: task["fingerprint"] for name, task in zip(scene.test, tasks, strict=True)}
+
+
+def _trace(
+    scene: Scene, settings: Settings, console: Console, views: list[View], split: str, spp: int | None = None
+) -> dict[str, str]:
+    test = split == "test"
+    tasks = trace_views(
+        scene.workspace,
+        settings,
+        console,
+        scene.run_id,
+        views=views,
+        split=split,
+        spp=settings.raytrace.evaluation_spp if test else spp or settings.raytrace.spp,
+        stage="evaluate" if test else "raytrace",
+        purpose="evaluation" if test else "training",
+    )
+    return {view.name: task["fingerprint"] for view, task in zip(views, tasks, strict=True)}

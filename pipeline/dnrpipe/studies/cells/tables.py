@@ -1,0 +1,32 @@
+"""Markdown helpers of the studies' tables."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+NONE = "–"
+
+
+def spread(values: Sequence[float], digits: int, *, signed: bool = False) -> str:
+    """``mean ± standard deviation`` (of the sample) over seeds; the mean alone where there is one seed."""
+    if not values:
+        return NONE
+    text = f"{statistics.fmean(values):{'+' if signed else ''}.{digits}f}"
+    return f"{text} ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else text
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table; all columns but the first are right-aligned."""
+    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def code_of(results: Mapping[str, Any]) -> str:
+    """The commit that made the results, and those of its cells where they differ."""
+    commits = sorted({cell["commit"] for cell in results["cells"] if cell["commit"]})
+    state = f"commit {(results['commit'] or 'unknown')[:12]}{' with changes' if results['dirty'] else ''}"
+    if len(commits) > 1:
+        state += f" (cells of {len(commits)} commits: {', '.join(commit[:12] for commit in commits)})"
+    return state

@@ -1,0 +1,78 @@
+"""Worker processes for cells: how many, on how many threads, and a loop that leaves out what is done."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ...core.console import Console
+from ...core.errors import UserError
+from ...core.settings import Settings
+from ...stages.trainer import torch_device
+from ...workers.processes import Retry, run_tasks
+from ...workers.view_tasks import TasksFailed, worker_count
+
+
+@dataclass(frozen=True)
+class Crew:
+    """``device``: torch's. ``threads``: of each worker, 0 = torch's own choice. ``log``: what workers print."""
+
+    device: str
+    threads: int
+    workers: int
+    log: Path
+    console: Console
+
+    def work(self, label: str, module: str, tasks: Sequence[dict[str, Any]]) -> None:
+        """Run the tasks whose ``output`` file is missing on workers of ``module``.
+
+        Raises TasksFailed after all others are done.
+        """
+        due = [task for task in tasks if not Path(task["output"]).exists()]
+        if not due:
+            return
+        threads = {name: str(self.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")} if self.threads else {}
+        common = {"threads": self.threads, "device": self.device}
+        failed: list[str] = []
+        with self.console.bar(label, len(tasks), len(tasks) - len(due)) as bar:
+            outcomes = run_tasks(module, common, due, workers=self.workers, log=self.log, environment=threads)
+            try:
+                for outcome in outcomes:
+                    if isinstance(outcome, Retry):
+                        self.console.warn(f"{outcome.task['label']}: {outcome.reason}; trying once more")
+                    elif outcome.result is None:
+                        self.console.warn(f"{outcome.task['label']} failed: {outcome.error}")
+                        failed.append(outcome.task["label"])
+                        bar.advance()
+                    else:
+                        bar.advance(note=outcome.task["label"])
+            finally:
+                outcomes.close()  # type: ignore[attr-defined]
+        if failed:
+            raise TasksFailed(
+                f"{label}: {len(failed)} of {len(due)} failed ({', '.join(failed[:5])}); the others are done."
+                f" See {self.log}; run the same command to try again"
+            )
+
+
+def check_amounts(seconds: float | None, seeds: int, jobs: int) -> None:
+    """Raises UserError: an amount of work that is none."""
+    if seconds is not None and not seconds > 0:
+        raise UserError(f"--seconds {seconds:g}: must be more than 0")
+    if seeds < 1 or jobs < 0:
+        raise UserError(f"--seeds {seeds} --jobs {jobs}: at least 1 seed; jobs from 0 (one per core)")
+
+
+def make_crew(settings: Settings, jobs: int, log: Path, console: Console, *, single: bool = False) -> Crew:
+    """``jobs`` workers, or 0: one per core, one on a GPU.
+
+    Cells side by side on a thread each finish more per hour than one after the other on all cores. single: one thread
+    a worker also where there are fewer workers than cores, so that ``jobs`` does not enter what comes out.
+    """
+    device, cores = torch_device(settings), worker_count(0)
+    on_gpu = device.startswith("cuda")
+    workers = jobs or (1 if on_gpu else cores)
+    threads = 0 if on_gpu else 1 if single else max(1, cores // workers)
+    return Crew(device, threads, workers, log, console)

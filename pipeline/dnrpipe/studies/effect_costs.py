@@ -1,0 +1,157 @@
+"""`dnrpipe effects`: the plan as a table, its overrides, and its columns measured."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from ..core.effect_names import FORCEABLE, NAMES, EffectName
+from ..core.errors import UserError
+from ..core.ledger import CostRecord
+from ..effects.plan import Effect, EffectPlan
+from ..effects.store import keep_plan, pilot_views, plan_of, resolve_plan, run_pilots, trace_config, variant_for
+from ..raytrace.statistics import Measured
+
+if TYPE_CHECKING:
+    from ..core.settings import Settings
+    from ..stages.session import Session
+
+MEASURE_SPP = 16  # of each half
+
+
+def override_settings(
+    enable: Sequence[str], disable: Sequence[str], auto: Sequence[str]
+) -> Callable[[Settings], dict[str, Any]]:
+    """The settings that the flags change, given those in force. Raises UserError for a name that is no effect."""
+    for name in (*enable, *disable, *auto):
+        if name not in NAMES:
+            raise UserError(f"no effect '{name}'; they are {', '.join(NAMES)}")
+    twice = {name for name in enable if name in disable}
+    if twice:
+        raise UserError(f"--enable and --disable {sorted(twice)[0]}: give one of them")
+
+    def change(settings: Settings) -> dict[str, Any]:
+        if not (enable or disable or auto):
+            return {}
+        now = settings.effects
+        dropped = {*enable, *disable, *auto}
+        return {
+            "effects": {
+                "enable": [*(n for n in now.enable if n not in dropped), *dict.fromkeys(enable)],
+                "disable": [*(n for n in now.disable if n not in dropped), *dict.fromkeys(disable)],
+            }
+        }
+
+    return change
+
+
+def show_effects(session: Session, *, measure: bool) -> None:
+    """Print the plan; with ``measure``, fill its columns first."""
+    workspace, settings, console = session.workspace, session.settings, session.console
+    _require_scene(session)
+    plan = plan_of(workspace, settings)
+    for name in settings.effects.disable:
+        if plan.on(name):
+            raise UserError(f"--disable {name}: cannot be left out of this scene; undo with --auto {name}")
+    for name in settings.effects.enable:
+        if not plan.on(name) and name not in settings.effects.disable:
+            raise UserError(f"--enable {name}: there is nothing to simulate ({plan.effect(name).evidence[0]})")
+    workspace.save()
+    if measure:
+        run_id = f"effects-{int(time.time()):x}"
+        plan = resolve_plan(workspace, settings, console, run_id, "prepare")
+        plan = measure_plan(session, plan, run_id)
+        keep_plan(workspace, plan)
+    if not console.json_mode:
+        console.say(table(plan))
+    console.result({"workspace": str(workspace.root), **plan.model_dump(mode="json")})
+
+
+def _require_scene(session: Session) -> None:
+    from ..stages.pipeline import STAGES, state
+
+    found = state(STAGES["prepare"], session.workspace, session.settings)
+    if found in ("missing", "stale"):
+        why = {"missing": "has not run", "stale": "is out of date"}[found]
+        raise UserError(f"effects: prepare {why} for {session.workspace.root}; run `dnrpipe prepare` first")
+
+
+def measure_plan(session: Session, plan: EffectPlan, run_id: str) -> EffectPlan:
+    """The plan with cost and error of every effect that changes how views are traced.
+
+    Each effect is compared with the same plan but for that effect, on a few training views with the same seeds.
+    """
+    workspace, settings, console = session.workspace, session.settings, session.console
+    choice = variant_for(plan, settings)
+    base = trace_config(workspace, plan, choice.variant)
+    rows: list[tuple[EffectName, dict[str, Any]]] = []
+    for effect in plan.effects:
+        other = _toggled(session, plan, effect)
+        if other is None:
+            continue
+        config = trace_config(workspace, other, choice.variant)
+        if config == base:
+            continue
+        pair = (base, config) if effect.on else (config, base)
+        views = pilot_views(workspace, settings, plan if plan.on("depth-of-field") else other)
+        task = {"kind": "compare", "with": pair[0], "without": pair[1], "views": views, "spp": MEASURE_SPP}
+        rows.append((effect.name, task))
+    answers = run_pilots(workspace, [task for _, task in rows], choice, console, "measuring effects", "effects")
+    measured = {}
+    for (name, _), answer in zip(rows, answers, strict=True):
+        measured[name] = {key: Measured.model_validate(answer[key]) for key in ("cost", "error")}
+        workspace.ledger.append(
+            CostRecord(
+                time=time.time(),
+                run=run_id,
+                stage="prepare",
+                purpose="evaluation",
+                unit="scene",
+                name=f"effect/{name}",
+                seconds=answer["seconds"],
+                device=f"mitsuba {choice.variant}",
+            )
+        )
+    effects = tuple(effect.model_copy(update=measured.get(effect.name, {})) for effect in plan.effects)
+    return plan.model_copy(update={"effects": effects})
+
+
+def _toggled(session: Session, plan: EffectPlan, effect: Effect) -> EffectPlan | None:
+    """The plan with one light effect the other way round; None where there is nothing to switch."""
+    if effect.part == "neural" or not (effect.present or effect.name in FORCEABLE):
+        return None
+    chosen = session.settings.effects
+    enable: tuple[EffectName, ...] = tuple(name for name in chosen.enable if name != effect.name)
+    disable: tuple[EffectName, ...] = tuple(name for name in chosen.disable if name != effect.name)
+    if effect.on:
+        disable = (*disable, effect.name)
+    else:
+        enable = (*enable, effect.name)
+    return plan_of(session.workspace, session.settings, enable=enable, disable=disable, pilot=plan.pilot)
+
+
+def table(plan: EffectPlan) -> str:
+    """The plan as aligned lines: effect, on or off, evidence, cost, error."""
+    depth = "not known before its pilot" if plan.max_depth is None else str(plan.max_depth)
+    lines = [f"ray tracing: {plan.integrator}, path depth {depth}"]
+    head = ("effect", "", "cost", "error", "evidence")
+    rows: list[tuple[str, str, str, str, str]] = [head]
+    for effect in plan.effects:
+        state = ("on" if effect.on else "off") + (" (user)" if effect.by == "user" else "")
+        evidence = effect.evidence[0] + (f" (+{len(effect.evidence) - 1})" if len(effect.evidence) > 1 else "")
+        rows.append((effect.name, state, _percent(effect.cost), _percent(effect.error), evidence))
+    widths = [max(len(row[i]) for row in rows) for i in range(4)]
+    for row in rows:
+        cells = [
+            cell.rjust(w) if i in (2, 3) else cell.ljust(w)
+            for i, (cell, w) in enumerate(zip(row, widths, strict=False))
+        ]
+        lines.append("  ".join([*cells, row[4]]).rstrip())
+    if all(effect.cost is None for effect in plan.effects):
+        lines.append("cost and error are not measured yet: dnrpipe effects --measure")
+    return "\n".join(lines)
+
+
+def _percent(value: Measured | None) -> str:
+    return "-" if value is None else f"{value.mean:.1%} ± {value.half_width:.1%}"

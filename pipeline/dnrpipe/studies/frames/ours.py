@@ -1,0 +1,126 @@
+"""Our frames, from nothing but a camera: G-buffer and base image, then the network; each part timed.
+
+G-buffer and base image come from one kernel of Mitsuba in this process. What it gives goes through the EXR files that
+the trainer reads, which is not timed: a viewer would hand over memory.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from dnrtrain.checkpoint import load_model, read_record
+from dnrtrain.contract import View
+from dnrtrain.dataset import load_views
+from dnrtrain.exr import write_exr
+from dnrtrain.model import render_views
+
+from ...core.errors import UserError
+from ...raytrace.base import BaseRenderer
+from ...raytrace.base_worker import denoised
+from ...raytrace.light_worker import read_light
+from ...raytrace.units import scaled_view
+from ...stages.base_images import light_path
+from .scene import BenchScene, Clock
+
+TIMED = ("none", "baked")
+"""Base images that this benchmark can render frame by frame."""
+NEURAL, BASE = "neural", "base image alone"
+
+
+class Ours:
+    """The workspace's fine-tuned model on the CPU, and its base image.
+
+    model is None, and frames have nothing neural, where the workspace has none: the base image alone is measured then.
+    samples: rays per pixel of base images, each a renderer of its own with the same model, whatever it was trained
+    with; none: the workspace's. folder, light: another model and baked light than the workspace's.
+    Raises UserError: the model has a base image that is not timed here, or its light is not baked.
+    """
+
+    def __init__(
+        self,
+        scene: BenchScene,
+        samples: tuple[int, ...] = (),
+        folder: Path | None = None,
+        light: Path | None = None,
+    ) -> None:
+        folder = folder or scene.workspace.checkpoints("step2")
+        self.scene = scene
+        self.model = load_model(folder) if read_record(folder) is not None else None
+        self.base: Literal["none", "raster", "baked", "direct", "path"] = (
+            "baked" if self.model is None else self.model.settings.base
+        )
+        if self.base not in TIMED:
+            raise UserError(f"{folder}: base image '{self.base}' cannot be timed here, only {', '.join(TIMED)}")
+        self.renderers: dict[int, BaseRenderer] = {}
+        if self.base == "baked":
+            light = light or light_path(scene.workspace)
+            if not light.exists():
+                raise UserError(f"{light}: the light is not baked; run `dnrpipe finetune` with model.base=baked first")
+            mitsuba_scene = scene.engine.scenes[str(scene.bundle)]
+            baked = read_light(light)
+            for count in samples or (scene.settings.base.samples,):
+                self.renderers[count] = BaseRenderer(scene.engine.mi, mitsuba_scene, baked, count)
+
+    def frame(self, view: View, clock: Clock) -> dict[str, dict[str, Any]]:
+        """By NEURAL and BASE, and the rays per pixel: {"picture": display RGB over white [1, 3, H, W], "parts":
+        {name: ms}}."""
+        result: dict[str, dict[str, Any]] = {}
+        for renderer in self.renderers.values() or (None,):
+            result |= self._frame(renderer, view, clock)
+        return result
+
+    def _frame(self, renderer: BaseRenderer | None, view: View, clock: Clock) -> dict[str, dict[str, Any]]:
+        result: dict[str, dict[str, Any]] = {}
+        channels, parts = self._inputs(renderer, view, clock)
+        rays = "" if renderer is None else f", {renderer.samples} rays"
+        if renderer is not None:
+            alpha = channels["coverage"]
+            straight = (
+                np.stack([channels[f"base.{c}"] for c in "RGB"], axis=-1)
+                / np.maximum(channels["base.A"], 1e-6)[..., None]
+            )
+            picture = np.concatenate([straight * alpha[..., None], alpha[..., None]], axis=-1)
+            result[BASE + rays] = {"picture": self.scene.shown(picture), "parts": dict(parts)}
+        if self.model is not None:
+            data = self._data(view, channels)
+            picture, parts["network"] = clock.time(partial(render_views, self.model, data))
+            result[NEURAL + rays] = {"picture": picture.float(), "parts": parts}
+        return result
+
+    def _inputs(
+        self, renderer: BaseRenderer | None, view: View, clock: Clock
+    ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+        """(channels that the network sees, ms by part). The base image's kernel gives the G-buffer, too."""
+        if renderer is None:
+            channels, ms = clock.time(partial(self.scene.frames.gbuffer, view))
+            return channels, {"G-buffer": ms}
+        scale = self.scene.engine.unit_scale
+        channels, ms = clock.time(partial(renderer.frame, scaled_view(view, scale)))
+        mask = channels["mask"] > 0.5
+        coverage, finer = clock.time(partial(self.scene.frames.coverage, view, mask))
+        changed = {"depth.Z": channels["depth.Z"] / scale, "coverage": coverage}
+        parts = {"base image and G-buffer": ms, "silhouettes": finer}
+        if self.scene.settings.base.denoise:
+            clean, parts["denoiser"] = clock.time(partial(denoised, channels, 0))
+            changed |= clean
+        return {**channels, **changed}, parts
+
+    def _data(self, view: View, channels: dict[str, np.ndarray]) -> Any:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "view.exr"
+            write_exr(path, channels, {})
+            return load_views(
+                [path],
+                None,
+                self.scene.frame,
+                cameras=[view],
+                folder=self.scene.workspace.scene,
+                target=False,
+                base=self.base,
+                base_files=[path] if self.renderers else None,
+            )

@@ -1,0 +1,128 @@
+"""The rival in the same run: path tracing of the test views, raw and denoised, and our frames beside it, by one clock.
+
+A worker (see `dnrpipe.workers.processes`) renders them; their pictures are measured against the references that the
+cells are measured against.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dnrtrain.atomic import write_json
+from dnrtrain.exr import read_exr
+
+from ...core.settings import Settings
+from ...core.workspace import Workspace
+
+METHODS = ("raw", "colour-fast", "clean16-fast", "clean16")
+WARM = 2
+
+
+class Worker:
+    """common: {"threads"}; task: {"workspace", "settings", "samples", "output", "key"} -> what its output file holds:
+
+    {"key", "threads", "rungs": [{"name", "spp", "denoised", "ms", "masked", metrics}], "base_ms"}; metrics as in cells,
+    means over the test views; base_ms: of a base image with its G-buffer, by the same clock, None where none is
+    rendered.
+    """
+
+    def __init__(self, common: dict[str, Any]) -> None:
+        import torch
+
+        if common["threads"]:
+            torch.set_num_threads(int(common["threads"]))
+        self.threads = torch.get_num_threads()
+
+    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
+        from ...core.scene_files import split_views
+        from ..frames.ours import BASE, TIMED, Ours
+        from ..frames.rival import METHODS as ALL
+        from ..frames.rival import climb, make_rungs
+        from ..frames.scene import Clock, open_scene
+
+        workspace = Workspace.open(Path(task["workspace"]))
+        settings = Settings.model_validate(task["settings"])
+        views = split_views(workspace)["test"]
+        scene = open_scene(workspace.root, views, self.threads, settings)
+        clock = Clock("cpu", self.threads)
+        samples = tuple(int(n) for n in task["samples"])
+        for turn in range(WARM):
+            climb(scene, views[0], turn, clock, make_rungs(samples, METHODS))
+        rungs = make_rungs(samples, METHODS)
+        for number, view in enumerate(views):
+            climb(scene, view, 10_007 * (number + 1), clock, rungs)
+        names = [view.name for view in views]
+        truth = [scene.shown(read_rgba(workspace.raytraced("test", name))) for name in names]
+        masks = masks_of(workspace, names)
+        lpips = load_lpips()
+        found = [
+            {
+                "name": rung.name,
+                "spp": rung.spp,
+                "denoised": ALL[rung.method].denoise,
+                "ms": rung.ms(),
+                "masked": rung.masked,
+                **quality_of([picture.float() for picture in rung.pictures], truth, masks, lpips),
+            }
+            for rung in rungs.values()
+        ]
+        base_ms = None
+        if settings.model.base == "baked" and settings.model.base in TIMED:
+            ours = Ours(scene, (), Path(task["output"]).parent / "no-model")
+            ours.frame(views[0], clock)
+            frames = [next(iter(ours.frame(view, clock).items())) for view in views]
+            base_ms = float(
+                np.median([sum(frame["parts"].values()) for name, frame in frames if name.startswith(BASE)])
+            )
+        made = {"key": task["key"], "threads": self.threads, "rungs": found, "base_ms": base_ms}
+        write_json(Path(task["output"]), made)
+        return made
+
+
+def read_rgba(path: Path) -> np.ndarray:
+    """RGBA of a picture's file, [H, W, 4]."""
+    channels, _ = read_exr(path)
+    return np.stack([channels[channel] for channel in "RGBA"], axis=-1)
+
+
+def masks_of(workspace: Workspace, names: list[str]) -> list[Any]:
+    """Object masks of test views, torch [1, 1, H, W]."""
+    import torch
+
+    gbuffers = [read_exr(workspace.passes("test", name))[0] for name in names]
+    return [torch.from_numpy(np.ascontiguousarray(g["mask"] > 0.5)).float()[None, None] for g in gbuffers]
+
+
+def load_lpips() -> Any:
+    """LPIPS networks by name, None where there are no weights."""
+    from dnrtrain.perceptual import build_lpips
+    from dnrtrain.weights import WeightsMissing, load_weights
+
+    try:
+        return build_lpips(load_weights())
+    except WeightsMissing:  # the parent has said so
+        return None
+
+
+def quality_of(pictures: list[Any], truth: list[Any], masks: list[Any], lpips: Any) -> dict[str, float | None]:
+    """Means over the views of the metrics that cells have."""
+    from dnrtrain.metrics import image_metrics
+
+    from ...core.images import flip_error
+
+    rows = []
+    for picture, target, mask in zip(pictures, truth, masks, strict=True):
+        row: dict[str, Any] = dict(image_metrics(picture, target, mask, lpips))
+        row["flip"] = flip_error(_image(target), _image(picture))[0]
+        rows.append(row)
+    return {
+        key: float(np.mean(values)) if (values := [row[key] for row in rows if row[key] is not None]) else None
+        for key in rows[0]
+    }
+
+
+def _image(tensor: Any) -> np.ndarray:
+    return tensor[0].float().clamp(0, 1).permute(1, 2, 0).cpu().numpy()

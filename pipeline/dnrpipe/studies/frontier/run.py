@@ -1,0 +1,93 @@
+"""The sweep: every point is a row of an ablation, so that workers, shared coarse models and resuming are those of
+:mod:`..ablation.run`. Views, references and base images are traced once, into the workspace itself.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ...core.console import Console
+from ...core.errors import UserError
+from ...core.settings import Settings
+from ...core.workspace import Workspace
+from ..ablation.rows import CLASSIC, ROWS, Row
+from ..ablation.run import Ablation, Request
+from ..cells.scenes import Scene, prepared
+
+RIVALS = ("random", "all", "paper")
+"""Other ways to train, compared at the settings' own samples and epochs."""
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """budgets (views), samples per pixel, optimiser steps: every combination is trained. also: of RIVALS."""
+
+    budgets: tuple[int, ...]
+    samples: tuple[int, ...]
+    steps: tuple[int, ...]
+    also: tuple[str, ...] = RIVALS
+
+    def rows(self, settings: Settings) -> list[Row]:
+        """All points as rows; the base image alone last. Raises UserError: no paper row at these sizes."""
+        batch = settings.finetune.step2.batch
+        found = [
+            self._row(f"{views} views, {spp} spp, {steps} steps", views, spp, max(1, round(steps * batch / views)))
+            for views in self.budgets
+            for spp in self.samples
+            for steps in self.steps
+        ]
+        spp, epochs = settings.raytrace.spp, settings.finetune.step2.epochs
+        if "random" in self.also:
+            found += [
+                self._row(f"{views} random views", views, spp, epochs, views_by="random") for views in self.budgets
+            ]
+        if "all" in self.also:
+            found.append(self._row("all candidates", None, spp, epochs, views_by="all"))
+        if "paper" in self.also:
+            if settings.preset not in CLASSIC:
+                raise UserError(
+                    f"the paper's row has sizes for the presets {', '.join(CLASSIC)}; leave it out of --also"
+                )
+            paper = ROWS["paper"]
+            found.append(Row("paper", paper.what, paper.family, paper.changes, paper.views, budget=max(self.budgets)))
+        if settings.model.base != "none":
+            found.append(Row("base image alone", ROWS["base"].what, "dnr", network=False))
+        return found
+
+    @staticmethod
+    def _row(name: str, views: int | None, spp: int, epochs: int, views_by: str = "farthest") -> Row:
+        changes = {"finetune": {"step2": {"epochs": epochs}}}
+        return Row(name, name, "dnr", changes, views_by, budget=views, spp=spp)  # type: ignore[arg-type]
+
+
+@dataclass
+class Frontier(Ablation):
+    """An ablation of one scene: the workspace that is open."""
+
+    workspace: Workspace | None = field(default=None)
+
+    def _open(self, source: Path) -> Scene:
+        assert self.workspace is not None
+        scene = prepared(source.stem, self.workspace, self.request.base, self.console)
+        scene.run_id = f"frontier-{int(time.time()):x}"
+        return scene
+
+    @property
+    def scene(self) -> Scene:
+        """The scene, once :meth:`run` has prepared it."""
+        return self.scenes[0]
+
+
+def make_frontier(
+    workspace: Workspace, settings: Settings, rows: Sequence[Row], out: Path, jobs: int, seeds: int, console: Console
+) -> Frontier:
+    """The run over ``rows``; cells go to ``out``."""
+    largest = max((row.budget or 1 for row in rows), default=1)
+    base = settings.model_copy(deep=True)
+    base.select.budget = largest
+    source = Path(f"{workspace.root.name.removesuffix('.dnr')}.blend")
+    request = Request([source], list(rows), seeds, base, {}, None, out, jobs)
+    return Frontier(request, console, workspace=workspace)

@@ -1,0 +1,132 @@
+"""The pilot: every kind of work once, small; kept part by part in ``plan/pilot.json``, so that it goes on after Ctrl-C.
+
+    trace      a few views at few samples, the held-out ones at more
+    light      the real bake, kept; a smaller one where that would take too long
+    base       base images of those views
+    training   two networks on the few views, by a hundred steps and by three hundred
+    frames     the held-out views by the networks, by the base image alone, and by path tracing with a denoiser
+
+Its pictures lie in ``plan/pilot/`` until the last part is done. What it takes is booked in the ledger, stage ``plan``.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from dnrtrain.atomic import write_json
+from dnrtrain.contract import DamagedFile
+
+from ...core.console import Console
+from ...core.errors import UserError
+from ...core.ledger import CostRecord
+from ...core.scene_files import read_json, scene_fingerprint
+from ...core.settings import Settings
+from ...core.workspace import Workspace, digest
+from ...effects.plan import EffectPlan
+from ...effects.store import lenses, resolve_plan
+from ...stages.base_images import RENDERED, light_is_baked, renderer_inputs
+from .pilot_parts import FOLDER, HELD_OUT, REFERENCE_SPP, RESOLUTION, SPP, STEPS, VIEWS, Piloting
+from .records import LightPart, Pilot, Record
+
+VERSION = 6
+FILE = "pilot.json"
+
+
+def pilot_path(workspace: Workspace) -> Path:
+    """``plan/pilot.json``."""
+    return workspace.root / FOLDER / FILE
+
+
+def run_pilot(workspace: Workspace, settings: Settings, console: Console) -> Pilot:
+    """The pilot of the workspace under the settings; parts that are on disk are kept.
+
+    Raises UserError: settings that it cannot stand for, or a part that failed twice.
+    """
+    if settings.model.base not in RENDERED:
+        raise UserError(
+            f"plan: model.base={settings.model.base} has no base image that can be rendered on its own; plan with"
+            f" --set model.base=baked (the presets draft and standard), or one of {', '.join(RENDERED)}"
+        )
+    run_id = f"plan-{int(time.time()):x}"
+    plan = resolve_plan(workspace, settings, console, run_id, "plan")
+    if plan.on("depth-of-field") and lenses(workspace, settings):
+        raise UserError(f"plan: the cameras of {workspace.root} have depth of field, whose frames cannot be timed yet")
+    piloting = Piloting(workspace, settings, console, run_id, plan)
+    stamp = _stamp(workspace, settings, plan)
+    found = read_pilot(workspace)
+    first = piloting.train[0]
+    if found is None or found.fingerprint != stamp:
+        shutil.rmtree(piloting.folder, ignore_errors=True)
+        found = Pilot(fingerprint=stamp, size=(first.width, first.height), load=_load())
+    _, _, light, _ = renderer_inputs(workspace, settings, plan)
+    bake = found.light is None and light is not None and not light_is_baked(light)  # removed since, perhaps
+    if found.frames is not None and not bake:
+        return found
+    piloting.folder.mkdir(parents=True, exist_ok=True)
+    parts: list[tuple[str, Callable[[], Record | None]]] = [
+        ("trace", piloting.trace),
+        ("light", piloting.light),
+        ("base", piloting.base),
+        ("training", piloting.training),
+        ("frames", piloting.frames),
+    ]
+    for name, part in parts:
+        if getattr(found, name) is not None:
+            continue
+        started = time.monotonic()
+        made = part()
+        seconds = time.monotonic() - started
+        found = found.model_copy(update={name: made, "seconds": found.seconds + seconds})
+        write_json(pilot_path(workspace), found.model_dump(mode="json"))
+        booked = made.bake.seconds if isinstance(made, LightPart) and made.kept else 0.0
+        _book(workspace, run_id, name, seconds - booked)
+    shutil.rmtree(piloting.folder, ignore_errors=True)
+    return found
+
+
+def read_pilot(workspace: Workspace) -> Pilot | None:
+    """The pilot on disk; None where there is none that this version reads."""
+    path = pilot_path(workspace)
+    if not path.exists():
+        return None
+    try:
+        return Pilot.model_validate(read_json(path))
+    except (ValidationError, DamagedFile):  # of another version, or torn: it is run again
+        return None
+
+
+def _stamp(workspace: Workspace, settings: Settings, plan: EffectPlan) -> str:
+    """Hash of all that decides what the pilot measures."""
+    step2 = settings.finetune.step2.model_dump(mode="json", exclude={"epochs"})
+    return digest(
+        [
+            *(VERSION, RESOLUTION, VIEWS, SPP, HELD_OUT, REFERENCE_SPP, STEPS, scene_fingerprint(workspace)),
+            workspace.manifest.stages["prepare"].output,
+            *(plan.integrator, plan.max_depth, sorted(plan.left_out), plan.model(settings.model).model_dump()),
+            *(settings.base.model_dump(), step2, settings.raytrace.denoise, settings.device, os.cpu_count()),
+        ]
+    )
+
+
+def _load() -> float | None:
+    return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+
+
+def _book(workspace: Workspace, run_id: str, part: str, seconds: float) -> None:
+    workspace.ledger.append(
+        CostRecord(
+            time=time.time(),
+            run=run_id,
+            stage="plan",
+            purpose="training",
+            unit="scene",
+            name=f"pilot: {part}",
+            seconds=seconds,
+        )
+    )

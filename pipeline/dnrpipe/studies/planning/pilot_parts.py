@@ -1,0 +1,282 @@
+"""What the pilot does: every kind of work once, small, on workers. :mod:`.pilot` keeps it and says what is due."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dnrtrain.contract import View
+
+from ...core.cameras import scaled_to
+from ...core.console import Console
+from ...core.errors import UserError
+from ...core.scene_files import split_views
+from ...core.settings import Settings
+from ...core.workspace import Workspace
+from ...effects.plan import EffectPlan
+from ...effects.store import trace_config, variant_for
+from ...stages.base_images import bake_light, light_is_baked, renderer_inputs
+from ...stages.raytrace import view_seed
+from ...workers.processes import Retry, run_tasks
+from ...workers.view_tasks import worker_count
+from .records import BasePart, FramePart, LightPart, LightPoint, Traced, TracePart, TrainingPart
+
+RESOLUTION = 128
+VIEWS, SPP = 6, 16
+HELD_OUT, REFERENCE_SPP = 6, 64
+STEPS = (100, 300)
+"""Two trainings: from the second on, how fast a scene's network still gains is measured, not assumed."""
+RUNGS = (1, 4, 16, 64)
+METHODS = ("raw", "clean16-fast", "clean16")
+"""Path tracing's samples, and what the denoiser is given (:mod:`..frames.rival`)."""
+LIGHT_PATHS = 2 * 512 * 512 * 128
+"""Paths of a bake of light that the pilot can afford: twice what ``light_spp = auto`` asks for at any size."""
+TIMEOUT = 600.0
+"""Seconds after which a part counts as hung: ten times what the whole pilot should take."""
+FOLDER = "plan"
+
+
+@dataclass
+class Piloting:
+    """One run of the pilot: the workspace with its settings, effect plan and views, and where pictures go."""
+
+    workspace: Workspace
+    settings: Settings
+    console: Console
+    run_id: str
+    plan: EffectPlan
+
+    def __post_init__(self) -> None:
+        self.folder = self.workspace.root / FOLDER / "pilot"
+        self.train, self.held_out = _views(self.workspace)
+
+    def trace(self) -> TracePart:
+        """Views at two numbers of samples. Each worker's first view compiles its kernels, which are of one size."""
+        choice = variant_for(self.plan, self.settings)
+        config = trace_config(self.workspace, self.plan, choice.variant)
+        workers = 1 if choice.variant.startswith("cuda") else worker_count(self.settings.raytrace.workers)
+        warm = [self._task(self.train[0], f"warm{i}", 1, config) for i in range(workers)]
+        tasks = [self._task(view, f"train-{view.name}", SPP, config) for view in self.train]
+        tasks += [self._task(view, f"held-{view.name}", REFERENCE_SPP, config) for view in self.held_out]
+        common = {"bundle": config["bundle"], "variant": choice.variant, "threads": 1}
+        self._compile("dnrpipe.raytrace.tracer", common, warm[0], choice.environment)
+        started = time.monotonic()
+        answers = self._run(
+            "pilot: ray tracing", "dnrpipe.raytrace.tracer", common, [*warm, *tasks], workers, choice.environment
+        )
+        took = time.monotonic() - started
+        points = []
+        for task, result in answers:
+            if Path(task["output"]).name.startswith("warm"):
+                continue
+            pixels = task["view"]["width"] * task["view"]["height"]
+            points.append(
+                Traced(
+                    spp=result["spp"],
+                    pixels=pixels,
+                    seconds=result["seconds"],
+                    cpu_seconds=result["cpu_seconds"],
+                    noise_rmse=result.get("noise_rmse"),
+                    raw_rmse=_raw_rmse(result),
+                )
+            )
+        startup = max(0.0, took - sum(point.seconds for point in points) / workers)
+        return TracePart(points=points, workers=workers, startup=startup)
+
+    def light(self) -> LightPart | None:
+        """The real light, kept, for the quality of base images hangs on its paths; fewer paths where that is too dear.
+
+        None where there is no light to bake or it is on disk.
+        """
+        common, environment, task, _ = renderer_inputs(self.workspace, self.settings, self.plan)
+        if task is None or light_is_baked(task):
+            return None
+        size, spp = task["size"], max(1, min(task["spp"], LIGHT_PATHS // task["size"] ** 2))
+        started = time.monotonic()
+        if kept := spp == task["spp"]:
+            result = bake_light(self.workspace, self.console, self.run_id, "raytrace", common, environment, task)
+            assert result is not None  # it is not on disk
+        else:
+            shared = {"bundle": common["bundle"], "variant": common["variant"]}
+            small = task | {"spp": spp, "output": str(self.folder / "light.npz")}
+            ((_, result),) = self._run(
+                "pilot: baking light", "dnrpipe.raytrace.light_worker", shared, [small], 1, environment
+            )
+        took = time.monotonic() - started
+        bake = LightPoint(size=size, spp=spp, seconds=result["seconds"], cpu_seconds=result["cpu_seconds"])
+        return LightPart(bake=bake, startup=max(0.0, took - bake.seconds), kept=kept)
+
+    def base(self) -> BasePart:
+        """Base images of all views of the pilot."""
+        common, environment, task, _ = renderer_inputs(self.workspace, self.settings, self.plan)
+        if task is not None:
+            common |= {"light": str(self._light(task))}
+        tasks = [
+            {
+                "view": view.model_dump(mode="json"),
+                "output": str(self._base_file(kind, view)),
+                "fingerprint": self.run_id,
+            }
+            for kind, views in (("train", self.train), ("held", self.held_out))
+            for view in views
+        ]
+        self._compile("dnrpipe.raytrace.base_worker", common, tasks[0], environment)
+        started = time.monotonic()
+        answers = self._run("pilot: base images", "dnrpipe.raytrace.base_worker", common, tasks, 1, environment)
+        took = time.monotonic() - started
+        seconds = [result["seconds"] for _, result in answers]
+        return BasePart(
+            pixels=self.train[0].width * self.train[0].height,
+            seconds=float(np.median(seconds)),
+            cpu_seconds=float(np.median([result["cpu_seconds"] for _, result in answers])),
+            startup=max(0.0, took - sum(seconds)),
+        )
+
+    def training(self) -> TrainingPart:
+        """Short step 2s."""
+        view = self.train[0]
+        task = {
+            "kind": "train",
+            "views": [view.model_dump(mode="json") for view in self.train],
+            "base_files": [str(self._base_file("train", view)) for view in self.train],
+            "images": [str(self._image(f"train-{view.name}")) for view in self.train],
+            "folders": [str(folder) for folder in self._models()],
+            "fingerprint": self.run_id,
+            "epochs": [max(2, round(steps / self._steps_per_epoch())) for steps in STEPS],
+        }
+        ((_, result),) = self._run("pilot: training", "dnrpipe.studies.planning.worker", self._common(), [task], 1, {})
+        patch = self.settings.finetune.step2.patch or max(view.width, view.height)
+        return TrainingPart(
+            views=len(self.train),
+            spp=SPP,
+            steps=result["steps"],
+            pixels=min(patch, view.width) * min(patch, view.height),
+            seconds=result["seconds"],
+            cpu_seconds=result["cpu_seconds"],
+            between=result["between"],
+            cpu_between=result["cpu_between"],
+            startup=result["startup"],
+            threads=result["threads"],
+        )
+
+    def frames(self) -> FramePart:
+        """The held-out views, by all renderers."""
+        _, environment, light, _ = renderer_inputs(self.workspace, self.settings, self.plan)
+        task = {
+            "kind": "frames",
+            "views": [view.model_dump(mode="json") for view in self.held_out],
+            "folders": [str(folder) for folder in self._models()],
+            "light": str(self._light(light)) if light is not None else None,
+            "samples": list(RUNGS),
+            "methods": list(METHODS),
+        }
+        ((_, result),) = self._run(
+            "pilot: frames", "dnrpipe.studies.planning.worker", self._common(), [task], 1, environment
+        )
+        if lost := result.pop("unknown"):
+            self.console.warn(f"pilot: {lost} pixels of the held-out views were not finite; they take no part")
+        return FramePart.model_validate(result | {"views": len(self.held_out)})
+
+    # -- what the parts share --------------------------------------------------------------------------
+
+    def _compile(self, module: str, common: dict[str, Any], task: dict[str, Any], environment: dict[str, str]) -> None:
+        """One task on a worker of its own: its kernels are then in Dr.Jit's cache on disk, as they are when the plan is
+        carried out. Compiling them takes 2 to 7 s, which would count as the start of every later stage."""
+        self._run("pilot: compiling kernels", module, common, [task], 1, environment)
+
+    def _run(
+        self,
+        label: str,
+        module: str,
+        common: dict[str, Any],
+        tasks: list[dict[str, Any]],
+        workers: int,
+        environment: dict[str, str],
+    ) -> list[tuple[dict[str, Any], dict[str, Any]]]:
+        """(task, result) of each. Raises UserError where one failed twice."""
+        log = self.workspace.log("plan")
+        found = []
+        with self.console.bar(label, len(tasks)) as bar:
+            outcomes = run_tasks(
+                module, common, tasks, workers=workers, log=log, timeout=TIMEOUT, environment=environment
+            )
+            try:
+                for outcome in outcomes:
+                    if isinstance(outcome, Retry):
+                        self.console.warn(f"{label}: {outcome.reason}; trying once more")
+                    elif outcome.result is None:
+                        raise UserError(f"{label}: {outcome.error}; see {log}")
+                    else:
+                        found.append((outcome.task, outcome.result))
+                        bar.advance()
+            finally:
+                outcomes.close()  # type: ignore[attr-defined]
+        return found
+
+    def _task(self, view: View, name: str, spp: int, config: dict[str, Any]) -> dict[str, Any]:
+        task: dict[str, Any] = {
+            "view": view.model_dump(mode="json"),
+            "output": str(self._image(name)),
+            "spp": spp,
+            "integrator": self.plan.integrator,
+            "max_depth": self.plan.max_depth,
+            "lens": None,
+            "seed": view_seed(self.settings.raytrace.seed, "pilot", name),
+            "fingerprint": self.run_id,
+        }
+        return task | ({"denoise": True} if self.settings.raytrace.denoise else {})
+
+    def _common(self) -> dict[str, Any]:
+        model = self.plan.model(self.settings.model)
+        settings = self.settings.model_copy(update={"model": model}).model_dump(mode="json")
+        return {"workspace": str(self.workspace.root), "settings": settings, "threads": 0}
+
+    def _steps_per_epoch(self) -> int:
+        return math.ceil(len(self.train) / self.settings.finetune.step2.batch)
+
+    def _models(self) -> list[Path]:
+        return [self.folder / f"model-{steps}" for steps in STEPS]
+
+    def _image(self, name: str) -> Path:
+        return self.folder / f"{name}.exr"
+
+    def _base_file(self, kind: str, view: View) -> Path:
+        return self.folder / f"base-{kind}-{view.name}.exr"
+
+    def _light(self, task: dict[str, Any]) -> Path:
+        """The real light where it is on disk, else the pilot's."""
+        return Path(task["output"]) if light_is_baked(task) else self.folder / "light.npz"
+
+
+def _raw_rmse(result: dict[str, Any]) -> float | None:
+    """RMSE of a view as it was traced; the tracer tells that of the picture as it is used, and both over its level."""
+    used, raw, relative = (result.get(name) for name in ("noise_rmse", "raw_noise", "noise"))
+    return used if not (used and raw and relative) else used * raw / relative
+
+
+def _views(workspace: Workspace) -> tuple[list[View], list[View]]:
+    """(a few candidates, the farthest from each other; a few others) at the pilot's size.
+
+    Others: test views, for their PSNR is what is predicted (by poses alone; nothing is trained on them or chosen among
+    them), else validation views, else candidates that were not taken.
+    """
+    from dnrtrain.selector.policies import untrained
+    from dnrtrain.selector.protocol import Candidates
+
+    splits = split_views(workspace)
+    views = splits["train"]
+    rule = untrained("farthest")
+    assert rule is not None
+    positions = np.stack([view.position for view in views])
+    directions = np.stack([-view.matrix[:3, 2] for view in views])
+    chosen = rule.choose(Candidates(positions, directions), min(VIEWS, len(views)), 0).views
+    others = [view for i, view in enumerate(views) if i not in set(chosen)]
+    left = splits.get("test") or splits.get("val") or others or views
+    step = max(1, len(left) // HELD_OUT)
+    pick = left[::step][:HELD_OUT]
+    return [scaled_to(views[i], RESOLUTION) for i in chosen], [scaled_to(view, RESOLUTION) for view in pick]

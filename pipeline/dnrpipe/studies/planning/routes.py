@@ -1,0 +1,114 @@
+"""Whether to train at all: for N frames at a wanted PSNR, the cheapest of path tracing with a denoiser, the base image
+alone, and the neural renderer.
+
+    total(N) = upfront + N * frame
+    N*       = upfront of the neural renderer / (frame of path tracing - frame of the neural renderer), at equal PSNR
+
+Path tracing's frame is read off its measured ladder (:mod:`..frames.ladder`): dB is linear in log(ms) between the rungs
+that nothing beats. Beyond the last rung the last step's slope goes on, and the route says so.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from ...core.ledger import break_even_frames
+from ..frames.ladder import crossover, frontier
+from .quality import with_noise
+from .records import FramePart, FramePoint, Prediction, Route
+
+FURTHEST = 64.0
+"""How many times the last rung's time the ladder is followed beyond its end."""
+
+
+def rival_line(part: FramePart, only: str | None = None) -> list[tuple[str, float, float]]:
+    """(name, seconds, PSNR) of the rungs that nothing beats, cheapest first.
+
+    only: the end of a method's name (``raw``), else all methods.
+    """
+    rungs = {p.name: p for p in part.rival if only is None or p.name.endswith(only)}
+    points = {name: (p.ms / 1000, p.psnr) for name, p in rungs.items()}
+    return [(name, *points[name]) for name in frontier(points)]
+
+
+def seconds_for(line: Sequence[tuple[str, float, float]], psnr: float) -> tuple[float, bool] | None:
+    """(seconds of a frame at ``psnr``, whether that lies beyond the ladder); None where it cannot be told."""
+    points = [(seconds, quality) for _, seconds, quality in line]
+    found = crossover(points, psnr)
+    if found is not None:
+        return found, False
+    if len(points) < 2:
+        return None
+    (left, low), (right, high) = points[-2:]
+    slope = (high - low) / math.log(right / left)
+    seconds = right * math.exp((psnr - high) / slope)
+    return (seconds, True) if seconds <= FURTHEST * right else None
+
+
+def as_reported(part: FramePart, reference: float) -> FramePart:
+    """The part with every PSNR as a report measures it: against references whose own noise is ``reference``, RMSE."""
+
+    def shown(point: FramePoint) -> FramePoint:
+        return point.model_copy(update={"psnr": with_noise(point.psnr, reference)})
+
+    return part.model_copy(
+        update={
+            "base": shown(part.base),
+            "neural": [shown(point) for point in part.neural],
+            "rival": [shown(point) for point in part.rival],
+        }
+    )
+
+
+def routes(
+    part: FramePart, neural: Prediction | None, light_seconds: float, scale: float, psnr: float, frames: int
+) -> list[Route]:
+    """All routes to ``frames`` frames at ``psnr`` dB, the cheapest that reaches it first.
+
+    neural: the cheapest choice that reaches it, None where none does. scale: pixels of a frame over the pilot's.
+    """
+    found: list[Route] = []
+    line = rival_line(part)
+    answer = seconds_for(line, psnr)
+    if answer is None:
+        name, seconds, quality = line[-1]
+        what = f"its best rung, {name}, ends at {quality:.1f} dB"
+        found.append(_route("path tracing + denoiser", what, 0.0, seconds * scale, frames, quality, quality >= psnr))
+    else:
+        seconds, beyond = answer
+        what = "beyond the pilot's ladder, extrapolated" if beyond else _between(line, seconds)
+        found.append(_route("path tracing + denoiser", what, 0.0, seconds * scale, frames, psnr, True))
+    base = part.base.psnr
+    alone = part.base.ms / 1000 * scale
+    found.append(
+        _route("base image alone", "baked light, no network", light_seconds, alone, frames, base, base >= psnr)
+    )
+    frame = part.neural[-1].ms / 1000 * scale
+    if neural is None:
+        found.append(_route("neural renderer", "no choice is expected to reach it", 0.0, frame, frames, None, False))
+    else:
+        choice, upfront = neural.choice, neural.seconds.total.expected
+        what = f"{choice.views} views, {choice.spp} spp, {choice.steps} steps"
+        found.append(_route("neural renderer", what, upfront, frame, frames, neural.psnr.expected, True))
+    return sorted(found, key=lambda route: (not route.reaches, route.total))
+
+
+def break_even(found: Sequence[Route]) -> int | None:
+    """Frames from which on the neural renderer is cheaper than path tracing; None where it never is."""
+    by_name = {route.name: route for route in found}
+    neural, traced = by_name["neural renderer"], by_name["path tracing + denoiser"]
+    if not (neural.reaches and traced.reaches):
+        return None
+    return break_even_frames(neural.upfront, traced.frame, neural.frame)
+
+
+def _between(line: Sequence[tuple[str, float, float]], seconds: float) -> str:
+    below = [name for name, at, _ in line if at <= seconds * (1 + 1e-9)]
+    above = [name for name, at, _ in line if at > seconds * (1 + 1e-9)]
+    return f"about {below[-1]}" if below and not above else f"up to {(above or below)[0]}"
+
+
+def _route(name: str, what: str, upfront: float, frame: float, frames: int, psnr: float | None, ok: bool) -> Route:
+    total = upfront + frames * frame
+    return Route(name=name, what=what, upfront=upfront, frame=frame, total=total, psnr=psnr, reaches=ok)

@@ -1,0 +1,225 @@
+"""The pilot's worker: short trainings, and frames of ours and of path tracing with a denoiser.
+
+Notation
+    A, B      two independent path-traced pictures of a held-out view in display space, as they were traced
+    D         a picture to be judged, made without their samples
+    mse(D)    mean of (D - A)(D - B): the noise of A and that of B cancel in the product (:func:`without_reference`)
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dnrtrain.contract import View
+
+from ...core.scene_files import read_frame
+from ...core.settings import Settings
+from ...core.workspace import Workspace
+
+if TYPE_CHECKING:
+    from dnrtrain.dataset import ViewSet
+
+    from ..frames.scene import BenchScene
+
+WARM = 2
+HALVES, REFERENCE_SPP = 2, 64
+"""A and B are means of so many pictures of so many samples: a kernel that the ladder has anyway."""
+SEED = 0x5EED0000
+"""Far from the ladder's seeds, so that A and B share no samples with what they judge."""
+LEAST_MSE = 1e-6
+
+
+class Worker:
+    """Answers the pilot's tasks.
+
+    common: {"workspace", "settings", "threads"}
+    task "train": {"views", "base_files", "images", "fingerprint", "folders", "epochs": a training each}
+        -> {"seconds", "cpu_seconds": of a step of the last, "between", "cpu_between": of its epochs, "startup",
+        "steps": of each, "threads"}
+    task "frames": {"views", "folders": of the models, "light", "samples", "methods": the ladder}
+        -> {"base", "rival": rows {"name", "ms", "psnr"}, "neural": a row per model, "unknown": pixels that no
+        reference knows}; PSNR by :func:`without_reference`
+    """
+
+    def __init__(self, common: dict[str, Any]) -> None:
+        import torch
+
+        if common["threads"]:
+            torch.set_num_threads(int(common["threads"]))
+        self.threads = torch.get_num_threads()
+        self.workspace = Workspace.open(Path(common["workspace"]))
+        self.settings = Settings.model_validate(common["settings"])
+
+    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
+        views = [View.model_validate(view) for view in task["views"]]
+        return self._train(task, views) if task["kind"] == "train" else self._frames(task, views)
+
+    def _train(self, task: dict[str, Any], views: list[View]) -> dict[str, Any]:
+        from dnrtrain.weights import WeightsMissing, load_weights
+
+        try:
+            weights: Any = load_weights()
+        except WeightsMissing:  # training will do without, too
+            weights = None
+        found = [
+            self._train_one(task, views, weights, Path(folder), epochs)
+            for folder, epochs in zip(task["folders"], task["epochs"], strict=True)
+        ]
+        return found[-1] | {"steps": [one["steps"] for one in found], "threads": self.threads}
+
+    def _train_one(
+        self, task: dict[str, Any], views: list[View], weights: Any, folder: Path, epochs: int
+    ) -> dict[str, Any]:
+        from dnrtrain.checkpoint import read_record
+        from dnrtrain.events import EpochEnd
+        from dnrtrain.step2 import run_step2
+
+        from ...stages.trainer import torch_device
+
+        started = time.monotonic()
+        step2 = self.settings.finetune.step2.model_copy(
+            update={"epochs": epochs, "start": "fresh", "validation_views": 0}
+        )
+        events = run_step2(
+            self._load(views, task),
+            None,
+            folder,
+            self.settings.model,
+            step2,
+            seed=self.settings.finetune.seed,
+            device=torch_device(self.settings),
+            checkpoints=folder,
+            fingerprint=task["fingerprint"],
+            weights=weights,
+        )
+        gaps, last = [], None
+        for event in events:
+            now = (time.monotonic(), time.process_time())
+            if isinstance(event, EpochEnd):
+                if last is not None:
+                    gaps.append((now[0] - last[0] - event.seconds, now[1] - last[1] - event.cpu_seconds))
+                last = now
+        took = time.monotonic() - started
+        between, cpu_between = np.maximum(0.0, np.median(gaps, axis=0)).tolist()
+        record = read_record(folder)
+        assert record is not None  # training has just finished
+        history = record["history"]
+        later = history[1:] or history  # the first epoch warms up
+        steps = sum(entry["steps"] for entry in later)
+        seconds = sum(entry["seconds"] for entry in later) / steps
+        booked = sum(entry["seconds"] for entry in history)
+        return {
+            "seconds": seconds,
+            "cpu_seconds": sum(entry["cpu_seconds"] for entry in later) / steps,
+            "between": between,
+            "cpu_between": cpu_between,
+            "startup": max(0.0, took - booked - between * len(history)),
+            "steps": sum(entry["steps"] for entry in history),
+        }
+
+    def _load(self, views: list[View], task: dict[str, Any]) -> ViewSet:
+        from dnrtrain.dataset import load_views
+
+        files = [Path(path) for path in task["base_files"]]
+        return load_views(
+            files,  # base images bring their G-buffer along
+            [Path(path) for path in task["images"]],
+            read_frame(self.workspace),
+            cameras=views,
+            folder=self.workspace.scene,
+            base=self.settings.model.base,
+            base_files=files,
+        )
+
+    def _frames(self, task: dict[str, Any], views: list[View]) -> dict[str, Any]:
+        from dnrtrain.checkpoint import load_model
+
+        from ..frames.ours import BASE, NEURAL, Ours
+        from ..frames.rival import climb, make_rungs
+        from ..frames.scene import Clock, open_scene
+
+        scene = open_scene(self.workspace.root, views, self.threads, self.settings)
+        light = Path(task["light"]) if task["light"] else None
+        folders = [Path(folder) for folder in task["folders"]]
+        ours = Ours(scene, (), folders[-1], light)
+        models = [load_model(folder) for folder in folders]
+        truth = [_references(scene, view, number) for number, view in enumerate(views)]
+        clock, samples, methods = Clock("cpu", self.threads), tuple(task["samples"]), tuple(task["methods"])
+        for _ in range(WARM):
+            climb(scene, views[0], 1, clock, make_rungs(samples, methods))
+            ours.frame(views[0], clock)
+        rungs = make_rungs(samples, methods)
+        base, neural = _Row(), [_Row() for _ in models]
+        for number, view in enumerate(views):
+            climb(scene, view, 10_007 * (number + 1), clock, rungs)
+            for row, ours.model in zip(neural, models, strict=True):
+                frames = ours.frame(view, clock)
+                for name, frame in frames.items():
+                    if name.startswith(NEURAL):
+                        row.add(frame["picture"], truth[number], frame["parts"])
+                    elif row is neural[-1]:
+                        base.add(frame["picture"], truth[number], frame["parts"])
+        rival = []
+        for rung in rungs.values():
+            row = _Row()
+            for number, picture in enumerate(rung.pictures):
+                parts = {name: values[number] for name, values in rung.parts.items()}
+                row.add(picture.float(), truth[number], parts)
+            rival.append({"name": rung.name, **row.summary()})
+        return {
+            "base": {"name": BASE, **base.summary()},
+            "neural": [{"name": NEURAL, **row.summary()} for row in neural],
+            "rival": rival,
+            "deviation": float(np.std(base.psnr, ddof=1)) if len(views) > 1 else 0.0,
+            "unknown": sum(int((~known).sum()) for _, _, known in truth),
+        }
+
+
+class _Row:
+    def __init__(self) -> None:
+        self.ms: list[float] = []
+        self.psnr: list[float] = []
+
+    def add(self, picture: Any, truth: tuple[Any, Any, Any], parts: dict[str, float]) -> None:
+        self.ms.append(sum(parts.values()))
+        mean, error = without_reference(picture, *truth)
+        self.psnr.append(-10 * math.log10(max(mean, error, LEAST_MSE)))
+
+    def summary(self) -> dict[str, float]:
+        return {"ms": float(np.median(self.ms)), "psnr": float(np.mean(self.psnr))}
+
+
+def without_reference(picture: Any, first: Any, second: Any, known: Any) -> tuple[float, float]:
+    """(mean square error of D = ``picture`` in display space, its standard error) without a noise-free reference.
+
+    picture, first = A, second = B: [1, 3, H, W]; known: bool [H, W], pixels that count. For independent A and B whose
+    mean is the truth T, E (D - A)(D - B) = (D - T)²: neither noise nor a denoiser's bias counts against D. The mean may
+    come out below 0 where D is better than the noise lets tell. (The display curve bends the mean of A and B by half
+    its curvature times their variance: a hundredth of a dark pixel's value at 30 % noise.)
+    """
+    products = ((picture - first) * (picture - second)).double().mean(dim=(0, 1))[known]
+    return float(products.mean()), float(products.std() / math.sqrt(products.numel()))
+
+
+def _references(scene: BenchScene, view: View, number: int) -> tuple[Any, Any, Any]:
+    """(A, B, pixels that are finite in both), each the mean of HALVES pictures of REFERENCE_SPP samples.
+
+    A sample picture counts where it is finite; a pixel that is so in none of a half is not known, and takes no part.
+    """
+    import torch
+
+    shown, known = [], np.ones((view.height, view.width), bool)
+    for half in range(2):
+        seeds = [SEED + 1009 * number + 2 * part + half for part in range(HALVES)]
+        images = np.stack([scene.frames.path(view, REFERENCE_SPP, seed) for seed in seeds])
+        finite = np.isfinite(images).all(axis=-1, keepdims=True)
+        count = finite.sum(axis=0)
+        known &= count[..., 0] > 0
+        mean = np.where(finite, images, 0).sum(axis=0) / np.maximum(count, 1)
+        shown.append(scene.shown(mean))
+    return shown[0], shown[1], torch.from_numpy(known)

@@ -1,0 +1,103 @@
+"""What competes, as data: every policy of :mod:`dnrtrain.selector`, and the paper's with each of its rewards."""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ...core.errors import UserError
+from ...core.settings import Settings, merge
+
+LEARNED = "rl"
+"""The policy that the trainer's step 1 trains."""
+
+
+@dataclass(frozen=True)
+class Contender:
+    """One line of the tables.
+
+    policy: the trainer's name of it. changes: nested settings. rule: whether a line that needs no training; the best
+    of the simple ones is what others are compared with. rounds: 2 or more choose on after ray tracing a part.
+    """
+
+    name: str
+    what: str
+    policy: str
+    rule: bool = True
+    rounds: int = 1
+    changes: Mapping[str, Any] = field(default_factory=dict)
+
+
+def _paper(name: str, what: str, reward: str) -> Contender:
+    what = f"the paper's RL selector, reward: {what}"
+    return Contender(name, what, LEARNED, rule=False, changes=_reward(reward))
+
+
+def _reward(name: str) -> dict[str, Any]:
+    return {"select": {"step1": {"reward": name}}}
+
+
+_CONTENDERS = (
+    Contender("random", "uniform, another draw per seed", "random"),
+    Contender("farthest", "farthest-point sampling of camera poses", "farthest"),
+    Contender("kmedoids", "k-medoids of camera poses", "kmedoids"),
+    Contender("coverage", "greedy coverage: surface x view direction x resolution", "coverage"),
+    Contender("d-optimal", "greedy D-optimal design of the neural texture", "d-optimal"),
+    Contender("exchange", "k-medoids, then swaps that count what is seen, too", "exchange"),
+    Contender("auto-2", "coverage, traced, then exchange where that shows errors", "auto", rounds=2),
+    Contender("dqn", "learned on a surrogate of texture training, other scenes; never worse by it than rules", "dqn"),
+    Contender("fisher", "Fisher information of the coarse renderer, redundancy controlled", "fisher", rule=False),
+    Contender("ensemble", "active: where coarse renderers of the views so far disagree", "ensemble", rule=False),
+    Contender("variance", "active: where a coarse renderer of the views so far is least sure", "variance", rule=False),
+    _paper("rl-paper", "-loss (the paper's)", "neg-loss"),
+    _paper("rl-hard", "+loss", "pos-loss"),
+    _paper("rl-decrease", "decrease of the error on probe views", "improvement"),
+    _paper("rl-own", "decrease of the error on the view itself", "improvement-own"),
+    _paper("rl-all", "decrease of the error on all candidates", "improvement-all"),
+)
+CONTENDERS: dict[str, Contender] = {contender.name: contender for contender in _CONTENDERS}
+SIMPLE = ("farthest", "kmedoids", "coverage")
+"""The simple rules; the best of them in a pool is the rival."""
+GROUPS: dict[str, tuple[str, ...]] = {
+    "core": tuple(c.name for c in _CONTENDERS if c.rule and c.rounds == 1),
+    "simple": ("random", *SIMPLE),
+    "auto": ("coverage",),  # what the default is
+    "rewards": tuple(c.name for c in _CONTENDERS if c.policy == LEARNED),
+    "all": tuple(CONTENDERS),
+}
+
+
+def choose_policies(text: str) -> list[Contender]:
+    """``"random,kmedoids"`` or groups, in the table's order. Raises UserError for unknown names."""
+    names: set[str] = set()
+    for name in filter(None, (part.strip() for part in text.split(","))):
+        if name not in GROUPS and name not in CONTENDERS:
+            near = difflib.get_close_matches(name, [*CONTENDERS, *GROUPS], n=1)
+            hint = f"did you mean '{near[0]}'?" if near else f"groups: {', '.join(GROUPS)}"
+            raise UserError(f"--policies {name}: no such policy or group; {hint} (policies: {', '.join(CONTENDERS)})")
+        names.update(GROUPS.get(name, (name,)))
+    if not names:
+        raise UserError(f"--policies: names none; choose of {', '.join([*GROUPS, *CONTENDERS])}")
+    return [contender for contender in _CONTENDERS if contender.name in names]
+
+
+def settings_of(contender: Contender, base: Settings, budget: int) -> Settings:
+    """The run's settings with the contender's changes and the budget."""
+    data = merge(base.model_dump(mode="json"), contender.changes)
+    return Settings.model_validate(merge(data, {"select": {"budget": budget}}))
+
+
+@functools.cache
+def rules_fingerprint() -> str:
+    """Hash of the sources of all rules: selections of other code are not kept, for they cost seconds."""
+    import dnrtrain.selector
+
+    whole = hashlib.sha256()
+    for path in sorted(Path(dnrtrain.selector.__path__[0]).glob("*.py")):
+        whole.update(path.name.encode() + b"\0" + path.read_bytes())
+    return whole.hexdigest()[:24]

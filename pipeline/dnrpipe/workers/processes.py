@@ -1,0 +1,330 @@
+"""Task lists on local worker processes.
+
+A renderer runs in a process of its own: bpy is process-global state, and a bad LLVM or GL driver kills
+the process it lives in. The parent survives, reports, retries a task once on a fresh worker, and goes on.
+A worker that does not answer is killed after a while: see :class:`Patience`.
+
+Protocol: ``python -m dnrpipe.workers.processes MODULE PARENT``. The worker calls ``MODULE.Worker(common)`` once, then
+``worker(task) -> result`` for every JSON line on standard input. Answers are JSON lines on a private copy
+of standard output; what libraries print goes to the log file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import importlib
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..core.errors import UserError
+from .timeouts import Patience
+
+MAX_ATTEMPTS = 2
+
+
+@dataclass
+class TaskResult:
+    """Outcome of one task: ``result`` when it succeeded, else ``error`` (one line).
+
+    ``died``: the worker process ended or hung, rather than answering with an error. ``errno``: of the
+    OSError that the worker met, or None.
+    """
+
+    task: dict[str, Any]
+    result: dict[str, Any] | None = None
+    error: str | None = None
+    attempts: int = 1
+    seconds: float = 0.0
+    died: bool = False
+    errno: int | None = None
+
+
+@dataclass
+class _Slot:
+    process: subprocess.Popen[str] | None = None
+
+
+@dataclass
+class Retry:
+    """A worker died or a task failed; the task is tried again."""
+
+    task: dict[str, Any]
+    reason: str
+
+
+def run_tasks(
+    module: str,
+    common: dict[str, Any],
+    tasks: Sequence[dict[str, Any]],
+    *,
+    workers: int,
+    log: Path,
+    timeout: float | None = None,
+    environment: dict[str, str] | None = None,
+    follow: Callable[[TaskResult], Sequence[dict[str, Any]]] | None = None,
+) -> Iterator[TaskResult | Retry]:
+    """Run ``tasks`` on ``workers`` processes; yield a TaskResult per task, and a Retry for each new try.
+
+    Args:
+        module: importable module with a class ``Worker(common)`` that is callable with a task.
+        common: JSON-able, sent once to each worker.
+        log: file to which the workers' output is appended.
+        timeout: seconds after which a silent task counts as hung; its worker is killed. None: see :mod:`.patience`.
+        environment: variables added to the workers' environment.
+        follow: called with each TaskResult before it is yielded; returns tasks to do after it.
+
+    Closing the iterator (Ctrl-C in the consumer) kills the workers. Raises UserError: see :class:`Patience`.
+    """
+    patience = Patience(timeout)
+    pending: queue.SimpleQueue[tuple[dict[str, Any], int]] = queue.SimpleQueue()
+    for task in tasks:
+        pending.put((task, 1))
+    outcomes: queue.SimpleQueue[TaskResult | Retry] = queue.SimpleQueue()
+    stopping = threading.Event()
+    open_tasks = _Counter(len(tasks))
+    slots = [_Slot() for _ in range(max(1, min(workers, len(tasks))))]
+    log.parent.mkdir(parents=True, exist_ok=True)
+    # Workers end without Blender's own clean-up (see _worker_main); what it leaves in the temporary folder goes here.
+    litter = tempfile.TemporaryDirectory(prefix="dnrpipe-workers-", ignore_cleanup_errors=True)
+    surroundings = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), litter.name) | (environment or {})
+
+    def serve(slot: _Slot) -> None:
+        # The thread lives as long as its worker: PR_SET_PDEATHSIG follows the spawning thread.
+        try:
+            while not stopping.is_set() and open_tasks.value > 0:
+                try:
+                    task, attempt = pending.get(timeout=0.05)
+                except queue.Empty:
+                    continue
+                started = time.monotonic()
+                try:
+                    if slot.process is None or slot.process.poll() is not None:
+                        slot.process = _spawn(module, common, log, surroundings)
+                    answer = _ask(slot.process, task, patience.limit(attempt), patience.words())
+                except (WorkerDied, OSError, ValueError) as death:  # also: cannot be started, torn answer
+                    _kill(slot.process)
+                    slot.process = None
+                    answer = {"error": " ".join(str(death).split()), "retry": True, "died": True}
+                if stopping.is_set():
+                    return
+                seconds = time.monotonic() - started
+                if answer.get("retry"):  # on a fresh worker: this one may be short of memory, or half broken
+                    _close(slot.process, force=True)
+                    slot.process = None
+                if "error" not in answer:
+                    patience.took(seconds)
+                    outcomes.put(TaskResult(task, answer["result"], None, attempt, seconds))
+                elif attempt < MAX_ATTEMPTS and answer.get("retry", True):
+                    outcomes.put(Retry(task, answer["error"]))
+                    pending.put((task, attempt + 1))
+                else:
+                    died, number = answer.get("died", False), answer.get("errno")
+                    outcomes.put(TaskResult(task, None, answer["error"], attempt, seconds, died, number))
+        finally:
+            _close(slot.process, force=stopping.is_set())
+
+    threads = [threading.Thread(target=serve, args=(slot,), daemon=True) for slot in slots]
+    for thread in threads:
+        thread.start()
+    try:
+        while open_tasks.value > 0:
+            outcome = outcomes.get()
+            if isinstance(outcome, TaskResult):
+                more = follow(outcome) if follow is not None else ()
+                for task in more:
+                    pending.put((task, 1))
+                open_tasks.value += len(more) - 1
+            yield outcome
+    finally:
+        stopping.set() if open_tasks.value > 0 else None
+        if stopping.is_set():
+            for slot in slots:
+                _kill(slot.process)
+        for thread in threads:
+            thread.join(timeout=10)
+        litter.cleanup()
+
+
+class WorkerDied(RuntimeError):
+    """The worker process ended or hung while a task was under way."""
+
+
+class TaskFailed(RuntimeError):
+    """The worker answered with an error; it lives on."""
+
+
+class LocalWorker:
+    """One worker process that is asked task by task, outside of :func:`run_tasks`. Not for several threads at once.
+
+    Linux kills it when the thread that asked first ends.
+
+    Args: as of :func:`run_tasks`.
+    """
+
+    def __init__(self, module: str, common: dict[str, Any], log: Path, environment: dict[str, str]) -> None:
+        self.module, self.common, self.log, self.environment = module, common, log, environment
+        self._slot = _Slot()
+
+    def ask(self, task: dict[str, Any], timeout: float) -> dict[str, Any]:
+        """The worker's answer; it is started where there is none. Raises WorkerDied, TaskFailed."""
+        if self._slot.process is None or self._slot.process.poll() is not None:
+            self.log.parent.mkdir(parents=True, exist_ok=True)
+            self._slot.process = _spawn(self.module, self.common, self.log, self.environment)
+        try:
+            answer = _ask(self._slot.process, task, timeout)
+        except WorkerDied:
+            self.close()
+            raise
+        if "error" in answer:
+            raise TaskFailed(answer["error"])
+        return answer["result"]
+
+    def close(self) -> None:
+        """End the process."""
+        _close(self._slot.process, force=True)
+        self._slot.process = None
+
+
+@dataclass
+class _Counter:
+    """Tasks not answered for yet. Written by the consumer of the answers alone, read by the workers' threads."""
+
+    value: int
+
+
+def _spawn(module: str, common: dict[str, Any], log: Path, environment: dict[str, str]) -> subprocess.Popen[str]:
+    with log.open("a") as sink:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "dnrpipe.workers.processes", module, str(os.getpid())],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=sink,
+            text=True,
+            env={**os.environ, "PYTHONUNBUFFERED": "1", **environment},
+        )
+    assert process.stdin is not None
+    try:
+        process.stdin.write(json.dumps(common) + "\n")
+        process.stdin.flush()
+    except OSError:
+        raise WorkerDied(_epitaph(process)) from None
+    return process
+
+
+def _ask(process: subprocess.Popen[str], task: dict[str, Any], timeout: float, why: str = "") -> dict[str, Any]:
+    """The answer to a task. Raises WorkerDied, also after ``timeout`` seconds (``why``: where that number is from)."""
+    assert process.stdin is not None and process.stdout is not None
+    hung = threading.Event()
+
+    def kill() -> None:
+        hung.set()
+        process.kill()
+
+    timer = threading.Timer(timeout, kill)
+    timer.daemon = True
+    timer.start()
+    try:
+        try:
+            process.stdin.write(json.dumps(task) + "\n")
+            process.stdin.flush()
+            line = process.stdout.readline()
+        except OSError:
+            line = ""
+        if not line:
+            raise WorkerDied(f"worker hung for {timeout:.0f} s{why}" if hung.is_set() else _epitaph(process))
+        return json.loads(line)
+    finally:
+        timer.cancel()
+
+
+def _epitaph(process: subprocess.Popen[str]) -> str:
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(timeout=5)
+    code = process.returncode
+    if code is not None and code < 0:
+        with contextlib.suppress(ValueError):
+            guess = " (out of memory?)" if -code == signal.SIGKILL else ""
+            return f"worker was killed by {signal.Signals(-code).name}{guess}"
+    return f"worker ended with exit code {code}"
+
+
+def _kill(process: subprocess.Popen[str] | None) -> None:
+    if process is not None and process.poll() is None:
+        process.kill()
+
+
+def _close(process: subprocess.Popen[str] | None, *, force: bool) -> None:
+    if process is None:
+        return
+    with contextlib.suppress(OSError):
+        if process.stdin:
+            process.stdin.close()
+    if force:
+        _kill(process)
+    try:
+        process.wait(timeout=20)
+    except subprocess.TimeoutExpired:  # a library that hangs at exit; its work is on disk already
+        process.kill()
+        process.wait()
+    if process.stdout:
+        process.stdout.close()
+
+
+def die_with_parent(parent: int) -> None:
+    """Ask Linux to kill this process when the thread that started it dies; elsewhere stdin's end serves.
+
+    parent: number of the process that started this one. Where it died before we could ask, this process ends at once.
+    """
+    if sys.platform == "linux":
+        import ctypes
+
+        parent_death_signal = 1  # PR_SET_PDEATHSIG
+        ctypes.CDLL(None, use_errno=True).prctl(parent_death_signal, signal.SIGKILL)
+        if os.getppid() != parent:
+            os._exit(1)
+
+
+def _worker_main(module: str, parent: int) -> int:
+    die_with_parent(parent)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+    answers = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+    common = json.loads(sys.stdin.readline())
+    worker: Any = None
+    for line in sys.stdin:
+        try:
+            if worker is None:  # made on the first task: its failure is that task's answer
+                worker = importlib.import_module(module).Worker(common)
+            answer = {"result": worker(json.loads(line))}
+        except Exception as error:  # reported to the parent, the traceback goes to the log
+            import traceback
+
+            traceback.print_exc()
+            reason = " ".join(str(error).split()) or type(error).__name__
+            if isinstance(error, MemoryError):
+                reason = f"out of memory ({reason})"
+            # Bad input and a full disk stay what they are; anything else gets its second try.
+            full = isinstance(error, OSError) and error.errno == errno.ENOSPC
+            retry = not (full or isinstance(error, ValueError | UserError))
+            answer = {"error": reason, "retry": retry, "errno": getattr(error, "errno", None)}
+        answers.write(json.dumps(answer) + "\n")
+        answers.flush()
+    answers.flush()
+    sys.stderr.flush()
+    os._exit(0)  # bpy and Dr.Jit may crash in their own shutdown after all work is written
+
+
+if __name__ == "__main__":
+    raise SystemExit(_worker_main(sys.argv[1], int(sys.argv[2])))
