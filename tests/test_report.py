@@ -19,8 +19,9 @@ import pytest
 from PIL import Image
 
 from dnrpipe.core.errors import UserError
+from dnrpipe.core.units import duration, several
 from dnrpipe.export.browser import find_chromium, open_page
-from dnrpipe.report import build_report, charts, words
+from dnrpipe.report import build_report, charts
 from dnrpipe.report.collect import collect
 from dnrpipe.report.pictures import load_png
 from dnrpipe.report.render import render_html
@@ -360,13 +361,13 @@ def test_projections_are_right_handed() -> None:
     ],
 )  # fmt: skip
 def test_durations(seconds: float, text: str) -> None:
-    assert words.duration(seconds) == text
+    assert duration(seconds) == text
 
 
 def test_sample_counts_in_words() -> None:
-    assert words.several([64]) == "64"
-    assert words.several([32, 64, 128]) == "32, 64, 128"
-    assert words.several([80, 112, 160, 664]) == "80 to 664"
+    assert several([64]) == "64"
+    assert several([32, 64, 128]) == "32, 64, 128"
+    assert several([80, 112, 160, 664]) == "80 to 664"
 
 
 @needs_browser

@@ -19,7 +19,7 @@ from tests.service.test_planned import prediction
 from websockets.sync.client import connect
 
 from dnrpipe.export.browser import find_chromium, open_page
-from dnrpipe.service.live_pace import BUDGET, LEVELS, PATIENCE, START, Pace
+from dnrpipe.service.live_pace import BUDGET, LEVELS, MIN_FRAMES, START, Pace
 from dnrpipe.service.models import JobRequest
 from dnrpipe.service.routes_live import unpack
 
@@ -150,17 +150,17 @@ def test_pace() -> None:
     """Slow frames make it coarser, quick ones finer, and it settles where frames fit into the budget."""
     pace = Pace()
     cost = {0: 400.0, 1: 150.0, 2: 80.0, 3: 40.0, 4: 25.0}
-    for _ in range(10 * PATIENCE):
-        pace.took(256, cost[pace.level])
+    for _ in range(10 * MIN_FRAMES):
+        pace.record(256, cost[pace.level])
     assert pace.level == 2
-    for _ in range(20 * PATIENCE):
-        pace.took(256, 20 * cost[pace.level])
+    for _ in range(20 * MIN_FRAMES):
+        pace.record(256, 20 * cost[pace.level])
     assert pace.level == len(LEVELS) - 1 and pace.pick(256) == (128, 1)
-    for _ in range(20 * PATIENCE):
-        pace.took(256, 0.01 * cost[pace.level])
+    for _ in range(20 * MIN_FRAMES):
+        pace.record(256, 0.01 * cost[pace.level])
     assert pace.level == 0 and pace.pick(256) == (256, None)
     first = Pace()
-    first.took(256, 100 * BUDGET)  # compiles the kernels
+    first.record(256, 100 * BUDGET)  # compiles the kernels
     assert first.level == START and first._mean is None
 
 

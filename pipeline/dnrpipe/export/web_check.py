@@ -1,4 +1,4 @@
-"""The page in a browser against torch: the same cameras, the page's own inputs, its own pictures."""
+"""Compares the page in a browser with torch: same cameras, same inputs."""
 
 from __future__ import annotations
 
@@ -27,13 +27,20 @@ CHANNELS = {"uv": 2, "mask": 1, "coverage": 1, "view_dir": 3, "normal": 3, "base
 def check_page(out: Path, views: Sequence[View], data: ViewSet, model: DNR, console: Console) -> dict[str, Any]:
     """Open ``out/index.html`` from disk in a headless Chromium (software GL) and render the views.
 
-    data: the same views by their files (`web_model.web_views`), with ray-traced targets.
+    Args:
+        out: the exported folder.
+        views: their cameras.
+        data: the same views by their files (`web_model.web_views`), with ray-traced targets.
+        model: the page's network.
+        console: for progress.
 
-    Returns means over the views, dB: ``psnr_torch``, the page's picture against torch on the inputs that the page
-    drew; ``psnr_files``, against torch on Blender's G-buffers; ``psnr_truth``, against the ray-traced view; also the
-    share of pixels whose mask agrees with Blender's, and milliseconds by stage.
+    Returns:
+        Means over the views, dB: `psnr_torch`, the page's picture against torch on the inputs that the page drew;
+        `psnr_files`, against torch on Blender's G-buffers; `psnr_truth`, against the ray-traced view; also
+        `mask_agrees`, the share of pixels whose mask agrees with Blender's, and milliseconds by stage.
 
-    Raises UserError: no Chromium, or the page failed in it.
+    Raises:
+        UserError: no Chromium, or the page failed in it.
     """
     import torch
 
@@ -67,7 +74,7 @@ def check_page(out: Path, views: Sequence[View], data: ViewSet, model: DNR, cons
 
 
 def probe(page: Page, view: View) -> dict[str, np.ndarray]:
-    """What the page draws and renders of a view: its inputs and ``rgb``, float32 [C, H, W] each."""
+    """What the page draws and renders of a view: its inputs and `rgb`, float32 [C, H, W] each."""
     answer = wait_for(page, f"window.dnr.then(page => page.probe({json.dumps(view.model_dump(mode='json'))}))")
     return {
         name: np.frombuffer(base64.b64decode(answer[name]), "<f4").reshape(count, view.height, view.width).copy()
@@ -76,7 +83,7 @@ def probe(page: Page, view: View) -> dict[str, np.ndarray]:
 
 
 def page_batch(batch: Any, drawn: dict[str, np.ndarray]) -> Any:
-    """``batch`` (one view) with the page's inputs in place of those from files."""
+    """`batch` (one view) with the page's inputs instead of those from files."""
     from dataclasses import replace
 
     import torch

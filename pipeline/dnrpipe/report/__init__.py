@@ -1,4 +1,4 @@
-"""The report: one self-contained HTML file that says what came out, how good it is and what it cost.
+"""The report: one self-contained HTML file with the result, its quality and its cost.
 
     workspace files -> collect.py -> ReportData -> render.py -> report/report.html (+ report.json)
 
@@ -12,10 +12,10 @@ from pathlib import Path
 
 
 def build_report(workspace_dir: Path, *, made_at: datetime | None = None) -> Path:
-    """Write ``report/report.html`` and ``report/report.json`` (the same figures, for machines).
+    """Write `report/report.html` and `report/report.json` (the same figures, for machines).
 
-    Whatever stages have run is shown; the rest is named with the command that makes it. Returns the path
-    of the HTML file. ``made_at``: the date shown, now (UTC) when None.
+    It shows the stages that have run, and names the commands for the rest. Returns the path of the HTML file.
+    made_at: the date shown, now (UTC) when None.
 
     Raises:
         UserError: not a workspace, or one of its files is damaged.
