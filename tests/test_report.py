@@ -197,6 +197,12 @@ def test_every_half_done_workspace_has_a_report(tmp_path: Path) -> None:
         build_report(root)
 
 
+BAD_EPOCH = json.dumps(
+    {"model": {}, "fingerprint": "f", "run": "r", "stage": "step1", "settings": {}, "seed": 0, "bfloat16": False}
+    | {"history": [{"epoch": "x"}]}
+)
+
+
 @pytest.mark.parametrize(
     ("file", "text", "message"),
     [
@@ -204,7 +210,7 @@ def test_every_half_done_workspace_has_a_report(tmp_path: Path) -> None:
         ("evaluation/metrics.json", '{"views": []}', r"metrics\.json: views: .*dnrpipe evaluate"),
         ("evaluation/metrics.json", '{"views": [{"name": "../../etc/x"}]}', r"views\.0\.name"),
         ("selection.json", "[]", r"selection\.json: not a JSON object.*dnrpipe select"),
-        ("checkpoints/step1/model.json", '{"history": [{"epoch": "x"}]}', r"history\.0\.epoch"),
+        ("checkpoints/step1/model.json", BAD_EPOCH, r"history\.0\.epoch"),
         ("cameras/test.json", '{"frames": [{}]}', r"test\.json: damaged \(frame 0"),
         ("evaluation/0003.truth.png", "not a picture", r"0003\.truth\.png: damaged image"),
         ("raytraced/train/0011.exr", "not an exr", r"0011\.exr: damaged \(EXR"),

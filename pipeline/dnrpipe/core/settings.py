@@ -16,8 +16,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, field_validator
 
-from dnrtrain.selector.names import TRAINED_NAMES, PolicyName, full_name
-from dnrtrain.settings import ActiveSettings, LossWeights, ModelSettings, Step1Settings, Step2Settings, Strict
+from dnrtrain.selector.names import TRAINED_NAMES, PolicyName
+from dnrtrain.settings import LossWeights, ModelSettings, Step1Settings, Step2Settings, Strict
 
 from .effect_names import EffectName
 from .errors import UserError
@@ -134,20 +134,8 @@ class SelectSettings(Strict):
 
     budget: int = Field(default=25, ge=1, description="views to ray-trace")
     policy: PolicyName = Field(default="auto", description="how they are chosen (docs/method.md)")
-    weights: str = Field(
-        default="", description="file of `dnrpipe train-selector` for policy dqn; empty: the shipped one"
-    )
-    rounds: int = Field(
-        default=1, ge=1, description="2 or more: trace a part, look where the base image is wrong, choose the rest"
-    )
     seed: int = Field(default=0, ge=0)
     step1: Step1Settings = Step1Settings()
-    active: ActiveSettings = ActiveSettings()
-
-    @field_validator("policy", mode="before")
-    @classmethod
-    def _in_full(cls, value: Any) -> Any:
-        return full_name(value) if isinstance(value, str) else value
 
 
 class FinetuneSettings(Strict):

@@ -118,7 +118,7 @@ def raytraced_views(workspace: Workspace) -> dict[str, list[View]]:
     """
     cameras = split_views(workspace)
     by_name = {view.name: view for view in cameras["train"]}
-    chosen = [by_name[name] for name in read_selection(workspace)["views"] if name in by_name]
+    chosen = [by_name[name] for name in read_selection(workspace).views if name in by_name]
     missing = [view.name for view in chosen if not workspace.raytraced("train", view.name).is_file()]
     if missing or not chosen:
         raise UserError(

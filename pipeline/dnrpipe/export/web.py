@@ -142,7 +142,7 @@ def _scene(workspace: Workspace, views: dict[str, list[View]], maps: SurfaceMaps
         "quality": quality,
         "start": first.model_dump(mode="json"),
         "distance": float(np.median([np.linalg.norm(view.position - frame.center) for view in views["train"]])),
-        "trained_on": len(read_selection(workspace)["views"]),
+        "trained_on": len(read_selection(workspace).views),
     }
 
 

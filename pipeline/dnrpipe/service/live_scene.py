@@ -104,7 +104,7 @@ def open_scene(root: Path) -> LiveScene:
     frame, summary = read_frame(workspace), read_summary(workspace)
     radius = float(summary["bounds"]["radius"])
     pixels, distance = framing(summary, settings.cameras, radius)
-    names = set(read_selection(workspace)["views"])
+    names = set(read_selection(workspace).views)
     views = [view for view in read_cameras(workspace.cameras("train")) if view.name in names]
     return LiveScene(
         root=root,

@@ -160,13 +160,11 @@ def run_finetune(workspace: Workspace, settings: Settings, console: Console, run
     """Step 2: fine-tune the coarse DNR on the selected ray-traced views."""
     from dnrtrain.step2 import run_step2
 
-    from .previews import LivePicture  # which imports this module
-
     by_name = {view.name: view for view in split_views(workspace)["train"]}
-    names = read_selection(workspace)["views"]
+    names = read_selection(workspace).views
     dataset = load(workspace, [by_name[name] for name in names], "train", raytraced=True, base=settings.model.base)
-    stamp = fingerprint(STAGES["finetune"], workspace, settings)
-    assert stamp is not None
+    inputs = fingerprint(STAGES["finetune"], workspace, settings)
+    assert inputs is not None
     folder = workspace.checkpoints("step2")
     weights = perceptual_weights(console)
     picture = LivePicture(workspace, settings, console, run_id, dataset)
@@ -179,7 +177,7 @@ def run_finetune(workspace: Workspace, settings: Settings, console: Console, run
         seed=settings.finetune.seed,
         device=torch_device(settings),
         checkpoints=folder,
-        fingerprint=digest([stamp, weights is not None]),
+        fingerprint=digest([inputs, weights is not None]),
         weights=weights,
         preview=picture.preview,
     )

@@ -15,15 +15,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-from dnrtrain.selector.names import ACTIVE_NAMES, SHIPPED_WEIGHTS
-
 from .. import __version__
 from ..core.console import Console, clock
 from ..core.effect_names import NEURAL
 from ..core.errors import UserError
 from ..core.scene_files import scene_fingerprint
 from ..core.settings import Settings
-from ..core.workspace import Workspace, digest, file_sha256
+from ..core.workspace import Workspace, digest
 from .stage import Outcome, Stage
 
 
@@ -54,26 +52,9 @@ def _base(settings: Settings) -> list[Any]:
 
 def _selection(settings: Settings) -> list[Any]:
     """Settings that decide which views are chosen, and the coarse model where there is one."""
-    parts: list[Any] = []
-    if settings.select.rounds > 1:  # what is traced decides what is chosen next
-        parts = [settings.select.rounds, STAGES["raytrace"].settings(settings)]
-    if settings.select.policy == "dqn":
-        parts.append(_selector_weights(settings))
     if not settings.trains_step1:
-        return [settings.select.model_dump(include={"budget", "policy", "seed"}), *parts]
-    if settings.select.policy in ACTIVE_NAMES:
-        parts.append([settings.select.active.model_dump(), settings.starts_coarse])
-    select = settings.select.model_dump(exclude={"rounds", "weights", "active"})
-    if select["policy"] == "rl-paper":
-        select["policy"] = "rl"  # its first name: what was trained under it stays done
-    return [settings.model.coarse().model_dump(), select, _neural(settings), *parts]
-
-
-def _selector_weights(settings: Settings) -> str:
-    """Hash of the learned selector's weights; "" while there are none."""
-    named = settings.select.weights
-    path = Path(named) if named else SHIPPED_WEIGHTS
-    return file_sha256(path) if path.is_file() else ""
+        return [settings.select.model_dump(include={"budget", "policy", "seed"})]
+    return [settings.model.coarse().model_dump(), settings.select.model_dump(), _neural(settings)]
 
 
 def _neural(settings: Settings) -> dict[str, list[str]]:

@@ -32,7 +32,7 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
     from .previews import shown_view  # which imports this module
 
     by_name = {view.name: view for view in split_views(workspace)["train"]}
-    selected = [by_name[name] for name in read_selection(workspace)["views"]]
+    selected = [by_name[name] for name in read_selection(workspace).views]
     tasks = trace_views(
         workspace,
         settings,
@@ -68,7 +68,7 @@ def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
     if not workspace.selection.exists():
         return 0, settings.select.budget
     try:
-        names = read_selection(workspace)["views"]
+        names = read_selection(workspace).views
     except ContractError:
         return 0, settings.select.budget  # damaged: the stage mends it when it runs
     rendered = settings.model.base in RENDERED

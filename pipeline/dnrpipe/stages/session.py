@@ -127,10 +127,8 @@ class Session:
     def _check(self, settings: Settings, workspace: Workspace | None) -> None:
         """Refuse bad camera files and a budget above the candidates before any work is done or folder made."""
         from ..core.cameras import KEYWORDS, read_camera_file
-        from .select import check_budget, check_rounds
+        from .select import check_budget
 
-        if self.command in ("run", "select"):
-            check_rounds(settings.select)
         record = workspace.manifest.stages.get("prepare") if workspace else None
         if settings.cameras.source not in KEYWORDS and (self.command == "prepare" or self.scene is not None):
             read_camera_file(Path(settings.cameras.source), settings.cameras)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from dnrtrain.contract import DamagedFile, View, read_cameras
 from dnrtrain.events import Diverged, EpochEnd, Event, Note
+from dnrtrain.records import PROGRESS, Progress, Selection, read
 
 from ..core.console import Bar, Console
 from ..core.errors import UserError
@@ -24,20 +23,15 @@ if TYPE_CHECKING:
     from dnrtrain.dataset import Base, ViewSet
 
 
-def read_selection(workspace: Workspace) -> dict[str, Any]:
+def read_selection(workspace: Workspace) -> Selection:
     """``selection.json``. Raises UserError: there is none. DamagedFile: it does not read, or names other views."""
     path = workspace.selection
     try:
-        selection = json.loads(path.read_text(encoding="utf-8"))
+        selection = read(path, Selection)
     except FileNotFoundError:
         raise UserError(f"{workspace.root}: no views selected yet; run `dnrpipe select` first") from None
-    except (ValueError, RecursionError) as error:
-        raise DamagedFile(path, str(error)) from None
-    names = selection.get("views") if isinstance(selection, dict) else None
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise DamagedFile(path, "has no list of views")
     cameras = workspace.cameras("train")
-    unknown = sorted(set(names) - {view.name for view in read_cameras(cameras)}) if cameras.exists() else []
+    unknown = sorted(set(selection.views) - {view.name for view in read_cameras(cameras)}) if cameras.exists() else []
     if unknown:
         raise DamagedFile(path, f"views {', '.join(unknown)[:200]} are no candidates")
     return selection
@@ -91,13 +85,13 @@ def perceptual_weights(console: Console) -> Any:
 
 
 def epochs_done(folder: Path, wanted: int, finished: bool) -> tuple[int, int]:
+    """(epochs trained, epochs wanted) by the files of a training; all of them where it is ``finished``."""
     if finished and (folder / "model.safetensors").exists():
         return wanted, wanted
-    for name in ("checkpoint.json", "model.json"):
-        path = folder / name
-        with contextlib.suppress(OSError, ValueError, TypeError, AttributeError, RecursionError):
-            return min(int(json.loads(path.read_text()).get("epoch", 0)), wanted - 1), wanted
-    return 0, wanted  # no epoch, or a damaged book of them: the stage itself reads the weights
+    try:
+        return min(read(folder / PROGRESS, Progress).epoch, wanted - 1), wanted
+    except (OSError, DamagedFile):  # no epoch, or a damaged file: the stage itself reads the weights
+        return 0, wanted
 
 
 def follow(

@@ -49,17 +49,14 @@ class Scene:
         return self._baseline("random", budget, seed)
 
     def _baseline(self, policy: str, budget: int, seed: int) -> list[str]:
-        import numpy as np
-
         from dnrtrain.selector.policies import untrained
         from dnrtrain.selector.protocol import Candidates
 
         names = list(self.train)
-        positions = np.stack([self.train[name].position for name in names])
-        directions = np.stack([-self.train[name].matrix[:3, 2] for name in names])
+        candidates = Candidates.of_views([self.train[name] for name in names])
         rule = untrained(policy)
         assert rule is not None  # both names above are rules
-        return [names[i] for i in rule.choose(Candidates(positions, directions), budget, seed).views]
+        return [names[i] for i in rule.choose(candidates, budget, seed).views]
 
 
 def find_scenes(text: str | None) -> list[Path]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import DamagedFile
-from dnrtrain.selector.names import ACTIVE_NAMES, TRAINED_NAMES
+from dnrtrain.selector.names import TRAINED_NAMES
 
 from ...core.console import Console
 from ...core.errors import UserError
@@ -204,11 +204,4 @@ def _policy_seconds(workspace: Workspace, settings: Settings, step_seconds: floa
     trains = policy_of(workspace, settings) in TRAINED_NAMES or settings.finetune.step2.start == "coarse"
     if not trains:
         return RULE_SECONDS
-    steps = settings.select.step1.epochs * len(split_views(workspace)["train"])
-    if policy_of(workspace, settings) in ACTIVE_NAMES:
-        from dnrtrain.selector.active import active_steps
-
-        select = settings.select
-        own = active_steps(select.policy, select.active, select.budget)
-        steps = own + (steps if settings.starts_coarse or not own else 0)
-    return steps * step_seconds
+    return settings.select.step1.epochs * len(split_views(workspace)["train"]) * step_seconds

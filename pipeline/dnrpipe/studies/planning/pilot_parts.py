@@ -272,9 +272,7 @@ def _views(workspace: Workspace) -> tuple[list[View], list[View]]:
     views = splits["train"]
     rule = untrained("farthest")
     assert rule is not None
-    positions = np.stack([view.position for view in views])
-    directions = np.stack([-view.matrix[:3, 2] for view in views])
-    chosen = rule.choose(Candidates(positions, directions), min(VIEWS, len(views)), 0).views
+    chosen = rule.choose(Candidates.of_views(views), min(VIEWS, len(views)), 0).views
     others = [view for i, view in enumerate(views) if i not in set(chosen)]
     left = splits.get("test") or splits.get("val") or others or views
     step = max(1, len(left) // HELD_OUT)
