@@ -1,4 +1,4 @@
-"""What a rasteriser shows of the scene: the light that the atlas sends back diffusely, as textures."""
+"""The diffuse outgoing light of the atlas as textures, for rasterisers."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ FINER = 2
 
 @dataclass(frozen=True)
 class SurfaceMaps:
-    """radiance: float32 [2, n, n, 4] (front, back): linear Rec.709, what the texel sends back diffusely and emits;
-    opacity. normal: float32 [n, n, 3], the triangles', world space. Row 0 at V = 0. thin: backs can be seen."""
+    """radiance: float32 [2, n, n, 4] (front, back): diffuse outgoing and emitted light of the texel, linear Rec.709;
+    opacity. normal: float32 [n, n, 3], the triangles', world space. Row 0 at V = 0. thin: backs are visible."""
 
     radiance: np.ndarray
     normal: np.ndarray

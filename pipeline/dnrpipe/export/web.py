@@ -2,9 +2,9 @@
 
 index.html, viewer.js   the page
 scene.json              cameras, sizes, display figures
-scene.glb               meshes with atlas coordinates (see :mod:`.gltf`)
+scene.glb               meshes with atlas coordinates (see `gltf`)
 light-front.bin, -back  what surfaces send back diffusely: RGBA float16 [n, n, 4], row 0 at V = 0, A = opacity
-model.onnx              the network (see :mod:`.web_model`)
+model.onnx              the network (see `web_model`)
 ort/                    onnxruntime-web and its licence
 offline.js              all of the above once more as text: pages opened from disk may not read files
 """
@@ -51,10 +51,19 @@ def export_web(
 ) -> dict[str, Any]:
     """Train the page's network, write the folder, and measure the network on the held-out views (by torch).
 
-    check: also open the page in a browser (:mod:`.web_check`).
+    Args:
+        workspace: with baked light and ray-traced views.
+        out: the folder, new or an earlier export of the same kind.
+        console: for progress.
+        epochs: of training; None: 40, more for few views.
+        check: also open the page in a browser (`web_check`).
 
-    Raises UserError: no baked light, no ray-traced views, no npm, or a folder that is not ours to write; with ``check``
-    also no Chromium.
+    Returns:
+        folder, bytes, the figures of `held_out`, and with `check` those of `check_page`.
+
+    Raises:
+        UserError: no baked light, no ray-traced views, no npm, or a folder that is not ours to write; with `check`
+            also no Chromium.
     """
     from dnrtrain import onnx_export
 

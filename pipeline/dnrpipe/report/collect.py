@@ -1,4 +1,4 @@
-"""Workspace -> :class:`ReportData`: reads what the stages left, computes statistics, notes what is missing."""
+"""Workspace -> `ReportData`: reads the stages' files, computes statistics, lists what is missing."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ STEP_TITLES = {
     1: "Step 1: rasterised images, all candidates",
     2: "Step 2: ray-traced images, chosen views",
 }
-AGENT_TERMS = ("reward", "q")  # booked beside the losses of step 1, but signed and no losses
+AGENT_TERMS = ("reward", "q")  # recorded beside the losses of step 1, but signed and no losses
 Model = TypeVar("Model", bound=BaseModel)
 
 
 class Outline(BaseModel):
-    """What a workspace holds, without pictures: quick enough to ask for while a stage runs.
+    """A workspace's figures without pictures: quick enough to read while a stage runs.
 
     psnr: dB by test view, in the order of the evaluation. costs: see `core.ledger.summarise`.
     """
@@ -165,10 +165,10 @@ def _selection(
         exr = ExrPictures(root, frame) if frame else None
     except ContractError as error:
         raise UserError(str(error)) from None
-    booked = {r.name: r for r in traced_views(records, "training")}
+    tracing = {r.name: r for r in traced_views(records, "training")}
     views = []
     for order, name in enumerate(chosen.views, start=1):
-        record = booked.get(f"train/{name}")
+        record = tracing.get(f"train/{name}")
         views.append(
             ChosenView(
                 order=order,

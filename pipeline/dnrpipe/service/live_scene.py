@@ -1,4 +1,4 @@
-"""What a live view needs to know of a workspace, and cameras from what a mouse does."""
+"""What the live viewer needs of a workspace, and its orbit cameras."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Orbit(BaseModel):
 
 
 class LiveRequest(BaseModel):
-    """What a viewer asks for. size: pixels of the side at rest; moving: quick is better than fine."""
+    """A viewer's request. size: pixels of the side at rest; moving: quick is better than fine."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -51,10 +51,10 @@ class LiveRequest(BaseModel):
 
 @dataclass(frozen=True)
 class LiveScene:
-    """common, environment: of the frame process. stamp: changes when the model does. hello: told to the viewer."""
+    """common, environment: of the frame process. fingerprint: changes when the model does. hello: the first message."""
 
     root: Path
-    stamp: str
+    fingerprint: str
     common: dict[str, Any]
     environment: dict[str, str]
     hello: dict[str, Any]
@@ -66,28 +66,28 @@ class LiveScene:
     def view(self, camera: Orbit, size: int) -> View:
         """The view of ``camera``, ``size``² pixels."""
         ce = math.cos(camera.elevation)
-        towards = np.array(
+        direction = np.array(
             [ce * math.cos(camera.azimuth), ce * math.sin(camera.azimuth), math.sin(camera.elevation)], np.float64
         )
         target = np.asarray(camera.target, np.float64)
         settings = self.settings.cameras.model_copy(update={"width": size, "height": size})
-        return look_at_view("live", target + camera.distance * towards, target, self.focal * size, settings)
+        return look_at_view("live", target + camera.distance * direction, target, self.focal * size, settings)
 
     def nearest(self, view: View) -> View | None:
-        """The ray-traced training view that is most like ``view``: by place (in scene radii) and direction."""
+        """The ray-traced training view that is most like ``view``: by position (in scene radii) and direction."""
         if not self.training:
             return None
         radius = self.hello["radius"]
 
         def difference(other: View) -> float:
-            place = np.linalg.norm(other.position - view.position) / radius
-            return float(place + 1 - other.matrix[:3, 2] @ view.matrix[:3, 2])
+            distance = np.linalg.norm(other.position - view.position) / radius
+            return float(distance + 1 - other.matrix[:3, 2] @ view.matrix[:3, 2])
 
         return min(self.training, key=difference)
 
 
 def open_scene(root: Path) -> LiveScene:
-    """Read a workspace for viewing. Raises UserError naming what has to run first."""
+    """Read a workspace for viewing. Raises UserError: it cannot be viewed yet; names the stage to run first."""
     workspace = Workspace.open(root)
     record = workspace.manifest.stages.get("finetune")
     if record is None:
@@ -110,7 +110,7 @@ def open_scene(root: Path) -> LiveScene:
     views = [view for view in read_cameras(workspace.cameras("train")) if view.name in names]
     return LiveScene(
         root=root,
-        stamp=json.dumps([record.output, base, config], sort_keys=True),
+        fingerprint=json.dumps([record.output, base, config], sort_keys=True),
         common={
             "scene": str(workspace.scene),
             "frame": frame.model_dump(mode="json"),
