@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dnrpipe.blender.bundle.ply import weld, write_ply
-from dnrpipe.raytrace.base import CENTRES, MEANS, BaseRenderer
+from dnrpipe.raytrace.base_renderer import CENTRES, MEANS, BaseRenderer
 from dnrpipe.raytrace.engine import Engine
 from dnrpipe.raytrace.lightmap import LightBaker
 from dnrpipe.raytrace.lobes import diffuse_context
@@ -135,12 +135,12 @@ def test_samples_that_are_not_finite_are_counted(
 
 def test_large_pictures_in_bands_have_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Memory is bounded by launches of few rows; the last band is smaller than the others."""
-    from dnrpipe.raytrace import base
+    from dnrpipe.raytrace import base_renderer
 
     scene = poisoned_room(tmp_path, "")
     light = np.ones((2, 2, 16, 16, 3), np.float32)
     whole = BaseRenderer(mi, scene, light, 2).frame(camera())
-    monkeypatch.setattr(base, "MAX_RAYS", 2 * SIZE * 13)
+    monkeypatch.setattr(base_renderer, "MAX_RAYS", 2 * SIZE * 13)
     renderer = BaseRenderer(mi, scene, light, 2)
     launches: list[int] = []
     kernel = renderer.kernel

@@ -1,4 +1,4 @@
-"""The base-image worker: renders the images that the network corrects (see :mod:`.base`) into EXR files."""
+"""The base-image worker: renders the images that the network corrects (see `base_renderer`) into EXR files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dnrpipe.core.errors import UserError
 from dnrtrain.contract import View
 from dnrtrain.exr import write_exr
 
-from .base import BaseRenderer
+from .base_renderer import BaseRenderer
 from .denoise import denoise
 from .engine import Engine
 from .finite import masked

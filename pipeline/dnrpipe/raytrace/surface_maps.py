@@ -1,7 +1,7 @@
 """What the scene's surfaces are, over the atlas: diffuse reflectance, emission, opacity, geometric normal.
 
 A worker (see `dnrpipe.workers.processes`). Together with the light map this is all that a rasteriser needs to show
-the scene's diffuse light: radiance = albedo · light + emission (:mod:`.base` says the same of rays).
+the scene's diffuse light: radiance = albedo · light + emission (`base_renderer` says the same of rays).
 """
 
 from __future__ import annotations
