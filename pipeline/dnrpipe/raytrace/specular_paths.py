@@ -1,6 +1,6 @@
 """Paths of base images: camera rays that follow mirrors, glass, glossy lobes and cut-outs, without noise.
 
-For the notation see `base_images`. What a scene has none of (media, glass, rough metal, ...) leaves no code in its
+For the notation see `base_renderer`. What a scene has none of (media, glass, rough metal, ...) leaves no code in its
 kernel. Imports Mitsuba at the top: import this module where a variant is set.
 """
 
@@ -72,7 +72,7 @@ class SpecularPaths:
 
     @dr.syntax
     def trace(self, scene: Any, light: Any, steps: Any, ray: Any, forward: Any, number: Any) -> list[Any]:
-        """One sample along each ray -> the values that `base_images` names by LOST, MEANS and CENTRES, in that order.
+        """One sample along each ray -> the values that `base_renderer` names by LOST, MEANS and CENTRES, in that order.
 
         Args:
             scene: the scene.
