@@ -209,7 +209,7 @@ def run_pilots(
     log = workspace.log(stage)
     with console.bar(label, len(tasks)) as bar:
         for task in tasks:
-            common = {"configs": [task[key] for key in ("config", "with", "without") if key in task]}
+            common = {"configs": [task[key] for key in ("config", "with_effect", "without_effect") if key in task]}
             outcomes = run_tasks(
                 "dnrpipe.raytrace.pilot", common, [task], workers=1, log=log, environment=choice.environment
             )

@@ -9,10 +9,10 @@ Notation
     S        the light that comes from surfaces, not from emitters, in the mean over what a rough glossy lobe sees, for
              cosine-weighted directions of view: W sr^-1 m^-2
 
-At a view, B is E times the reflectance of that very point (`base_renderer`), so that the map holds light alone, which is
-smooth, and textures stay as sharp as they are. In the same way S is multiplied by what the lobe reflects at that view:
-a lobe so wide sees about the same from everywhere. Direct light is sampled at the emitters; the rest of the path is the
-plan's own integrator, from the first bounce on, with all its effects.
+At a view, B is E times the reflectance of that very point (`base_renderer`): the map holds light alone, which is smooth,
+and textures stay as sharp as they are. In the same way S is multiplied by what the lobe reflects at that view: a lobe so
+wide sees about the same from everywhere. Direct light is sampled at the emitters; the plan's own integrator follows the
+rest of the path, from the first bounce on, with all its effects.
 """
 
 from __future__ import annotations

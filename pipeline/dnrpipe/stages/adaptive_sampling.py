@@ -84,7 +84,7 @@ def run_passes(
 
 
 def _known(task: dict[str, Any]) -> ViewProgress:
-    facts = read_facts(Path(task["samples"]), task["samples_print"])
+    facts = read_facts(Path(task["samples"]), task["samples_fingerprint"])
     return ViewProgress(facts.spp, facts.noise, facts.error, facts.seconds)
 
 

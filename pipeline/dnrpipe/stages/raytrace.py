@@ -170,7 +170,7 @@ def _tasks(
             del task["spp"], decisive["spp"]
             path = workspace.raytraced(split, task_name(task).partition("/")[2])
             task["samples"] = str(path.parent / "samples" / f"{path.stem}.npz")
-            task["samples_print"] = digest([SAMPLES_VERSION, scene_print, decisive, light])
+            task["samples_fingerprint"] = digest([SAMPLES_VERSION, scene_print, decisive, light])
             decisive["goal"] = [goal.noise, goal.seconds, goal.limit]
         if wanted:
             task["denoise"] = decisive["denoise"] = True
