@@ -1,17 +1,18 @@
 """Base images: what a view looks like by baked light and mirror-like paths alone, without noise and in milliseconds.
 
 Notation
-    E        light map (see :mod:`.lightmap`), rho the diffuse reflectance of the point at hand
-    S        what a rough lobe sees of other surfaces (ibid.): its directions end at emitters
-    chain    the path that follows the non-diffuse lobes: mirror reflection, refraction, glossy lobes, cut-outs
-    sample   one of S rays through a pixel; the same S places in every pixel, so that nothing flickers
+    E        light map (see `lightmap`), rho the diffuse reflectance of the point at hand
+    S        what a rough lobe sees of other surfaces (see `lightmap`): its directions end at emitters
+    path     follows the non-diffuse lobes: mirror reflection, refraction, glossy lobes, cut-outs (`specular_paths`)
+    chain    a path from its second vertex on, to the first surface with a diffuse lobe
+    sample   one of K rays through a pixel; the same K places in every pixel, so that nothing flickers
 
-    base     = mean over samples of the sum over the chain's vertices of throughput (emission + rho E), and of S where
-               the chain ends at a rough lobe
+    base     = mean over samples of the sum over the path's vertices of throughput (emission + rho E), and of S where
+               the path ends at a rough lobe
     diffuse  = the first vertex's share of it
 
-A glossy lobe is sampled by numbers of a fixed low-discrepancy sequence, which repeats over tiles of TILE² pixels. Where
-light sources can be hit, emitter sampling serves the first glossy vertex, and multiple importance sampling joins both.
+The numbers that choose directions come from a fixed low-discrepancy sequence, which repeats over tiles of TILE² pixels.
+Emitter sampling serves a path's first glossy vertex; multiple importance sampling joins it with hits of emitters.
 """
 
 from __future__ import annotations
@@ -43,10 +44,12 @@ class BaseRenderer:
     """Renders base images of one scene.
 
     Args:
+        mi: the mitsuba module, a jit variant set.
+        scene: the scene.
         light: E and S of the front and of the back, float32 [2, 2, size, size, 3], row 0 at V = 0.
-        samples: S, rays per pixel.
+        samples: K, rays per pixel.
 
-    Of the last frame: ``repaired`` pixels had samples that were not finite, of which that part was left out; ``masked``
+    Of the last frame: ``repaired`` pixels had samples with parts that were not finite and are left out; ``masked``
     pixels were not finite all the same, and are 0.
     """
 
@@ -66,10 +69,10 @@ class BaseRenderer:
         self.kernel = Recorded(self._kernel)
 
     def frame(self, view: Any) -> dict[str, np.ndarray]:
-        """Channels of BASE_CHANNELS and of the G-buffer, float32 [H, W], for a view in the bundle's units.
+        """Channels of BASE_CHANNELS and of the G-buffer: float32 [H, W] each, linear Rec.709, premultiplied.
 
-        ``coverage`` is base.A, at most 1, and ``depth.Z`` in the bundle's units, too. Where cut-outs stand one behind
-        the other base.A can be above 1 as the colours are: of each surface met its opaque share is counted.
+        view: in the bundle's units, as is ``depth.Z``. ``coverage`` is base.A, at most 1. Where cut-outs stand one
+        behind the other, base.A can be above 1 as the colours are: each surface adds its opaque share.
         """
         import drjit as dr
 
@@ -98,10 +101,18 @@ class BaseRenderer:
     def _kernel(
         self, scene: Any, light: Any, tables: Any, axes: Any, film: Any, start: Any, width: int, height: int
     ) -> list[Any]:
-        """``height`` rows from row ``start`` on. All that varies comes in as data: recorded once, replayed for every
-        view of that size.
+        """Values [height * width] of LOST, MEANS and CENTRES. Recorded once, replayed for every view of that size.
 
         A pixel's samples lie side by side; the first goes through the pixel's centre.
+
+        Args:
+            scene: the scene.
+            light: E and S, a texture of six channels for the front and one for the back.
+            tables: places within a tile, steps of the random numbers.
+            axes: the camera's axes and its place, columns of c2w.
+            film: fl_x, fl_y, cx, cy in pixels.
+            start: the first row.
+            width, height: the size of the band.
         """
         import drjit as dr
 

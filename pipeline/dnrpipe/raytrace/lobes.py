@@ -37,7 +37,7 @@ def diffuse_context(mi: Any) -> Any:
     return context_of(mi, mi.BSDFFlags.Diffuse)
 
 
-def other_context(mi: Any) -> Any:
+def specular_context(mi: Any) -> Any:
     """Context of the lobes that mirror and refract, sharp or rough."""
     return context_of(mi, mi.BSDFFlags.Glossy, mi.BSDFFlags.Delta)
 

@@ -1,7 +1,7 @@
 """The ray-tracing worker for targets: adds passes of samples to a view, and writes its EXR when asked to.
 
 What has been traced lies in a file of its own (see `samples`), so that any worker can go on with any view, also
-after a crash or with another target. The decisions are :mod:`dnrpipe.raytrace.sample_schedule`'s.
+after a crash or with another target. The decisions are `sample_schedule`'s.
 """
 
 from __future__ import annotations

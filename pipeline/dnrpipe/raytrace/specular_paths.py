@@ -20,8 +20,8 @@ from .lobes import (
     is_among,
     is_rough,
     mirrors_and_refracts,
-    other_context,
     reflectance,
+    specular_context,
 )
 from .paths import power_heuristic
 from .sequence import TILE, fraction, steps
@@ -64,7 +64,7 @@ class SpecularPaths:
         kinds = mi.BSDFFlags
         self.diffuse = diffuse_context(mi)
         self.not_diffuse = context_of(mi, int(kinds.All) & ~int(kinds.Diffuse))
-        self.glossy_or_delta = other_context(mi)
+        self.specular = specular_context(mi)
         self.glossy = context_of(mi, kinds.Glossy)
         self.null = context_of(mi, kinds.Null)
         self.mirrored = context_of(mi, kinds.DeltaReflection, kinds.GlossyReflection)
@@ -93,7 +93,7 @@ class SpecularPaths:
         vertex = mi.UInt32(0)
         straight = mi.Bool(every)  # nothing has turned the ray yet
         unforked = mi.Bool(every)  # no glass yet
-        surfaces_known = mi.Bool(False)  # the last lobe was so rough that S says what it sees of surfaces
+        prev_rough = mi.Bool(False)  # S said what the lobe before sees of surfaces: only emitters count
 
         # ------------------- Multiple importance sampling ---------------------
         prev_si = dr.zeros(mi.SurfaceInteraction3f)
@@ -121,7 +121,7 @@ class SpecularPaths:
             here = dr.select(shows, throughput * mis * emission, 0)
 
             # --------------------------- Baked light --------------------------
-            met = going & ~surfaces_known & si.is_valid()
+            met = going & ~prev_rough & si.is_valid()
             rho = dr.select(met, reflectance(mi, bsdf, self.diffuse, si, met, self.translucent), 0)
             baked, around, place = self._baked(light, si, met)
             here += dr.select(met, throughput * rho * baked, 0)
@@ -172,7 +172,7 @@ class SpecularPaths:
             prev_pdf = dr.select(null, prev_pdf, bsdf_sample.pdf)
             prev_sampled = dr.select(null, prev_sampled, glossy & ~delta)
             emitters_sampled |= glossy & ~null
-            surfaces_known = rough
+            prev_rough = rough
             straight &= passed | (null & onwards)
             unforked &= ~forked
             active = passed | (alive & (vertex < MAX_VERTICES))
@@ -233,7 +233,7 @@ class SpecularPaths:
 
     def _is_rough(self, bsdf: Any, si: Any, active: Any) -> Any:
         """Whether the lobe is so wide that S says what it sees."""
-        return is_rough(mi, bsdf, self.glossy_or_delta, si, active) if self.has_glossy else mi.Bool(False)
+        return is_rough(mi, bsdf, self.specular, si, active) if self.has_glossy else mi.Bool(False)
 
     def _direct(self, scene: Any, bsdf: Any, si: Any, throughput: Any, u: list[Any], active: Any) -> Any:
         """Light of one emitter that the glossy lobes send back."""
