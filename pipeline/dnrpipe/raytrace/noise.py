@@ -1,7 +1,7 @@
 """How noisy a path-traced picture is, from the picture's own samples, and how sure that is. numpy only.
 
 Notation
-    f        linear RGBA -> sRGB over white (:func:`dnrpipe.raytrace.statistics.display`): where noise is measured
+    f        linear RGBA -> sRGB over white (`statistics.display`): where noise is measured
     X_k      means of G disjoint groups of samples, equally many in each, independent of each other; M their mean
     M_-k     the mean of all groups but the k-th
     v        jackknife estimate of Var f(M) at a pixel: (G-1)/G sum_k (f(M_-k) - mean_j f(M_-j))²
@@ -58,7 +58,7 @@ def group_noise(groups: np.ndarray) -> Noise:
 
 
 def half_noise(half_a: np.ndarray, half_b: np.ndarray) -> Noise:
-    """Noise of the mean of two independent, equally noisy halves [H, W, 4]; see :func:`group_noise`, which is better.
+    """Noise of the mean of two independent, equally noisy halves [H, W, 4]; see `group_noise`, which is better.
 
     E[((A-B)/2)²] = Var[(A+B)/2], first order through the display curve. The standard error is an upper bound: from
     the second moment of the pixels' estimates, as nothing tells it from their variance.

@@ -34,7 +34,7 @@ class Measured(Strict):
 
 
 class DepthStep(Strict):
-    """What paths cut at ``depth`` leave out, as shares of the mean radiance (see :mod:`.statistics`)."""
+    """What paths cut at ``depth`` leave out, as shares of the mean radiance (see `statistics`)."""
 
     depth: int
     mean: float
@@ -88,7 +88,7 @@ def difference(with_effect: np.ndarray, without: np.ndarray) -> Measured:
 def significance(with_effect: np.ndarray, without: np.ndarray) -> float:
     """How surely two renders differ: sum of d1 d2 over its standard error where only noise differs.
 
-    Same arguments as :func:`difference`; d1, d2: differences of the two halves at a pixel, mean of the channels.
+    Same arguments as `difference`; d1, d2: differences of the two halves at a pixel, mean of the channels.
     With independent noise of variance s² the product has variance s⁴; d1 - d2 is free of the signal and has a fourth
     moment of 12 s⁴ (Gaussian; more with heavy tails, which errs on the safe side). Standard normal without effect.
     """
