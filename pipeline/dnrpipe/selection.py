@@ -25,7 +25,7 @@ from .workspace import Workspace, digest, file_sha256
 
 if TYPE_CHECKING:
     from dnrtrain.selector.protocol import Choice, Policy
-    from dnrtrain.selector.sightings import Sightings
+    from dnrtrain.selector.visibility import SurfaceVisibility
 
 
 def run(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
@@ -86,7 +86,7 @@ def _choose_by(
     """The rule's choice; what it took is booked."""
     select = settings.select
     clock, cpu = time.monotonic(), time.process_time()
-    candidates = Candidates.of_views(views, look(workspace, console, views) if rule.looks else None)
+    candidates = Candidates.of_views(views, look(workspace, console, views) if rule.needs_visibility else None)
     with console.bar(f"choosing by {select.policy}", len(views) * rule.effort) as bar:
         tick = functools.partial(_advance, bar)
         choice = rule.choose(candidates, select.budget, select.seed, tick)
@@ -153,9 +153,9 @@ def _train_and_choose(
     return chosen
 
 
-def look(workspace: Workspace, console: Console, views: list[View]) -> Sightings:
+def look(workspace: Workspace, console: Console, views: list[View]) -> SurfaceVisibility:
     """What the candidates see, from their pass files."""
-    from dnrtrain.selector.sightings import read_sightings
+    from dnrtrain.selector.visibility import read_visibility
 
     with console.bar("what candidates see", len(views)) as bar:
-        return read_sightings([workspace.passes("train", view.name) for view in views], views, tick=bar.advance)
+        return read_visibility([workspace.passes("train", view.name) for view in views], views, tick=bar.advance)
