@@ -28,6 +28,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dnrpipe.raytrace.statistics import display
+from dnrtrain import srgb
 
 GROUPS = 8
 
@@ -80,7 +81,7 @@ def denoised_error(denoised: np.ndarray, others: np.ndarray) -> tuple[float, flo
     alpha = denoised[..., 3:]
     straight = np.where(alpha > 0, denoised[..., :3] / np.maximum(alpha, 1e-6), 2.0)
     curved = 1.055 / 2.4 * np.maximum(straight, 1e-6) ** (1 / 2.4 - 1)
-    slope = np.where(straight <= 0.0031308, 12.92, np.where(straight < 1, curved, 0.0))
+    slope = np.where(straight <= srgb.LINEAR_END, 12.92, np.where(straight < 1, curved, 0.0))
     delta = (denoised - others)[..., :3] * slope
     count = len(others)
     products = (delta.sum(axis=0) ** 2 - (delta**2).sum(axis=0)) / (count * (count - 1))

@@ -14,6 +14,7 @@ import math
 
 import numpy as np
 
+from dnrtrain import srgb
 from dnrtrain.settings import Strict
 
 BLOCK = 4
@@ -108,9 +109,7 @@ def display(rgba: np.ndarray) -> np.ndarray:
     """Premultiplied linear RGBA [..., 4] -> sRGB over white [..., 3] in [0, 1]."""
     alpha = np.clip(rgba[..., 3:], 0.0, 1.0)
     straight = np.where(alpha > 0, rgba[..., :3] / np.maximum(alpha, 1e-6), 0.0)
-    linear = np.clip(straight, 0.0, 1.0)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return encoded * alpha + 1.0 - alpha
+    return srgb.encode(np.clip(straight, 0.0, 1.0)) * alpha + 1.0 - alpha
 
 
 def _half_width(values: np.ndarray) -> float:
