@@ -97,7 +97,7 @@ def findings(workspace: Workspace) -> list[dict[str, Any]]:
     return json.loads((workspace.scene / "census.json").read_text())["findings"]
 
 
-CONVERSION = ("blender", "baking.py", "prepare.py", "scene_files.py", "settings.py")
+CONVERSION = ("blender", "stages/baking.py", "stages/prepare.py", "core/scene_files.py", "core/settings.py")
 TRACING = tuple(f"raytrace/{name}.py" for name in ("tracer", "engine", "sensors", "visibility", "coverage"))
 PLUGINS = ("raytrace/plugins",)
 
