@@ -60,9 +60,12 @@ def make_workspace(
     for view in views["train"]:
         if view.name in chosen:
             write_exr(root / "raytraced" / "train" / f"{view.name}.exr", _ball(view, 1.0, rng), {"spp": 128})
-    _dump(root / "selection.json", {"policy": "rl", "budget": len(chosen), "seed": 3, "views": chosen, "details": {}})
-    _dump(root / "checkpoints" / "step1" / "model.json", {"history": _history(1, 12), "epoch": 12})
-    _dump(root / "checkpoints" / "step2" / "model.json", {"history": _history(2, 30), "epoch": 30})
+    selection = {"policy": "rl-paper", "budget": len(chosen), "seed": 3, "views": chosen, "details": {}}
+    _dump(root / "selection.json", selection)
+    for step, epochs in ((1, 12), (2, 30)):
+        record = {"model": {}, "fingerprint": "f", "run": "r", "stage": f"step{step}", "settings": {}, "seed": 3}
+        record |= {"bfloat16": False, "history": _history(step, epochs)}
+        _dump(root / "checkpoints" / f"step{step}" / "model.json", record)
     if evaluated:
         _evaluation(root, views["test"], rng, lpips)
     _ledger(root, views, chosen, size, evaluated)
@@ -81,7 +84,7 @@ def _manifest(hostile: str, candidates: int, tests: int, size: int, budget: int)
             "preset": "draft",
             "cameras": {"source": "auto", "train": candidates, "val": 2, "test": tests, "width": size, "height": size},
             "raytrace": {"spp": 128, "evaluation_spp": 256, "max_depth": 12},
-            "select": {"budget": budget, "policy": "rl", "seed": 3, "step1": {"epochs": 12}},
+            "select": {"budget": budget, "policy": "rl-paper", "seed": 3, "step1": {"epochs": 12}},
             "finetune": {"step2": step2},
         },
         "stages": {},

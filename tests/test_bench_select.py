@@ -20,6 +20,7 @@ from dnrpipe.blender.geometry.frozen import FrozenMesh
 from dnrpipe.core.cameras import make_cameras
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import CameraSettings, resolve
+from dnrpipe.studies.selectbench.active.batches import KINDS
 from dnrpipe.studies.selectbench.command import choose_budgets
 from dnrpipe.studies.selectbench.figures import Figures
 from dnrpipe.studies.selectbench.intervals import half_width, summarise, t_distribution, t_quantile
@@ -28,7 +29,7 @@ from dnrpipe.studies.selectbench.pools import POOLS, choose_pools, write_rig
 from dnrpipe.studies.selectbench.rigs import inside, surface_points, walk, winding
 from dnrpipe.studies.selectbench.tables import difference, markdown, together
 from dnrtrain.contract import View
-from dnrtrain.selector.names import NAMES, TRAINED_NAMES
+from dnrtrain.selector.names import TRAINED_NAMES, UNTRAINED_NAMES
 
 SUMMARY = {
     "bounds": {"center": [1.0, -2.0, 0.5], "radius": 1.5, "min": [0, -3, 0], "max": [2, -1, 1]},
@@ -97,8 +98,10 @@ def test_pools_and_policies_by_name() -> None:
 
 
 def test_every_policy_of_the_trainer_competes() -> None:
-    assert {c.policy for c in CONTENDERS.values()} | {"rl-paper"} == {*NAMES, "rl"}
-    assert set(SIMPLE) <= set(GROUPS["core"]) and all(CONTENDERS[name].rule for name in GROUPS["core"])
+    kinds = {kind: {c.policy for c in CONTENDERS.values() if c.kind == kind} for kind in ("rule", "active", "step1")}
+    assert kinds["rule"] | {"auto"} == set(UNTRAINED_NAMES)  # auto is coverage
+    assert kinds["step1"] == set(TRAINED_NAMES) and kinds["active"] == set(KINDS)
+    assert set(SIMPLE) <= set(GROUPS["core"]) and all(CONTENDERS[name].kind == "rule" for name in GROUPS["core"])
     assert set(TRAINED_NAMES) <= set(GROUPS["all"]) and not set(TRAINED_NAMES) & set(GROUPS["core"])
     rewards = {
         settings_of(CONTENDERS[name], resolve("draft", {}, environment={}), 7).select.step1.reward
@@ -350,21 +353,6 @@ def test_cells_train_equally_long_and_policies_that_agree_share_one(smoke: tuple
     assert len({cell["key"] for cell in everything}) == 1
     assert everything[0]["views"] != everything[1]["views"]
     assert before.items() <= work(out).items()
-
-
-@pytest.mark.slow
-def test_a_second_round_sees_what_the_first_traced(smoke: tuple[Path, dict[str, Any]]) -> None:
-    out, _ = smoke
-    done = bench(out, "--pools", "dome", "--budgets", "4", "--policies", "auto-2")
-    assert done.returncode == 0, done.stderr
-    cell = json.loads(done.stdout)["cells"][0]
-    made = [json.loads(path.read_text()) for path in (out / "selections" / "emissive_only-dome").glob("*.json")]
-    rounds = {len(one["views"]): one for one in made if one["details"].get("rounds") or len(one["views"]) == 2}
-    last, first = rounds[4], rounds[2]
-    assert sorted(last["views"]) == sorted(cell["views"])
-    assert [one["views"] for one in last["details"]["rounds"]] == [2, 2]
-    assert last["details"]["rounds"][1]["error_found"] > 0
-    assert last["seconds"] > 0 and len(set(last["views"])) == 4 and len(first["views"]) == 2
 
 
 def test_bad_requests_are_one_line_and_leave_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from dnrpipe.core.errors import UserError
-from dnrpipe.workers import timeouts as patience_module
+from dnrpipe.workers import timeouts as timeouts_module
 from dnrpipe.workers.processes import LocalWorker, Retry, TaskFailed, TaskResult, WorkerDied, run_tasks
 
 WORKER = """
@@ -125,14 +125,14 @@ def test_a_time_limit_from_the_environment(module: str, tmp_path: Path, monkeypa
 
 def test_a_time_limit_from_what_tasks_took(module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Hours before anything is known, then a multiple of the longest, and twice that for the second try."""
-    patience = patience_module.Patience()
-    assert (patience.limit(1), patience.words()) == (6 * 3600, "")
+    timeout = timeouts_module.TaskTimeout()
+    assert (timeout.limit(1), timeout.reason()) == (6 * 3600, "")
     for seconds in (4.0, 100.0, 50.0):
-        patience.took(seconds)
-    assert (patience.limit(1), patience.limit(2)) == (3000, 6000)
-    assert patience.words() == "; the longest so far took 100 s"
-    monkeypatch.setattr(patience_module, "LEAST_LIMIT", 0.5)
-    monkeypatch.setattr(patience_module, "SLOWEST", 1.0)
+        timeout.took(seconds)
+    assert (timeout.limit(1), timeout.limit(2)) == (3000, 6000)
+    assert timeout.reason() == "; the longest so far took 100 s"
+    monkeypatch.setattr(timeouts_module, "LEAST_LIMIT", 0.5)
+    monkeypatch.setattr(timeouts_module, "SLOWEST", 1.0)
     results, retries = _run(module, tmp_path, ["sleep", "hang"], workers=1)
     assert results[0].error is None
     assert "hung" in retries[0].reason and "the longest so far took" in retries[0].reason
@@ -241,20 +241,22 @@ def test_a_scene_that_opened_at_the_second_try_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A refusal stays one line: the first try is told of only where the second one helped."""
-    from types import SimpleNamespace
-    from typing import Any
-
     from dnrpipe.core.console import Console
+    from dnrpipe.core.settings import Settings
+    from dnrpipe.core.workspace import Source, Workspace
     from dnrpipe.stages import prepare
+    from dnrpipe.stages.stage import Run
+    from dnrpipe.workers import answers
 
-    workspace: Any = SimpleNamespace(log=lambda stage: tmp_path / "log")
+    workspace = Workspace.create(tmp_path / "a.dnr", Source(path="a.blend", sha256=""))
     for last in (TaskResult({}, {"warnings": []}), TaskResult({}, None, "worker hung for 60 s", 2, died=True)):
-        outcomes = iter([Retry({}, "worker hung for 60 s"), last])
-        monkeypatch.setattr(prepare, "run_tasks", lambda *_, found=outcomes, **__: found)
+        outcomes = [Retry({}, "worker hung for 60 s"), last]
+        monkeypatch.setattr(answers, "run_tasks", lambda *_, found=outcomes, **__: (outcome for outcome in found))
+        run = Run(workspace, Settings(), Console(quiet=True))
         if last.result is not None:
-            assert prepare._attempt(tmp_path / "a.blend", {}, workspace, Console(quiet=True)) == last.result
+            prepare._run_conversion(run, tmp_path / "a.blend", tmp_path / "scene")
             assert "scene: worker hung for 60 s; opening it once more went well" in capsys.readouterr().err
         else:
             with pytest.raises(UserError, match="could not open it"):
-                prepare._attempt(tmp_path / "a.blend", {}, workspace, Console(quiet=True))
+                prepare._run_conversion(run, tmp_path / "a.blend", tmp_path / "scene")
             assert capsys.readouterr().err == ""

@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 
 from dnrpipe.cli import cli
+from dnrpipe.cli.failures import explain
 from dnrpipe.core.errors import UserError
 from dnrpipe.export import vendor
+from dnrpipe.export.browser import require_chromium
 
 COMMANDS = ("export-nerf", "export-onnx", "export-gltf", "export-web")
 
@@ -59,3 +61,16 @@ def test_what_npm_delivers_is_checked(tmp_path: Path, monkeypatch: pytest.Monkey
     with pytest.raises(UserError, match=words):
         vendor.runtime()
     assert not (tmp_path / "cache").exists()
+
+
+def test_what_the_check_of_the_page_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without Chromium, and without playwright: one line that says what to install."""
+    with monkeypatch.context() as patch:
+        patch.setattr("shutil.which", lambda _: None)
+        with pytest.raises(UserError, match=r"no Chromium here .* install one to check the page"):
+            require_chromium()
+    for name in ("playwright", "playwright.sync_api"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(ModuleNotFoundError) as caught:
+        require_chromium()
+    assert explain(caught.value) == ("playwright is not installed; run `pip install 'dnrpipe[export]'`", 2)

@@ -18,10 +18,10 @@ from pydantic import ValidationError
 
 from dnrpipe.core.cameras import read_camera_file
 from dnrpipe.core.errors import UserError
+from dnrpipe.core.scene_files import read_selection
 from dnrpipe.core.settings import CameraSettings
 from dnrpipe.core.workspace import Manifest, Source, Workspace
 from dnrpipe.stages.pipeline import owner_of
-from dnrpipe.stages.trainer import read_selection
 from dnrtrain.contract import ContractError, DamagedFile, SceneFrame, View, file_name, parse_transforms, write_cameras
 from dnrtrain.display import DisplayTransform
 from dnrtrain.exr import read_exr, write_exr

@@ -44,7 +44,7 @@ def _task(folder: Path, name: str, **changes) -> dict:
         "view": view.model_dump(mode="json"),
         "output": str(folder / f"{name}.exr"),
         "samples": str(folder / "samples" / f"{name}.npz"),
-        "samples_print": "s",
+        "samples_fingerprint": "s",
         "max_depth": 4,
         "seed": 3,
         "fingerprint": "f",

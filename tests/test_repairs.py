@@ -10,11 +10,17 @@ import numpy as np
 import pytest
 
 from dnrpipe.core.console import Console
+from dnrpipe.core.settings import Settings
+from dnrpipe.core.workspace import Source, Workspace
 from dnrpipe.raytrace.finite import masked, masked_channels
 from dnrpipe.raytrace.noise import half_noise
 from dnrpipe.raytrace.pictures import repair
+from dnrpipe.stages.base_images import BaseRenderer, bake_light
+from dnrpipe.stages.effect_plan import run_pilots
+from dnrpipe.stages.stage import Run
+from dnrpipe.workers import answers
 from dnrpipe.workers.processes import TaskResult
-from dnrpipe.workers.view_tasks import warn_repairs
+from dnrpipe.workers.view_tasks import warn_of_repairs
 from dnrtrain.contract import ContractError, View
 from dnrtrain.exr import read_exr, write_exr
 
@@ -60,7 +66,7 @@ def test_repairs_are_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
         path = tmp_path / "train" / f"{name}.exr"
         write_exr(path, {"R": np.zeros((2, 2))}, metadata)
         tasks.append({"view": {}, "output": str(path)})
-    warn_repairs(tasks, Console(quiet=True))
+    warn_of_repairs(tasks, Console(quiet=True))
     said = capsys.readouterr().err
     assert "repaired: 12 pixels in view train/7" in said and "2 more set to zero" in said and "train/8" not in said
     assert "repaired: 3 pixels of the denoiser's guides in view train/10" in said
@@ -87,7 +93,6 @@ def test_pilot_pictures_that_are_not_finite_are_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """By the pilot's worker, and said by the command that asked it."""
-    from dnrpipe.effects import store
     from dnrpipe.raytrace import pilot
 
     bad = picture()
@@ -113,11 +118,9 @@ def test_pilot_pictures_that_are_not_finite_are_counted(
     answer = worker(task)
     assert answer["masked"] == 6  # one pixel of two warm-up frames and two halves of two configurations
     assert answer["error"]["mean"] == 0
-    answers = iter([TaskResult(task, answer)])
-    monkeypatch.setattr(store, "run_tasks", lambda *_, **__: (item for item in answers))
-    workspace: Any = SimpleNamespace(log=lambda stage: tmp_path / "log")
+    monkeypatch.setattr(answers, "run_tasks", lambda *_, **__: (item for item in [TaskResult(task, answer)]))
     choice: Any = SimpleNamespace(environment={})
-    assert store.run_pilots(workspace, [task], choice, Console(quiet=True), "pilot", "prepare") == [answer]
+    assert run_pilots([task], choice, Console(quiet=True), "pilot", tmp_path / "log") == [answer]
     assert "repaired: 6 pixels of pilot pictures were not finite" in capsys.readouterr().err
 
 
@@ -125,18 +128,14 @@ def test_light_that_is_not_finite_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The baker's count reaches the terminal and the ledger."""
-    from dnrpipe.stages import base_images as base
-
     task = {"output": str(tmp_path / "light.npz"), "fingerprint": "f", "size": 16, "spp": 4}
     result = {"seconds": 1.0, "cpu_seconds": 1.0, "peak_mb": 1.0, "texels": 9, "lost": 12}
-    monkeypatch.setattr(base, "run_tasks", lambda *_, **__: iter([TaskResult(task, result)]))
-    booked: list[Any] = []
-    ledger = SimpleNamespace(append=booked.append)
-    workspace: Any = SimpleNamespace(log=lambda stage: tmp_path / "log", ledger=ledger)
-    common = {"bundle": "b", "variant": "v"}
-    base.bake_light(workspace, Console(quiet=True), "r", "raytrace", common, {}, task)
+    monkeypatch.setattr(answers, "run_tasks", lambda *_, **__: (item for item in [TaskResult(task, result)]))
+    workspace = Workspace.create(tmp_path / "a.dnr", Source(path="a.blend", sha256=""))
+    run = Run(workspace, Settings(), Console(quiet=True), "raytrace", "r")
+    bake_light(run, BaseRenderer({"bundle": "b", "variant": "v"}, {}, task, "f"))
     assert "repaired: 12 samples of the baked light were not finite" in capsys.readouterr().err
-    assert booked[0].detail["lost"] == 12
+    assert workspace.ledger.read()[0].detail["lost"] == 12
 
 
 def test_baked_texels_that_are_not_finite_are_counted() -> None:

@@ -19,7 +19,9 @@ import pytest
 from PIL import Image
 
 from dnrpipe.core.errors import UserError
-from dnrpipe.report import build_report, build_report_data, charts, words
+from dnrpipe.core.units import duration, several
+from dnrpipe.export.browser import find_chromium, open_page
+from dnrpipe.report import build_report, charts
 from dnrpipe.report.collect import collect
 from dnrpipe.report.pictures import load_png
 from dnrpipe.report.render import render_html
@@ -38,8 +40,7 @@ def _neighbour(name: str) -> ModuleType:
 
 
 make_workspace = _neighbour("report_workspace").make_workspace
-browser = _neighbour("browser")
-needs_browser = pytest.mark.skipif(browser.find_chromium() is None, reason="no Chromium is installed")
+needs_browser = pytest.mark.skipif(find_chromium() is None, reason="no Chromium is installed")
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +93,7 @@ def test_nothing_is_loaded_from_elsewhere(page: str) -> None:
 
 
 def test_figures_agree_with_the_files(workspace: Path, page: str) -> None:
-    data = build_report_data(workspace)
+    data = collect(workspace).figures()
     metrics = json.loads((workspace / "evaluation" / "metrics.json").read_text())
     values = {v["name"]: v["psnr"] for v in metrics["views"]}
     row = next(r for r in data["quality"]["rows"] if r["key"] == "psnr")
@@ -119,7 +120,7 @@ def test_figures_agree_with_the_files(workspace: Path, page: str) -> None:
 
 
 def test_reward_and_action_value_are_no_losses(workspace: Path, page: str) -> None:
-    first = build_report_data(workspace)["training"][0]
+    first = collect(workspace).figures()["training"][0]
     assert list(first["losses"]) == ["dnr", "rl"]
     assert list(first["agent"]) == ["reward", "q"] and first["agent"]["q"][0][1] < 0
     assert "Reward and action value of the view selector" in page
@@ -196,6 +197,12 @@ def test_every_half_done_workspace_has_a_report(tmp_path: Path) -> None:
         build_report(root)
 
 
+BAD_EPOCH = json.dumps(
+    {"model": {}, "fingerprint": "f", "run": "r", "stage": "step1", "settings": {}, "seed": 0, "bfloat16": False}
+    | {"history": [{"epoch": "x"}]}
+)
+
+
 @pytest.mark.parametrize(
     ("file", "text", "message"),
     [
@@ -203,7 +210,7 @@ def test_every_half_done_workspace_has_a_report(tmp_path: Path) -> None:
         ("evaluation/metrics.json", '{"views": []}', r"metrics\.json: views: .*dnrpipe evaluate"),
         ("evaluation/metrics.json", '{"views": [{"name": "../../etc/x"}]}', r"views\.0\.name"),
         ("selection.json", "[]", r"selection\.json: not a JSON object.*dnrpipe select"),
-        ("checkpoints/step1/model.json", '{"history": [{"epoch": "x"}]}', r"history\.0\.epoch"),
+        ("checkpoints/step1/model.json", BAD_EPOCH, r"history\.0\.epoch"),
         ("cameras/test.json", '{"frames": [{}]}', r"test\.json: damaged \(frame 0"),
         ("evaluation/0003.truth.png", "not a picture", r"0003\.truth\.png: damaged image"),
         ("raytraced/train/0011.exr", "not an exr", r"0011\.exr: damaged \(EXR"),
@@ -360,13 +367,13 @@ def test_projections_are_right_handed() -> None:
     ],
 )  # fmt: skip
 def test_durations(seconds: float, text: str) -> None:
-    assert words.duration(seconds) == text
+    assert duration(seconds) == text
 
 
 def test_sample_counts_in_words() -> None:
-    assert words.several([64]) == "64"
-    assert words.several([32, 64, 128]) == "32, 64, 128"
-    assert words.several([80, 112, 160, 664]) == "80 to 664"
+    assert several([64]) == "64"
+    assert several([32, 64, 128]) == "32, 64, 128"
+    assert several([80, 112, 160, 664]) == "80 to 664"
 
 
 @needs_browser
@@ -374,8 +381,13 @@ def test_sample_counts_in_words() -> None:
 @pytest.mark.parametrize(("width", "dark"), [(1280, False), (1280, True), (375, False)])
 def test_a_browser_draws_it(workspace: Path, page: str, tmp_path: Path, width: int, dark: bool) -> None:
     picture = tmp_path / "page.png"
-    browser.screenshot(workspace / "report" / "report.html", picture, width=width, height=1400, dark=dark)
-    pixels = np.asarray(Image.open(picture).convert("RGB"))[:, :width].astype(int)
+    address = (workspace / "report" / "report.html").as_uri()
+    scheme = "dark" if dark else "light"
+    with open_page(address, width=width, height=1400, color_scheme=scheme) as (drawn, errors):
+        drawn.screenshot(path=picture)
+    assert errors == []
+    pixels = np.asarray(Image.open(picture).convert("RGB")).astype(int)
+    assert pixels.shape == (1400, width, 3)
     assert pixels.std() > 15
     corner = pixels[2, 2].mean()
     assert corner < 60 if dark else corner > 220
@@ -388,8 +400,9 @@ def test_a_browser_draws_it(workspace: Path, page: str, tmp_path: Path, width: i
 @needs_browser
 @pytest.mark.slow
 def test_the_dom_holds_the_figures_and_the_script_ran(workspace: Path, page: str) -> None:
-    dom = browser.dump_dom(workspace / "report" / "report.html")
-    data = build_report_data(workspace)
+    with open_page((workspace / "report" / "report.html").as_uri()) as (drawn, _):
+        dom = drawn.content()
+    data = collect(workspace).figures()
     text = " ".join(_parse(dom).text.split())
     mean = next(r for r in data["quality"]["rows"] if r["key"] == "psnr")["mean"]
     assert f"PSNR, held-out{mean:.2f} dB" in text
@@ -403,6 +416,5 @@ def test_the_dom_holds_the_figures_and_the_script_ran(workspace: Path, page: str
 def test_a_hostile_name_runs_nothing_in_a_browser(tmp_path: Path) -> None:
     hostile = "\"><script>document.title='owned'</script><img src=x onerror=\"document.title='owned'\">"
     root = make_workspace(tmp_path / "x.dnr", tests=1, candidates=12, size=16, hostile=hostile)
-    dom = browser.dump_dom(build_report(root))
-    title = re.search(r"<title>(.*?)</title>", dom, re.S)
-    assert title is not None and "dnrpipe report" in title[1]
+    with open_page(build_report(root).as_uri()) as (drawn, _):
+        assert "dnrpipe report" in drawn.title()

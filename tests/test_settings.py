@@ -78,6 +78,26 @@ def test_unknown_environment_and_preset_and_broken_toml(tmp_path: Path) -> None:
         resolve(None, {}, toml_files=[toml], environment={})
 
 
+def test_a_layer_names_the_preset_and_its_mistakes(tmp_path: Path) -> None:
+    toml = tmp_path / "dnrpipe.toml"
+    toml.write_text('preset = "standard"\n')
+    environment = {"DNRPIPE_PRESET": "paper", "DNRPIPE_WORKSPACE": "elsewhere", "DNRPIPE_EFFECTS__ENABLE": "['glow']"}
+    assert resolve(None, {}, toml_files=[toml], environment={}).preset == "standard"
+    settings = resolve(None, {}, toml_files=[toml], environment=environment)
+    assert settings.preset == "paper" and settings.effects.enable == ("glow",)
+    assert resolve("vanilla", {}, toml_files=[toml], environment=environment).preset == "vanilla"
+    assert resolve(None, {}, environment={"DNRPIPE_PRESET": ""}).preset == "draft"
+    with pytest.raises(UserError, match="unknown preset '3'"):
+        resolve(None, {"preset": 3}, environment={})
+    with pytest.raises(UserError, match=r"environment: unknown setting 'camera'; did you mean 'cameras'\?"):
+        resolve(None, {}, environment={"DNRPIPE_CAMERA__TRAIN": "3"})
+    with pytest.raises(UserError, match="flags: setting 'device' is a single value, not a table"):
+        resolve(None, {"device": {"name": "cpu"}}, environment={})
+    toml.write_text("[cameras]\ntrian = 3\n")
+    with pytest.raises(UserError, match=rf"{toml}: unknown setting 'cameras.trian'; did you mean 'cameras.train'\?"):
+        resolve(None, {}, toml_files=[toml], environment={})
+
+
 def test_assignments() -> None:
     assert parse_assignment("a.b=3") == {"a": {"b": 3}}
     assert parse_assignment("a=true") == {"a": True}

@@ -21,9 +21,11 @@ from typing import Any
 
 from dnrpipe.core.console import Console
 from dnrpipe.core.workspace import Source, Workspace, file_sha256
-from dnrpipe.effects.store import pilot_views, resolve_plan, run_pilots, trace_config, variant_for
+from dnrpipe.effects.store import pilot_views, trace_config, variant_for
+from dnrpipe.stages.effect_plan import resolve_plan, run_pilots
 from dnrpipe.stages.prepare import scene_and_views
 from dnrpipe.stages.session import resolve_settings
+from dnrpipe.stages.stage import Run
 
 EVERYTHING = {"integrator": "volpath", "max_depth": 32, "passes": True}
 
@@ -33,9 +35,10 @@ def bench(scene: Path, folder: Path, spp: int) -> dict[str, Any]:
     workspace = Workspace.create(folder / f"{scene.stem}.dnr", Source(path=str(scene), sha256=file_sha256(scene)))
     settings = resolve_settings(workspace, {"cameras": {"train": 8, "val": 0, "test": 0}}, None)
     console = Console(quiet=True)
-    scene_and_views(workspace, settings, console, "bench")
+    run = Run(workspace, settings, console, id="bench")
+    scene_and_views(run)
     started = time.monotonic()
-    plan = resolve_plan(workspace, settings, console, "bench", "prepare")
+    plan = resolve_plan(run)
     pilot = time.monotonic() - started
     choice = variant_for(plan, settings)
     config = trace_config(workspace, plan, choice.variant)
@@ -43,7 +46,7 @@ def bench(scene: Path, folder: Path, spp: int) -> dict[str, Any]:
     views = pilot_views(workspace, settings, plan)
     pairs = [everything, {**everything, "passes": False}]
     tasks = [{"kind": "compare", "with": pair, "without": config, "views": views, "spp": spp} for pair in pairs]
-    answer, lean = run_pilots(workspace, tasks, choice, console, scene.stem, "bench")
+    answer, lean = run_pilots(tasks, choice, console, scene.stem, run.log)
     return {
         "scene": scene.stem,
         "integrator": plan.integrator,

@@ -69,9 +69,9 @@ def step_ms(root: Path) -> tuple[float, float]:
             pass
         record = read_record(folder)
     assert record is not None  # training has just finished
-    entries = record["history"][WARM:]
-    steps = sum(entry["steps"] for entry in entries)
-    return tuple(1000 * sum(entry[clock] for entry in entries) / steps for clock in ("seconds", "cpu_seconds"))  # type: ignore[return-value]
+    entries = record.history[WARM:]
+    steps = sum(entry.steps for entry in entries)
+    return tuple(1000 * sum(getattr(entry, clock) for entry in entries) / steps for clock in ("seconds", "cpu_seconds"))  # type: ignore[return-value]
 
 
 def main() -> int:

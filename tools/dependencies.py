@@ -22,8 +22,6 @@ REPO = Path(__file__).resolve().parents[1]
 CONSTRAINTS = REPO / "constraints.txt"
 PAGE = REPO / "docs" / "dependencies.md"
 OWN = "dnrpipe"
-UNPINNED = ("ray",)
-"""Extras that `make setup` does not install."""
 HEAD = """\
 # Versions that `make setup` installs and that the tests ran with, on Python 3.11; pyproject.toml says what else may do.
 # Made by `python -m tools.dependencies --pin`; `make audit` looks them up among known vulnerabilities.
@@ -104,8 +102,6 @@ def problems() -> list[str]:
     page = PAGE.read_text(encoding="utf-8")
     found = []
     for name in direct():
-        if name in UNPINNED:
-            continue
         if name not in versions:
             found.append(f"{name}: not in {CONSTRAINTS.name}")
         elif f"| {name} | {versions[name]} |" not in page:

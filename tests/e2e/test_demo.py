@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 import time
-from importlib import util
 from pathlib import Path
 
 import numpy as np
 import pytest
 from e2e_harness import command, image
+
+from dnrpipe.export.browser import find_chromium, open_page
 
 pytestmark = [pytest.mark.slow, pytest.mark.e2e]
 
@@ -54,20 +54,17 @@ def test_again_does_nothing(demo: Path, demo_blend: Path) -> None:
 
 
 def test_the_report_draws_in_a_browser(demo: Path, tmp_path: Path) -> None:
-    spec = util.spec_from_file_location("browser", Path(__file__).parents[1] / "browser.py")
-    assert spec and spec.loader
-    browser = util.module_from_spec(spec)
-    sys.modules["browser"] = browser
-    spec.loader.exec_module(browser)
-    if browser.find_chromium() is None:
+    if find_chromium() is None:
         pytest.skip("no Chromium is installed")
     page = demo / "report" / "report.html"
     text = page.read_text(encoding="utf-8")
     assert "http://" not in text.replace("http://www.w3.org", "")
     assert "https://" not in text
-    browser.screenshot(page, tmp_path / "report.png", width=1200, height=1600)
+    with open_page(page.as_uri(), width=1200, height=1600) as (drawn, _):
+        drawn.screenshot(path=tmp_path / "report.png")
+        dom = drawn.content()
     picture = image(tmp_path / "report.png")[..., :3]
     # Colourful: the scene's pictures are on it, not only text on a ground.
     assert (np.ptp(picture, axis=-1) > 0.2).mean() > 0.01
     mean = json.loads((demo / "evaluation" / "metrics.json").read_text())["mean"]
-    assert f"{mean['psnr']:.2f}" in browser.dump_dom(page)
+    assert f"{mean['psnr']:.2f}" in dom

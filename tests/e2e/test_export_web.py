@@ -15,7 +15,7 @@ import pytest
 from e2e_harness import run
 
 from dnrpipe.core.errors import UserError
-from dnrpipe.export.browser import browser, find_chromium
+from dnrpipe.export.browser import find_chromium, open_page, wait_for
 from dnrpipe.export.gltf import Y_UP
 from dnrpipe.export.vendor import runtime
 
@@ -25,7 +25,7 @@ PIXELS = "Array.from(document.querySelector('canvas').getContext('2d').getImageD
 
 SETTLED = (
     "window.dnr.then(async page => { do await new Promise(done => setTimeout(done, 100));"
-    " while (page.dirty || page.busy) })"
+    " while (page.dirty || page.busy); return true })"
 )
 
 
@@ -69,23 +69,26 @@ def test_the_browser_computes_what_torch_computes(exported: tuple[Path, dict[str
 
 
 def test_dragging_and_choosing_change_the_picture_from_disk(exported: tuple[Path, dict[str, Any]]) -> None:
-    with browser() as tab:
-        tab.open((exported[0] / "index.html").as_uri())
-        tab.evaluate(SETTLED)
-        before = tab.evaluate(PIXELS)
+    with open_page((exported[0] / "index.html").as_uri()) as (page, errors):
+        wait_for(page, SETTLED)
+        before = page.evaluate(PIXELS)
         assert len(set(before)) > 30
-        x, y, width = tab.evaluate(
-            "(r => [r.x, r.y, r.width])(document.querySelector('canvas').getBoundingClientRect())"
-        )
-        tab.drag((x + 0.3 * width, y + 0.5 * width), (x + 0.6 * width, y + 0.5 * width))
-        tab.evaluate(SETTLED)
-        after = tab.evaluate(PIXELS)
+        canvas = page.locator("canvas").bounding_box()
+        assert canvas is not None
+        x, y, width = canvas["x"], canvas["y"], canvas["width"]
+        page.mouse.move(x + 0.3 * width, y + 0.5 * width)
+        page.mouse.down()
+        page.mouse.move(x + 0.6 * width, y + 0.5 * width, steps=10)
+        page.mouse.up()
+        wait_for(page, SETTLED)
+        after = page.evaluate(PIXELS)
         changed = sum(a != b for a, b in zip(before, after, strict=True)) / len(before)
         assert changed > 0.05
-        tab.evaluate("(s => { s.value = 'normal'; s.onchange() })(document.getElementById('show'))")
-        tab.evaluate(SETTLED)
-        assert tab.evaluate(PIXELS) != after
-        figures = tab.evaluate("document.getElementById('figures').innerText")
+        page.evaluate("(s => { s.value = 'normal'; s.onchange() })(document.getElementById('show'))")
+        wait_for(page, SETTLED)
+        assert page.evaluate(PIXELS) != after
+        figures = page.evaluate("document.getElementById('figures').innerText")
+        assert errors == []
         assert "WebAssembly" in figures and "dB PSNR over 2 ray-traced" in figures
 
 
@@ -95,10 +98,9 @@ def test_instances_stand_where_gltf_puts_them(exported: tuple[Path, dict[str, An
     placement = np.eye(4)
     placement[:3] = rng.normal(size=(3, 4))
     stored = (Y_UP @ placement @ np.linalg.inv(Y_UP)).T.ravel().tolist()
-    with browser() as tab:
-        tab.open((exported[0] / "index.html").as_uri())
-        world = tab.evaluate(f"worldMatrix({stored})")
-        turned = np.array(tab.evaluate(f"normalMatrix({world})")).reshape(3, 3).T
+    with open_page((exported[0] / "index.html").as_uri()) as (page, _):
+        world = page.evaluate(f"worldMatrix({stored})")
+        turned = np.array(page.evaluate(f"normalMatrix({world})")).reshape(3, 3).T
     assert np.allclose(np.array(world).reshape(4, 4).T, placement)
     linear = placement[:3, :3]
     assert np.allclose(turned, abs(np.linalg.det(linear)) * np.linalg.inv(linear).T)
@@ -108,11 +110,10 @@ def test_a_static_server_serves_it_too(exported: tuple[Path, dict[str, Any]], se
     """Without offline.js, file by file."""
     (exported[0] / "offline.js").rename(exported[0] / "away.js")
     try:
-        with browser() as tab:
-            tab.open(server)
-            assert tab.evaluate("window.dnr.then(page => page.scene.size)") == [64, 64]
-            tab.evaluate("window.dnr.then(page => page.frame(page.view(), 'neural')).then(() => true)")
-            assert tab.evaluate("document.getElementById('message').textContent") == ""
+        with open_page(server) as (page, _):
+            assert wait_for(page, "window.dnr.then(page => page.scene.size)") == [64, 64]
+            wait_for(page, "window.dnr.then(page => page.frame(page.view(), 'neural')).then(() => true)")
+            assert page.evaluate("document.getElementById('message').textContent") == ""
     finally:
         (exported[0] / "away.js").rename(exported[0] / "offline.js")
 
@@ -157,6 +158,8 @@ def test_a_page_that_fails_is_an_error(tmp_path: Path) -> None:
     if find_chromium() is None:
         pytest.skip("no Chromium on this machine")
     (tmp_path / "index.html").write_text("<script>window.dnr = Promise.reject(new Error('no light'))</script>")
-    with browser() as tab, pytest.raises(UserError, match="no light"):
-        tab.open((tmp_path / "index.html").as_uri())
-        tab.evaluate("window.dnr.then(() => true)")
+    address = (tmp_path / "index.html").as_uri()
+    with pytest.raises(UserError, match="no light"), open_page(address) as (page, _):
+        wait_for(page, "window.dnr.then(() => true)")
+    with pytest.raises(UserError, match="ERR_FILE_NOT_FOUND"), open_page(address + ".html"):
+        pass

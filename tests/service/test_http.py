@@ -149,7 +149,7 @@ def test_many_clients_lose_nothing(tmp_path: Path) -> None:
         start = threading.Barrier(201)
 
         def crowd(number: int) -> list[int]:
-            with Client(server.url, patience=120) as client:
+            with Client(server.url, retry_seconds=120) as client:
                 start.wait(timeout=60)
                 return [
                     client.submit(_failing("crowd").model_copy(update={"priority": number % 7})).id for _ in range(5)

@@ -132,13 +132,16 @@ def test_what_is_not_a_picture(server: Server) -> None:
 
 def test_large_views_are_not_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Training goes by squares of them; the whole of one would want several times the memory."""
+    from dnrpipe.stages.previews import LivePicture
+
     from dnrpipe.core.console import Console
     from dnrpipe.core.settings import resolve
     from dnrpipe.core.workspace import Workspace
-    from dnrpipe.stages.previews import LivePicture
+    from dnrpipe.stages.finetune import LivePicture
+    from dnrpipe.stages.stage import Run
 
     large: Any = SimpleNamespace(size=(2048, 2048))
     empty_workspace(tmp_path, "large")
     workspace, settings = Workspace.open(tmp_path / "large.dnr"), resolve("draft", {}, environment={})
-    picture = LivePicture(workspace, settings, Console(), "run", large)
+    picture = LivePicture(Run(workspace, settings, Console()), large)
     assert picture.preview is None and "more than 2.1 megapixels" in capsys.readouterr().out

@@ -33,7 +33,7 @@ class Place:
         if state != "queued":
             claimed = self.queue.claim("cpu")
             while claimed is not None and claimed.id != job:  # older ones that wait
-                self.queue.put_back(claimed.id, crashed=False, why="not this one")
+                self.queue.requeue(claimed.id, crashed=False, why="not this one")
                 claimed = self.queue.claim("cpu")
             assert claimed is not None
         if told:
@@ -108,7 +108,7 @@ def test_a_job_that_is_tried_again_meanwhile(tmp_path: Path, monkeypatch: pytest
     """Between the look at the jobs and the removal it was queued again: its log is kept."""
     place = Place(tmp_path)
     job = place.job("failed", 50)
-    look = place.queue._told_of
+    look = place.queue._prunable_jobs
 
     def slow(*arguments: Any) -> list[list[int]]:
         found = look(*arguments)
@@ -116,7 +116,7 @@ def test_a_job_that_is_tried_again_meanwhile(tmp_path: Path, monkeypatch: pytest
         place.queue.retry(job)
         return found
 
-    monkeypatch.setattr(place.queue, "_told_of", slow)
+    monkeypatch.setattr(place.queue, "_prunable_jobs", slow)
     assert place.prune() == [] and place.told(job) == EVERYTHING
 
 

@@ -35,7 +35,7 @@ def run(scene: Path, out: Path, policy: str) -> list[str]:
     raster, traced = load(scene, traced=False), load(scene, traced=True)
     selected: list[str] = []
     for event in run_step1(
-        raster, traced.subset([0]), raster.camera_positions, MODEL, STEP1,
+        raster, traced.subset([0]), MODEL, STEP1,
         policy=policy, budget=BUDGET, seed=5, device="cpu", checkpoints=out / "step1", fingerprint="a",
     ):  # fmt: skip
         if isinstance(event, Selected):

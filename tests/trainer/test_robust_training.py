@@ -19,6 +19,7 @@ from dnrtrain.dataset import ViewSet
 from dnrtrain.events import Diverged, EpochEnd, Event, Note, Selected
 from dnrtrain.metrics import psnr
 from dnrtrain.model import render_views
+from dnrtrain.records import Epoch
 from dnrtrain.schedule import MAX_RESTARTS, SLOWER, EpochBook, Watch
 from dnrtrain.settings import LossWeights, ModelSettings, Step1Settings, Step2Settings
 from dnrtrain.step1 import run_step1
@@ -56,16 +57,16 @@ def test_a_learning_rate_spike_is_noticed_and_taken_back(scene: Scene, tmp_path:
     assert epochs == [1, 2, 3, 4]
     assert finite(tmp_path / "step2")
     record = read_record(tmp_path / "step2")
-    assert record is not None and len(record["restarts"]) == len(restarts)
-    assert record["restarts"][-1]["scale"] == pytest.approx(SLOWER ** len(restarts))
-    assert all(entry["losses"]["photometric"] < 10 for entry in record["history"])
+    assert record is not None and len(record.restarts) == len(restarts)
+    assert record.restarts[-1].scale == pytest.approx(SLOWER ** len(restarts))
+    assert all(entry.losses["photometric"] < 10 for entry in record.history)
 
 
 def test_step1_takes_a_spike_back_too(scene: Scene, tmp_path: Path) -> None:
     settings = Step1Settings(epochs=2, embedding=8, precision="float32", learning_rate=300, learning_rate_end=30)
     events = list(
         run_step1(
-            scene.raster, None, scene.raster.camera_positions, MODEL, settings, policy="rl-paper", budget=4, seed=0,
+            scene.raster, None, MODEL, settings, policy="rl-paper", budget=4, seed=0,
             device="cpu", checkpoints=tmp_path / "step1", fingerprint="f",
         )
     )  # fmt: skip
@@ -115,7 +116,7 @@ def test_the_watch() -> None:
         return made
 
     module, picture = torch.nn.Linear(2, 2), torch.full((1, 3, 2, 2), 0.7)
-    history = [{"losses": {"photometric": 0.004}}, {"losses": {"photometric": 0.002}}]
+    history = [Epoch(epoch=n, losses={"photometric": 0.004 / n}) for n in (1, 2)]
     watch = Watch()
     assert watch.trouble(book(3.0), "photometric", [], picture, module) is None  # an untrained network
     assert watch.trouble(book(0.05), "photometric", history, picture, module) is None  # worse, but no harm
@@ -144,7 +145,7 @@ def test_a_poisoned_batch_is_skipped_counted_and_reported(scene: Scene, tmp_path
     epochs = [event for event in fine_tune(poisoned, tmp_path, FRESH) if isinstance(event, EpochEnd)]
     assert [(epoch.steps, epoch.skipped) for epoch in epochs] == [(4, 1)] * 3
     record = read_record(tmp_path / "step2")
-    assert record is not None and [entry["skipped"] for entry in record["history"]] == [1, 1, 1]
+    assert record is not None and [entry.skipped for entry in record.history] == [1, 1, 1]
     assert finite(tmp_path / "step2")
 
 
@@ -161,10 +162,10 @@ def test_identical_views(scene: Scene, tmp_path: Path) -> None:
     """One view, ten times: selection, training and rendering stay finite, and still learn that view."""
     same = scene.traced.subset([3] * 10)
     same = dataclasses.replace(same, names=tuple(f"copy{i}" for i in range(10)))
-    for policy in ("rl-paper", "farthest", "auto"):
+    for policy in ("rl-paper", "farthest", "kmedoids"):
         events = list(
             run_step1(
-                same, None, same.camera_positions, MODEL, Step1Settings(epochs=1, embedding=8, precision="float32"),
+                same, None, MODEL, Step1Settings(epochs=1, embedding=8, precision="float32"),
                 policy=policy, budget=4, seed=0, device="cpu", checkpoints=tmp_path / policy, fingerprint="f",
             )
         )  # fmt: skip

@@ -1,4 +1,4 @@
-"""What candidates see: cells, pixels, directions, duplicates; demand and service; what a selection leaves uncovered."""
+"""What candidates see: cells, pixels, directions, duplicates; what a selection leaves uncovered."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import pytest
 import synthetic
 
 from dnrtrain.contract import ContractError, View
-from dnrtrain.selector.demand import demand_of, demand_problem, directions, service
 from dnrtrain.selector.explain import coverage_of, sentences
+from dnrtrain.selector.geometry import direction_bins
 from dnrtrain.selector.sightings import Sightings, collect, look_at, read_sightings
 
 SIDE, GRID = 24, 16
@@ -55,21 +55,10 @@ def test_files_are_read_one_by_one_and_give_the_same(views: list[View], seen: Si
     read = read_sightings(files, views, grid=GRID, tick=lambda: ticks.append(1))
     assert len(ticks) == len(views)
     assert read.cells.tolist() == seen.cells.tolist() and np.allclose(read.pixels, seen.pixels)
-    assert (read.detail > 0).all()  # stripes and checks; the G-buffers above have no colour
-    assert not seen.detail.any()
     with pytest.raises(ContractError, match="must agree"):
         read_sightings(files[1:], views)
     with pytest.raises(ContractError, match="its camera 48x24"):
         read_sightings(files[:1], [views[0].model_copy(update={"width": 48})])
-
-
-def test_detail_is_the_mean_step_between_neighbours() -> None:
-    view = synthetic.dome(1, 4)[0]
-    channels = {name: np.ones((4, 4), np.float32) for name in ("mask", "A")}
-    channels |= {name: np.full((4, 4), 0.5, np.float32) for name in ("uv.U", "uv.V")}
-    stripes = np.tile(np.array([0.0, 1.0, 0.0, 1.0], np.float32), (4, 1))
-    assert look_at({**channels, **dict.fromkeys("RGB", stripes)}, view).detail == pytest.approx(0.5)
-    assert look_at({**channels, **dict.fromkeys("RGB", stripes * 0 + 0.3)}, view).detail == 0.0
 
 
 def test_large_images_are_thinned_out() -> None:
@@ -113,28 +102,10 @@ def test_taking_views_takes_their_sightings(seen: Sightings) -> None:
 
 
 def test_directions_cover_the_sphere() -> None:
-    axes, random = directions(), np.random.default_rng(0).normal(size=(2000, 3))
+    axes, random = direction_bins(), np.random.default_rng(0).normal(size=(2000, 3))
     random /= np.linalg.norm(random, axis=1, keepdims=True)
     assert np.allclose(np.linalg.norm(axes, axis=1), 1.0, atol=1e-6)
     assert np.degrees(np.arccos((random @ axes.T).max(axis=1))).max() < 35
-
-
-def test_demand_and_service(seen: Sightings) -> None:
-    demand = demand_of(seen)
-    assert demand.weights.sum() == pytest.approx(1.0, rel=1e-5)
-    assert set(demand.cells) == set(seen.cells.tolist())
-    served = [service(seen, demand, view) for view in range(len(seen))]
-    assert min(one.min() for one in served) == 0.0 and max(one.max() for one in served) <= 1.0
-    for view, one in enumerate(served):
-        assert set(demand.cells[one > 0]) <= set(seen.cells[seen.of(view)].tolist())
-    # A lone view serves its own demand wholly.
-    alone = seen.take(np.array([2]))
-    assert service(alone, demand_of(alone), 0).min() == pytest.approx(1.0, abs=1e-3)
-    problem = demand_problem(seen, demand)
-    assert problem.cost([]) == pytest.approx(1.0, rel=1e-5)
-    assert problem.cost([0, 1]) == pytest.approx(
-        float((1 - np.maximum(served[0], served[1])) @ demand.weights), rel=1e-4
-    )
 
 
 def test_coverage_against_a_loop(seen: Sightings) -> None:

@@ -24,8 +24,9 @@ from dnrtrain.checkpoint import load_model, read_record
 from dnrtrain.contract import ContractError
 from dnrtrain.dataset import ViewSet, load_views
 from dnrtrain.events import EpochEnd, Event, Note, Selected
+from dnrtrain.losses import Step2Loss
 from dnrtrain.metrics import psnr
-from dnrtrain.model import render_views
+from dnrtrain.model import DNR, render_views
 from dnrtrain.precision import decide_bfloat16
 from dnrtrain.schedule import guarded_step, learning_rate
 from dnrtrain.selector.agent import Reward
@@ -39,14 +40,13 @@ QUICK2 = Step2Settings(epochs=2, loss=LossWeights(perceptual=0))
 
 
 def step1(
-    views: ViewSet, folder: Path, *, policy: str = "rl", budget: int = 4, seed: int = 0,
+    views: ViewSet, folder: Path, *, policy: str = "rl-paper", budget: int = 4, seed: int = 0,
     settings: Step1Settings = QUICK1, model: ModelSettings = MODEL, fingerprint: str = "f",
     val: ViewSet | None = None,
 ) -> list[Event]:  # fmt: skip
-    positions = views.camera_positions
     return list(
         run_step1(
-            views, val, positions, model, settings, policy=policy, budget=budget, seed=seed, device="cpu",
+            views, val, model, settings, policy=policy, budget=budget, seed=seed, device="cpu",
             checkpoints=folder / "step1", fingerprint=fingerprint,
         )
     )  # fmt: skip
@@ -64,19 +64,19 @@ def step2(
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("policy", ["rl", "random", "auto", "fisher"])
+@pytest.mark.parametrize("policy", ["rl-paper", "random", "kmedoids"])
 def test_selection_and_books(scene: Scene, tmp_path: Path, policy: str) -> None:
     events = step1(scene.raster, tmp_path, policy=policy, val=scene.raster.subset([0, 1]))
     epochs = [event for event in events if isinstance(event, EpochEnd)]
     assert [(e.epoch, e.epochs, e.steps, e.skipped) for e in epochs] == [(1, 2, 12, 0), (2, 2, 12, 0)]
     assert epochs[1].losses["dnr"] < epochs[0].losses["dnr"] and epochs[0].val["psnr"] > 0
-    assert ("rl" in epochs[0].losses) == (policy == "rl")
+    assert ("rl" in epochs[0].losses) == (policy == "rl-paper")
     last = events[-1]
-    assert isinstance(last, Selected) and last.policy == {"rl": "rl-paper"}.get(policy, policy)
+    assert isinstance(last, Selected) and last.policy == policy
     assert len(set(last.views)) == 4 and set(last.views) <= set(scene.raster.names)
     record = read_record(tmp_path / "step1")
-    assert record is not None and record["selected"] == last.views
-    assert [entry["epoch"] for entry in record["history"]] == [1, 2]
+    assert record is not None and record.selected == last.views
+    assert [entry.epoch for entry in record.history] == [1, 2]
     assert sorted(path.name for path in (tmp_path / "step1").iterdir()) == ["model.json", "model.safetensors"]
     # A finished step answers at once, and the same.
     assert step1(scene.raster, tmp_path, policy=policy) == [last]
@@ -121,7 +121,7 @@ def test_step2_without_weights_says_so(scene: Scene, tmp_path: Path) -> None:
     events = step2(scene.traced.subset([0, 1, 2]), tmp_path, settings=Step2Settings(epochs=1, batch=2))
     assert isinstance(events[0], Note) and "L_p" in events[0].text
     record = read_record(tmp_path / "step2")
-    assert record is not None and record["perceptual"] is False
+    assert record is not None and record.perceptual is False
     assert isinstance(events[1], EpochEnd) and events[1].steps == 2
     assert set(events[1].losses) == {
         "total", "photometric", "ssim", "frequency", "total_variation", "regularisation"
@@ -134,7 +134,7 @@ def test_non_finite_steps_are_skipped_and_counted(scene: Scene, tmp_path: Path) 
     target = tensors.target.clone()
     target[3] = torch.inf
     poisoned = dataclasses.replace(scene.raster, tensors=dataclasses.replace(tensors, target=target))
-    for policy in ("random", "rl"):
+    for policy in ("random", "rl-paper"):
         events = step1(poisoned, tmp_path / policy, policy=policy, budget=10)
         epochs = [event for event in events if isinstance(event, EpochEnd)]
         assert all(epoch.skipped == 1 and np.isfinite(epoch.losses["dnr"]) for epoch in epochs)
@@ -193,7 +193,7 @@ def test_killed_at_any_moment_it_resumes_bit_for_bit(moments: list[tuple[str, in
     script = str(Path(run_steps.__file__))
 
     def command(out: str) -> list[str]:
-        return [sys.executable, script, str(tmp_path / "scene"), str(tmp_path / out), "rl"]
+        return [sys.executable, script, str(tmp_path / "scene"), str(tmp_path / out), "rl-paper"]
 
     done = subprocess.run(command("whole"), capture_output=True, text=True, check=True)
     dice = random.Random(1)
@@ -224,7 +224,7 @@ def test_interruption_after_every_epoch(scene: Scene, tmp_path: Path) -> None:
     events: list[Event] = []
     for _ in range(4):
         run = run_step1(
-            scene.raster, None, scene.raster.camera_positions, MODEL, settings, policy="rl", budget=4, seed=0,
+            scene.raster, None, MODEL, settings, policy="rl-paper", budget=4, seed=0,
             device="cpu", checkpoints=folder / "step1", fingerprint="f",
         )  # fmt: skip
         for event in run:
@@ -248,7 +248,7 @@ def test_it_learns_views_it_has_not_seen(tmp_path: Path) -> None:
           settings=Step1Settings(epochs=8, precision="float32"))  # fmt: skip
     record = read_record(tmp_path / "step1")
     assert record is not None
-    chosen = scene.traced.subset([scene.traced.index(name) for name in record["selected"]])
+    chosen = scene.traced.subset([scene.traced.index(name) for name in record.selected])
     step2(chosen, tmp_path, model=model,
           settings=Step2Settings(epochs=25, photometric="l1", loss=LossWeights(perceptual=0)))  # fmt: skip
     target, seen = scene.held_out.target, chosen.target
@@ -302,7 +302,8 @@ def test_the_averaged_weights_are_the_model(scene: Scene, tmp_path: Path) -> Non
     step2(data, tmp_path / "averaged", model=model, settings=settings)
     tracks = []
     for steps in (1, 2, 3):
-        run = _Step2(data, None, tmp_path, model, settings, 0, "cpu", tmp_path / f"cut{steps}", "f", None)
+        loss, folder = Step2Loss(settings, None), tmp_path / f"cut{steps}"
+        run = _Step2(data, None, DNR(model, 0), settings, loss, 0, "run", folder, "cpu")
         run._restore()
         run.steps_per_epoch = 3
         taken = 0
@@ -314,7 +315,7 @@ def test_the_averaged_weights_are_the_model(scene: Scene, tmp_path: Path) -> Non
 
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("dnrtrain.step2.guarded_step", stop_after)
-            patch.setattr("dnrtrain.step2.Watch.trouble", lambda *_: None)  # steps not taken look like divergence
+            patch.setattr("dnrtrain.schedule.Watch.trouble", lambda *_: None)  # steps not taken look like divergence
             run._epoch(0)
         tracks.append({name: p.detach().clone() for name, p in run.dnr.named_parameters()})
     saved = load_model(tmp_path / "averaged" / "step2")

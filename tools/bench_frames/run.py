@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from dnrpipe.studies.frames.ladder import classes, frontier, standing
+from dnrpipe.studies.frames.ladder import frontier
 from dnrpipe.studies.frames.ours import Ours
-from dnrpipe.studies.frames.rival import METHODS, SAMPLES, climb, make_rungs
+from dnrpipe.studies.frames.rival import METHODS, climb, make_rungs
 from dnrpipe.studies.frames.scene import BenchScene, Clock, open_scene
 from dnrtrain.metrics import image_metrics
 from dnrtrain.perceptual import build_lpips
@@ -20,6 +20,7 @@ from dnrtrain.weights import WeightsMissing, load_weights
 
 from .reference import Reference, make_references
 from .stability import measure
+from .standing import classes, standing
 from .upfront import upfront
 
 CLASSES = (0.03, 0.07, 0.3)
@@ -37,7 +38,7 @@ class Options:
     reference: str = "auto"
     clock: str = "wall"
     threads: int = 2
-    samples: tuple[int, ...] = SAMPLES
+    samples: tuple[int, ...] = (1, 2, 4, 8, 16, 64)
     orbit: int = 12
     orbit_spp: int = 512
     rays: tuple[int, ...] = ()

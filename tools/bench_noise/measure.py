@@ -114,7 +114,7 @@ def _run(worker: Worker, common: dict[str, Any], view: View, target: float, most
     schedule = Schedule(Goal(target, None, most), {view.name: ViewProgress()}, 1)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "samples.npz"
-        task = {**common, "seed": seed, "samples": str(path), "samples_print": "bench"}
+        task = {**common, "seed": seed, "samples": str(path), "samples_fingerprint": "bench"}
         passes = 0
         while (step := schedule.next()) is not None and step.add:
             schedule.passed(view.name, add=step.add, **worker({**task, "add": step.add}))

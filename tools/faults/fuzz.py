@@ -57,6 +57,7 @@ def targets(folder: Path) -> dict[str, Target]:
     from dnrtrain.display import DisplayTransform
     from dnrtrain.exr import read_exr, read_metadata, write_exr
     from dnrtrain.model import DNR
+    from dnrtrain.records import ModelRecord
     from dnrtrain.settings import ModelSettings
 
     dice = np.random.default_rng(0)
@@ -110,19 +111,23 @@ def targets(folder: Path) -> dict[str, Target]:
     keep("selection", path, _selection, text=True)
 
     model = DNR(ModelSettings(texture_size=8, texture_channels=12, width=4, depth=1, texture_levels=2), seed=0)
-    checkpoint.save_model(folder / "model", model, {"fingerprint": "f", "history": []})
-    weights, record = (folder / "model" / name for name in ("model.safetensors", "model.json"))
+    record = ModelRecord(
+        model=model.settings.model_dump(), fingerprint="f", run="r", stage="step2", settings={}, seed=0,
+        bfloat16=False, history=[],
+    )  # fmt: skip
+    checkpoint.save_model(folder / "model", model, record)
+    weights, book = (folder / "model" / name for name in ("model.safetensors", "model.json"))
 
     def load_model(p: Path) -> None:
         place = p.parent / "model"
         place.mkdir(exist_ok=True)
-        for good in (weights, record):
+        for good in (weights, book):
             (place / good.name).write_bytes(p.read_bytes() if good.name == p.name else found_bytes[good.name])
         checkpoint.load_model(place)
 
-    found_bytes = {path.name: path.read_bytes() for path in (weights, record)}
+    found_bytes = {path.name: path.read_bytes() for path in (weights, book)}
     keep("safetensors", weights, load_model)
-    keep("model", record, load_model, text=True)
+    keep("model", book, load_model, text=True)
     checkpoint.save(folder / "state.safetensors", {"a": torch.zeros(4)}, {"run": "r", "epoch": 1})
     keep("state", folder / "state.safetensors", lambda p: checkpoint.load(p))
 
@@ -182,8 +187,8 @@ def _status(path: Path) -> None:
 def _selection(path: Path) -> None:
     import numpy as np
 
+    from dnrpipe.core.scene_files import read_selection
     from dnrpipe.core.workspace import Manifest, Source, Workspace
-    from dnrpipe.stages.trainer import read_selection
     from dnrtrain.contract import View, write_cameras
 
     workspace = Workspace(path.parent, Manifest(source=Source(path="/a", sha256="0")))  # pyright: ignore[reportCallIssue]

@@ -215,10 +215,8 @@ def choose(folder: Path, count: int) -> None:
 
     views = cameras_of(count)
     files = [folder / "candidates" / f"{view.name}.exr" for view in views]
-    sightings = read_sightings(files, views)
-    positions = np.stack([view.position for view in views])
-    candidates = Candidates(positions, np.stack([-view.matrix[:3, 2] for view in views]), sightings)
-    for policy in ("coverage", "exchange", "kmedoids", "d-optimal", "farthest", "random"):
+    candidates = Candidates.of_views(views, read_sightings(files, views))
+    for policy in ("coverage", "kmedoids", "farthest", "random"):
         rule = untrained(policy)
         assert rule is not None
         started = time.monotonic()

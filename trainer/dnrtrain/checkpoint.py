@@ -23,15 +23,16 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from .atomic import atomic_path, write_json
+from . import records
+from .atomic import atomic_path
 from .contract import ContractError, DamagedFile
 from .model import DNR
+from .records import ModelRecord, Progress
 from .settings import ModelSettings
 
 HEADER = "dnrtrain"
 CHECKSUM = "sha256"
 STATE = "state.safetensors"
-PROGRESS = "checkpoint.json"
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,14 @@ class Saved:
 
     tensors: dict[str, Tensor]
     info: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class State:
+    """An unfinished training: tensors by name (on the CPU), and how far it is."""
+
+    tensors: dict[str, Tensor]
+    progress: Progress
 
 
 def save(path: Path, tensors: Mapping[str, Tensor], info: Mapping[str, Any]) -> None:
@@ -56,7 +65,7 @@ def save(path: Path, tensors: Mapping[str, Tensor], info: Mapping[str, Any]) -> 
 
 
 def load(path: Path) -> Saved | None:
-    """Read what :func:`save` wrote; None when the file is missing. Raises DamagedFile when it does not read."""
+    """Read what `save` wrote; None when the file is missing. Raises DamagedFile when it does not read."""
     if not Path(path).exists():
         return None
     try:
@@ -89,15 +98,15 @@ def optimiser_tensors(optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
 
 
 def restore_optimiser(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
-    """Inverse of :func:`optimiser_tensors`; the parameter groups stay as they are.
+    """Inverse of `optimiser_tensors`; the parameter groups stay as they are.
 
     Fused Adam walks parameters and moments by memory address, so moments take their parameter's strides
     (channels-last): files hold them contiguous.
     """
     parameters = [p for group in optimiser.param_groups for p in group["params"]]
     state: dict[int, dict[str, Tensor]] = {}
-    for key, value in tensors.items():
-        number, name = key.split(".", 1)
+    for full_name, value in tensors.items():
+        number, name = full_name.split(".", 1)
         index = int(number)
         if name != "step":
             value = torch.empty_like(parameters[index]).copy_(value)
@@ -119,54 +128,56 @@ def load_module(module: nn.Module, tensors: Mapping[str, Tensor]) -> None:
     module.load_state_dict(dict(tensors))
 
 
-def save_state(folder: Path, tensors: Mapping[str, Tensor], info: Mapping[str, Any]) -> None:
-    """Write an epoch's state in place of the last one's. ``info`` holds at least run, epoch and history."""
-    save(folder / STATE, tensors, info)
-    write_json(folder / PROGRESS, dict(info))
+def save_state(folder: Path, tensors: Mapping[str, Tensor], progress: Progress) -> None:
+    """Write an epoch's state in place of the last one's."""
+    save(folder / STATE, tensors, progress.data())
+    records.write(folder / records.PROGRESS, progress)
 
 
-def load_state(folder: Path) -> Saved | None:
+def load_state(folder: Path) -> State | None:
     """The state of the last whole epoch, or None when there is none. Raises DamagedFile."""
-    return load(folder / STATE)
+    saved = load(folder / STATE)
+    if saved is None:
+        return None
+    try:
+        return State(saved.tensors, Progress.model_validate(saved.info))
+    except ValidationError as error:
+        raise DamagedFile(folder / STATE, error.errors()[0]["msg"]) from None
 
 
-def interrupted(folder: Path, key: str, notes: list[str]) -> Saved | None:
-    """The state that the run ``key`` was interrupted in, or None. A damaged one is no state; ``notes`` then says so."""
+def interrupted(folder: Path, run: str, notes: list[str]) -> State | None:
+    """The state that the run was interrupted in, or None. A damaged one is no state; ``notes`` then says so."""
     try:
         saved = load_state(folder)
     except DamagedFile as damage:
         notes.append(f"{damage.path}: damaged; training starts afresh")
         return None
-    return saved if saved is not None and saved.info.get("run") == key else None
+    return saved if saved is not None and saved.progress.run == run else None
 
 
-def require_state(folder: Path, key: str) -> Saved:
-    """The state that the run ``key`` wrote last. Raises ContractError when it is gone, or another run's."""
+def require_state(folder: Path, run: str) -> State:
+    """The state that the run wrote last. Raises ContractError when it is gone, or another run's."""
     saved = load_state(folder)
-    if saved is None or saved.info.get("run") != key:
+    if saved is None or saved.progress.run != run:
         raise ContractError(f"{folder / STATE}: was removed or replaced while training; run the same command again")
     return saved
 
 
-def save_model(folder: Path, model: DNR, info: Mapping[str, Any]) -> None:
-    """Write ``model.safetensors``, then ``model.json``; drop the epoch state.
-
-    ``info`` holds at least fingerprint and history.
-    """
-    record = {"model": model.settings.model_dump(mode="json"), **info}
-    save(folder / "model.safetensors", model.state_dict(), {"fingerprint": info["fingerprint"]})
-    write_json(folder / "model.json", record)
+def save_model(folder: Path, model: DNR, record: ModelRecord) -> None:
+    """Write ``model.safetensors``, then ``model.json``; drop the epoch state."""
+    save(folder / "model.safetensors", model.state_dict(), {"fingerprint": record.fingerprint})
+    records.write(folder / records.MODEL, record)
     (folder / STATE).unlink(missing_ok=True)
-    (folder / PROGRESS).unlink(missing_ok=True)
+    (folder / records.PROGRESS).unlink(missing_ok=True)
 
 
-def read_record(folder: Path) -> dict[str, Any] | None:
+def read_record(folder: Path) -> ModelRecord | None:
     """``model.json`` of a finished stage, or None when it is missing, damaged or of other weights."""
     try:
-        record = json.loads((folder / "model.json").read_text(encoding="utf-8"))
+        record = records.read(folder / records.MODEL, ModelRecord)
         with safe_open(folder / "model.safetensors", framework="pt") as file:
             header = json.loads((file.metadata() or {})[HEADER])
-        return record if record["fingerprint"] == header["fingerprint"] else None
+        return record if record.fingerprint == header["fingerprint"] else None
     except (OSError, SafetensorError, KeyError, ValueError, TypeError, RecursionError):
         return None
 
@@ -185,13 +196,14 @@ def load_model(folder: Path, device: str | torch.device = "cpu") -> DNR:
     if record is None or saved is None:
         raise ContractError(f"{folder}: holds no finished model; run `dnrpipe finetune` (again)")
     try:
-        _refuse_bomb(ModelSettings.model_validate(record["model"]), saved)
-        model = DNR(ModelSettings.model_validate(record["model"]), seed=0)
+        settings = ModelSettings.model_validate(record.model)
+        _refuse_bomb(settings, saved)
+        model = DNR(settings, seed=0)
         load_module(model, saved.tensors)
     except (ValidationError, RuntimeError, KeyError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ContractError(f"{folder}: model does not fit this version ({reason}); train it again") from None
-    model.use_bfloat16 = bool(record.get("bfloat16", False))
+    model.use_bfloat16 = record.bfloat16
     return model.to(device).eval()
 
 

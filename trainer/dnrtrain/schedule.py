@@ -22,6 +22,7 @@ from .contract import ContractError
 from .dataset import ViewSet
 from .metrics import psnr, ssim
 from .model import DNR, render_views
+from .records import Epoch, Restart
 from .textures import TexturePyramid
 
 STEP1, STEP2 = 1, 2
@@ -140,17 +141,17 @@ def _put(module: nn.Module, weights: dict[str, Tensor]) -> None:
 class Watch:
     """Notices epochs that diverged. ``scale`` multiplies the learning rate; it falls at every restart.
 
-    restarts: one entry per restart: epoch, reason, scale from there on. Part of a run's checkpoint.
+    restarts: one per diverged epoch; part of a run's checkpoint.
     """
 
-    restarts: list[dict[str, Any]] = field(default_factory=list)
+    restarts: list[Restart] = field(default_factory=list)
 
     @property
     def scale(self) -> float:
-        return float(self.restarts[-1]["scale"]) if self.restarts else 1.0
+        return self.restarts[-1].scale if self.restarts else 1.0
 
     def trouble(
-        self, book: EpochBook, term: str, history: Sequence[dict[str, Any]], picture: Tensor, *modules: nn.Module
+        self, book: EpochBook, term: str, history: Sequence[Epoch], picture: Tensor, *modules: nn.Module
     ) -> str | None:
         """What shows that the epoch in ``book`` diverged, in words; None when it did not.
 
@@ -168,7 +169,7 @@ class Watch:
         loss = book.means().get(term)
         if loss is None:
             return None
-        best = min((entry["losses"].get(term, loss) for entry in history), default=loss)
+        best = min((entry.losses.get(term, loss) for entry in history), default=loss)
         if loss > BLOWN_UP or loss > max(WORSE * best, NOTHING_LOST):
             return f"its {term} loss is {loss:.3g}" + (f" after {best:.3g}" if history else "")
         return None
@@ -183,7 +184,7 @@ class Watch:
                 f"training diverges in epoch {epoch} ({reason}) even at {self.scale:.2g} of its learning rate;"
                 " look at the training images, or lower the learning rate"
             )
-        self.restarts.append({"epoch": epoch, "reason": reason, "scale": self.scale * SLOWER})
+        self.restarts.append(Restart(epoch=epoch, reason=reason, scale=self.scale * SLOWER))
         return (
             f"epoch {epoch} diverged ({reason}): back to the weights after epoch {epoch - 1},"
             f" learning rate times {self.scale:.2g} from here"
@@ -215,22 +216,22 @@ class EpochBook:
     def means(self) -> dict[str, float]:
         return {name: total / self.counts[name] for name, total in self.sums.items()}
 
-    def entry(self, epoch: int, rate: float, val: dict[str, float]) -> dict[str, Any]:
-        """The epoch's line of the history, JSON-ready."""
-        return {
-            "epoch": epoch,
-            "losses": self.means(),
-            "val": val,
-            "seconds": time.monotonic() - self.wall,
-            "cpu_seconds": time.process_time() - self.cpu,
-            "steps": self.steps,
-            "skipped": self.skipped,
-            "learning_rate": rate,
-        }
+    def entry(self, epoch: int, rate: float, val: dict[str, float]) -> Epoch:
+        """The epoch's line of the history."""
+        return Epoch(
+            epoch=epoch,
+            losses=self.means(),
+            val=val,
+            seconds=time.monotonic() - self.wall,
+            cpu_seconds=time.process_time() - self.cpu,
+            steps=self.steps,
+            skipped=self.skipped,
+            learning_rate=rate,
+        )
 
 
-def run_key(fingerprint: str, views: ViewSet, parts: Sequence[Any]) -> str:
-    """What a checkpoint must share with a run to continue it: the caller's fingerprint and all settings."""
+def run_fingerprint(fingerprint: str, views: ViewSet, parts: Sequence[Any]) -> str:
+    """What a checkpoint must share with a run to continue it: a hash of the caller's fingerprint and all settings."""
     text = json.dumps([fingerprint, list(views.names), list(views.size), *parts], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 

@@ -93,16 +93,6 @@ class Step1Settings(Strict):
     validation_views: int = Field(default=8, ge=0, description="validation views rendered after each epoch")
 
 
-class ActiveSettings(Strict):
-    """Policies that train small models on the views chosen so far: ensemble, variance."""
-
-    members: int = Field(default=3, ge=2, le=16, description="models of policy ensemble; variance trains one")
-    rounds: int = Field(
-        default=2, ge=1, le=20, description="batches in which views are added to the first third of the budget"
-    )
-    epochs: int = Field(default=10, ge=1, description="each model's passes over the views chosen so far")
-
-
 class LossWeights(Strict):
     """The six losses of step 2 (paper, implementation details)."""
 

@@ -133,9 +133,9 @@ class Walker:
         tensors |= checkpoint.prefixed("slow", self.slow.state_dict())
         return tensors | checkpoint.prefixed("adam_agent", checkpoint.optimiser_tensors(self.adam))
 
-    def load(self, saved: checkpoint.Saved) -> None:
+    def load(self, saved: checkpoint.State) -> None:
         """Go on from step 1's checkpoint."""
-        self.scale = RewardScale(saved.info["reward_mean"], raw=self.settings.reward_scale == "raw")
+        self.scale = RewardScale(saved.progress.reward_mean, raw=self.settings.reward_scale == "raw")
         checkpoint.load_module(self.agent, checkpoint.unprefixed("agent", saved.tensors))
         checkpoint.load_module(self.slow, checkpoint.unprefixed("slow", saved.tensors))
         checkpoint.restore_optimiser(self.adam, checkpoint.unprefixed("adam_agent", saved.tensors))

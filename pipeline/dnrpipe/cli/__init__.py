@@ -20,7 +20,6 @@ from .frontier import frontier
 from .jobs import cancel, jobs, logs, retry, submit
 from .plan import plan
 from .serve import bench_live, serve
-from .train_selector import train_selector
 from .verify import verify
 
 
@@ -69,7 +68,6 @@ for _command in (
     frontier,
     ablate,
     bench_select,
-    train_selector,
     *(serve, submit, jobs, logs, cancel, retry, bench_live),
     information.status,
     verify,

@@ -21,6 +21,7 @@ _EXTRAS = {
     "matplotlib": "render",
     "onnx": "export",
     "onnxruntime": "export",
+    "playwright": "export",
     "fastapi": "serve",
     "uvicorn": "serve",
     "websockets": "serve",

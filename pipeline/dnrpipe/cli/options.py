@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from dnrtrain.selector.names import ALIASES, NAMES
+from dnrtrain.selector.names import NAMES
 
 from ..core.errors import UserError
 
@@ -56,15 +56,8 @@ SELECT_OPTIONS = [
     click.option("--budget", type=int, metavar="M", help="Views to ray-trace (default 25)."),
     click.option(
         "--policy",
-        type=click.Choice([*NAMES, *ALIASES]),
-        help="How to choose them; rl-paper (alias rl), fisher, ensemble and variance train for it, the others take"
-        " seconds.",
-    ),
-    click.option(
-        "--rounds",
-        type=int,
-        metavar="K",
-        help="Choose in K rounds (policy auto): trace a part, look where it is still wrong, choose on (default 1).",
+        type=click.Choice(NAMES),
+        help="How to choose them; rl-paper trains for it, the others take seconds.",
     ),
 ]
 
@@ -128,11 +121,9 @@ def camera_overrides(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def select_overrides(options: dict[str, Any]) -> dict[str, Any]:
-    chosen = {key: options.pop(key) for key in ("budget", "policy", "rounds")}
+    chosen = {key: options.pop(key) for key in ("budget", "policy")}
     if chosen["budget"] is not None and chosen["budget"] < 1:
         raise UserError(f"--budget {chosen['budget']}: must be at least 1 view")
-    if chosen["rounds"] is not None and chosen["rounds"] < 1:
-        raise UserError(f"--rounds {chosen['rounds']}: must be at least 1 round")
     given = {key: value for key, value in chosen.items() if value is not None}
     return {"select": given} if given else {}
 

@@ -88,7 +88,8 @@ def _render(
         views = orbit_views(read_summary(session.workspace), cameras, orbit, elevation)
         name = f"orbit-{orbit}"
     console = session.console
-    answer = render_novel(session.workspace, session.settings, console, views, name=name, frames=frames, movie=movie)
+    run = session.run.for_stage("render")
+    answer = render_novel(run, views, name=name, frames=frames, movie=movie)
     console.say(f"{answer['frames']} frames, {answer['neural_ms']:.1f} ms each for the network")
     console.say(answer["movie"] or answer["folder"])
     console.result(answer)

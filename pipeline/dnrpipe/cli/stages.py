@@ -55,15 +55,11 @@ def select(**options: Any) -> None:
     Trains the coarse neural renderer (step 1) only where the policy learns from it or step 2 starts from it
     (finetune.step2.start = coarse). selection.json says what each view adds, and why it was chosen.
 
-    With --rounds K a first part of the views is ray-traced at once; where those show that the base image is wrong
-    decides the next. The traced views are kept for raytrace-selected.
-
     \b
     Examples:
       dnrpipe select --budget 25
       dnrpipe select --budget 10 --policy auto
       dnrpipe select --budget 10 --policy kmedoids
-      dnrpipe select --budget 10 --policy auto --rounds 2
     """
     with open_session("select", options, overrides=select_overrides(options)) as session:
         session.stages("select")

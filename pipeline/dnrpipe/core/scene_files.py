@@ -10,6 +10,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from dnrtrain.contract import SPLITS, DamagedFile, SceneFrame, View, read_cameras
+from dnrtrain.records import Selection, read
 
 from .errors import UserError
 from .workspace import Workspace, digest, file_sha256
@@ -78,3 +79,17 @@ def split_views(workspace: Workspace) -> dict[str, list[View]]:
 def has_test_views(workspace: Workspace) -> bool:
     """Whether there is anything to evaluate on."""
     return bool(split_views(workspace).get("test"))
+
+
+def read_selection(workspace: Workspace) -> Selection:
+    """``selection.json``. Raises UserError: there is none. DamagedFile: it does not read, or names other views."""
+    path = workspace.selection
+    try:
+        selection = read(path, Selection)
+    except FileNotFoundError:
+        raise UserError(f"{workspace.root}: no views selected yet; run `dnrpipe select` first") from None
+    cameras = workspace.cameras("train")
+    unknown = sorted(set(selection.views) - {view.name for view in read_cameras(cameras)}) if cameras.exists() else []
+    if unknown:
+        raise DamagedFile(path, f"views {', '.join(unknown)[:200]} are no candidates")
+    return selection

@@ -9,14 +9,15 @@ from __future__ import annotations
 import difflib
 import os
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, field_validator
 
-from dnrtrain.selector.names import TRAINED_NAMES, PolicyName, full_name
-from dnrtrain.settings import ActiveSettings, LossWeights, ModelSettings, Step1Settings, Step2Settings, Strict
+from dnrtrain.selector.names import TRAINED_NAMES, PolicyName
+from dnrtrain.settings import LossWeights, ModelSettings, Step1Settings, Step2Settings, Strict
 
 from .effect_names import EffectName
 from .errors import UserError
@@ -24,9 +25,10 @@ from .units import parse_seconds, parse_share
 
 ENVIRONMENT_PREFIX = "DNRPIPE_"
 ENVIRONMENT_OTHER = {
-    *("DNRPIPE_WORKSPACE", "DNRPIPE_CACHE", "DNRPIPE_PRESET"),
-    *("DNRPIPE_EVENTS", "DNRPIPE_SERVER", "DNRPIPE_TOKEN_FILE", "DNRPIPE_TASK_TIMEOUT"),
+    *("DNRPIPE_WORKSPACE", "DNRPIPE_CACHE", "DNRPIPE_EVENTS"),
+    *("DNRPIPE_SERVER", "DNRPIPE_TOKEN_FILE", "DNRPIPE_TASK_TIMEOUT"),
 }
+"""Variables that are no settings."""
 
 
 class CameraSettings(Strict):
@@ -99,7 +101,7 @@ class RaytraceSettings(Strict):
 
 
 class BaseSettings(Strict):
-    """The image that the network corrects, where ``model.base`` is rendered (baked, direct, path)."""
+    """The image that the network corrects, where `model.base` is rendered (baked, direct, path)."""
 
     light_size: Annotated[int, Field(ge=16, le=16384)] | Literal["auto"] = Field(
         default="auto", description="texels of the baked light's side; auto: about one a pixel"
@@ -132,20 +134,8 @@ class SelectSettings(Strict):
 
     budget: int = Field(default=25, ge=1, description="views to ray-trace")
     policy: PolicyName = Field(default="auto", description="how they are chosen (docs/method.md)")
-    weights: str = Field(
-        default="", description="file of `dnrpipe train-selector` for policy dqn; empty: the shipped one"
-    )
-    rounds: int = Field(
-        default=1, ge=1, description="2 or more: trace a part, look where the base image is wrong, choose the rest"
-    )
     seed: int = Field(default=0, ge=0)
     step1: Step1Settings = Step1Settings()
-    active: ActiveSettings = ActiveSettings()
-
-    @field_validator("policy", mode="before")
-    @classmethod
-    def _in_full(cls, value: Any) -> Any:
-        return full_name(value) if isinstance(value, str) else value
 
 
 class FinetuneSettings(Strict):
@@ -248,41 +238,46 @@ def resolve(
     preset: str | None,
     overrides: Mapping[str, Any],
     *,
-    toml_files: list[Path] | None = None,
-    environment: Mapping[str, str] | None = None,
+    toml_files: Sequence[Path] = (),
+    environment: Mapping[str, str] = os.environ,
 ) -> Settings:
-    """Layer preset < toml files (in order) < environment < overrides, and validate.
+    """Layer preset < TOML files (in order) < environment < overrides, and validate.
 
-    ``overrides`` and the files are nested dicts. A preset named in a later layer replaces the earlier
-    one. Raises UserError naming the layer and the key.
+    Args:
+        preset: its name; None: the one that the latest layer names, else draft.
+        overrides: nested dict of what the flags say.
+        toml_files: later ones win.
+        environment: variables such as ``DNRPIPE_FINETUNE__STEP2__EPOCHS=20``.
+
+    Raises:
+        UserError: names the layer and the key, or the key and the value.
     """
-    environment = os.environ if environment is None else environment
-    layers: list[tuple[str, dict[str, Any]]] = []
-    for path in toml_files or []:
-        try:
-            layers.append((str(path), tomllib.loads(path.read_text(encoding="utf-8"))))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise UserError(f"{path}: not valid TOML ({error})") from None
-    layers.append(("environment", _from_environment(environment)))
-    layers.append(("flags", dict(overrides)))
-    name = preset
-    for _, layer in layers:
-        name = layer.get("preset", name) if preset is None else preset
-    name = name or "draft"
-    if name not in PRESETS:
-        raise UserError(f"unknown preset '{name}'; choose one of {', '.join(PRESETS)}")
-    merged: dict[str, Any] = {}
-    _merge(merged, PRESETS[name])
+    layers = [(str(path), _read_toml(path)) for path in toml_files]
+    layers += [("environment", _from_environment(environment)), ("flags", overrides)]
+    given: dict[str, Any] = {}
     for source, layer in layers:
         _check_keys(source, layer, Settings)
-        _merge(merged, layer)
-    merged["preset"] = name
+        given = merge(given, layer)
+    name = str(preset or given.get("preset") or "draft")
+    if name not in PRESETS:
+        raise UserError(f"unknown preset '{name}'; choose one of {', '.join(PRESETS)}")
     try:
-        return Settings.model_validate(merged)
+        return Settings.model_validate({**merge(PRESETS[name], given), "preset": name})
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         raise UserError(f"setting {where}: {first['msg'].lower()}, got {first['input']!r}") from None
+
+
+def merge(base: Mapping[str, Any], extra: Mapping[str, Any]) -> dict[str, Any]:
+    """``base`` with ``extra`` merged into a copy, recursively."""
+    result = dict(base)
+    for key, value in extra.items():
+        if isinstance(value, Mapping):
+            below = result.get(key)
+            value = merge(below if isinstance(below, Mapping) else {}, value)
+        result[key] = value
+    return result
 
 
 def parse_assignment(text: str) -> dict[str, Any]:
@@ -290,49 +285,32 @@ def parse_assignment(text: str) -> dict[str, Any]:
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         raise UserError(f"--set {text!r}: expected KEY=VALUE, e.g. --set finetune.step2.epochs=20")
-    return _nest(key.strip().split("."), _toml_value(value.strip()))
+    return _nest(key.strip().split("."), value.strip())
 
 
-def merge(base: dict[str, Any], extra: Mapping[str, Any]) -> dict[str, Any]:
-    """``base`` with ``extra`` merged into a copy, recursively."""
-    result: dict[str, Any] = {}
-    _merge(result, base)
-    _merge(result, extra)
-    return result
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: not valid TOML ({error})") from None
 
 
 def _from_environment(environment: Mapping[str, str]) -> dict[str, Any]:
     """``DNRPIPE_FINETUNE__STEP2__EPOCHS=20`` -> nested dict."""
     result: dict[str, Any] = {}
     for name, value in sorted(environment.items()):
-        if name == "DNRPIPE_PRESET":
-            result["preset"] = value
-        elif name.startswith(ENVIRONMENT_PREFIX) and name not in ENVIRONMENT_OTHER:
-            _merge(result, _nest(name.removeprefix(ENVIRONMENT_PREFIX).lower().split("__"), _toml_value(value)))
+        if name.startswith(ENVIRONMENT_PREFIX) and name not in ENVIRONMENT_OTHER:
+            result = merge(result, _nest(name.removeprefix(ENVIRONMENT_PREFIX).lower().split("__"), value))
     return result
 
 
-def _toml_value(text: str) -> Any:
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
-
-
-def _nest(keys: list[str], value: Any) -> dict[str, Any]:
+def _nest(keys: list[str], text: str) -> dict[str, Any]:
+    value: Any = text
+    with suppress(tomllib.TOMLDecodeError):
+        value = tomllib.loads(f"value = {text}")["value"]
     for key in reversed(keys):
         value = {key: value}
     return value
-
-
-def _merge(target: dict[str, Any], extra: Mapping[str, Any]) -> None:
-    for key, value in extra.items():
-        if isinstance(value, Mapping):
-            branch = target.get(key)
-            target[key] = dict(branch) if isinstance(branch, dict) else {}
-            _merge(target[key], value)
-        else:
-            target[key] = value
 
 
 def _check_keys(source: str, layer: Mapping[str, Any], model: type[Strict], prefix: str = "") -> None:
@@ -346,6 +324,3 @@ def _check_keys(source: str, layer: Mapping[str, Any], model: type[Strict], pref
             if not (isinstance(nested, type) and issubclass(nested, Strict)):
                 raise UserError(f"{source}: setting '{prefix}{key}' is a single value, not a table")
             _check_keys(source, value, nested, f"{prefix}{key}.")
-
-
-__all__ = ["PRESETS", "LossWeights", "Settings", "merge", "parse_assignment", "resolve"]

@@ -1,8 +1,7 @@
-"""The effect plan of a workspace: made from ``scene/``, kept in ``scene/effects.json``, carried out by the tracer."""
+"""The effect plan of a workspace: made from ``scene/``, kept in ``scene/effects.json``, followed by the tracer."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,16 +11,13 @@ from dnrtrain.atomic import write_json
 from dnrtrain.contract import read_cameras
 
 from ..core.cameras import scaled_to, view_lenses
-from ..core.console import Console
 from ..core.effect_names import EffectName
 from ..core.errors import UserError
-from ..core.ledger import CostRecord
 from ..core.scene_files import read_json, read_summary, scene_fingerprint
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest
 from ..raytrace.statistics import REFERENCE_DEPTH, Measured
 from ..raytrace.variants import VariantChoice, choose_variant
-from ..workers.processes import Retry, run_tasks
 from .bundle import bundle_facts, write_without
 from .plan import DepthPilot, EffectPlan, plan_effects
 
@@ -59,23 +55,10 @@ def plan_of(
     stored = _stored(workspace)
     if plan.max_depth is None:
         if pilot is None and stored is not None and stored.pilot is not None:
-            fits = stored.pilot.fingerprint == _pilot_print(workspace, settings, plan)
+            fits = stored.pilot.fingerprint == pilot_fingerprint(workspace, settings, plan)
             pilot = stored.pilot if fits else None
         plan = plan if pilot is None else plan_effects(**arguments, pilot=pilot)
     return plan if stored is None else _with_measurements(plan, stored)
-
-
-def resolve_plan(workspace: Workspace, settings: Settings, console: Console, run_id: str, stage: Any) -> EffectPlan:
-    """The whole plan: runs the path depth pilot where the plan needs it, and writes ``scene/effects.json``."""
-    plan = plan_of(workspace, settings)
-    if plan.max_depth is None:
-        pilot = _run_pilot(workspace, settings, plan, console, run_id, stage)
-        keep_plan(workspace, plan.model_copy(update={"pilot": pilot}))
-        plan = plan_of(workspace, settings)
-        assert plan.max_depth is not None
-        console.say(f"path depth {plan.max_depth}: {plan.effect('indirect').evidence[0].partition(': ')[2]}")
-    keep_plan(workspace, plan)
-    return plan
 
 
 def keep_plan(workspace: Workspace, plan: EffectPlan) -> None:
@@ -135,7 +118,8 @@ def pilot_views(workspace: Workspace, settings: Settings, plan: EffectPlan) -> l
     ]
 
 
-def _pilot_print(workspace: Workspace, settings: Settings, plan: EffectPlan) -> str:
+def pilot_fingerprint(workspace: Workspace, settings: Settings, plan: EffectPlan) -> str:
+    """Hash of all that the path depth pilot measures."""
     chosen = settings.effects
     return digest(
         [
@@ -150,92 +134,13 @@ def _pilot_print(workspace: Workspace, settings: Settings, plan: EffectPlan) -> 
     )
 
 
-def _run_pilot(
-    workspace: Workspace, settings: Settings, plan: EffectPlan, console: Console, run_id: str, stage: Any
-) -> DepthPilot:
-    choice = variant_for(plan, settings)
-    views = pilot_views(workspace, settings, plan)
-    chosen = settings.effects
-    task = {
-        "kind": "depth",
-        "config": trace_config(workspace, plan, choice.variant),
-        "views": views,
-        "spp": PILOT_SPP,
-        "tolerance": chosen.tolerance,
-        "pixel_tolerance": chosen.pixel_tolerance,
-    }
-    (answer,) = run_pilots(workspace, [task], choice, console, "path depth pilot", stage)
-    workspace.ledger.append(
-        CostRecord(
-            time=time.time(),
-            run=run_id,
-            stage=stage,
-            purpose="training",
-            unit="scene",
-            name="path depth pilot",
-            seconds=answer["seconds"],
-            cpu_seconds=answer["cpu_seconds"],
-            device=f"mitsuba {choice.variant}",
-            detail={"max_depth": answer["max_depth"], "spp": answer["spp"]},
-        )
-    )
-    return DepthPilot(
-        fingerprint=_pilot_print(workspace, settings, plan),
-        max_depth=answer["max_depth"],
-        reference_depth=REFERENCE_DEPTH,
-        tolerance=chosen.tolerance,
-        pixel_tolerance=chosen.pixel_tolerance,
-        views=len(views),
-        resolution=PILOT_RESOLUTION,
-        spp=answer["spp"],
-        seconds=answer["seconds"],
-        steps=answer["steps"],
-    )
-
-
-def run_pilots(
-    workspace: Workspace,
-    tasks: list[dict[str, Any]],
-    choice: VariantChoice,
-    console: Console,
-    label: str,
-    stage: str,
-) -> list[dict[str, Any]]:
-    """Run pilot tasks, each in a process of its own (bundles add up in memory); answers in the tasks' order.
-
-    Raises UserError when one fails twice.
-    """
-    answers: list[dict[str, Any]] = []
-    log = workspace.log(stage)
-    with console.bar(label, len(tasks)) as bar:
-        for task in tasks:
-            common = {"configs": [task[key] for key in ("config", "with", "without") if key in task]}
-            outcomes = run_tasks(
-                "dnrpipe.raytrace.pilot", common, [task], workers=1, log=log, environment=choice.environment
-            )
-            try:
-                for outcome in outcomes:
-                    if isinstance(outcome, Retry):
-                        console.warn(f"{label}: {outcome.reason}; trying once more")
-                    elif outcome.result is None:
-                        raise UserError(f"{label}: {outcome.error}; see {log}")
-                    else:
-                        answers.append(outcome.result)
-                        if lost := outcome.result["masked"]:
-                            console.warn(f"repaired: {lost} pixels of {label} pictures were not finite and are black")
-            finally:
-                outcomes.close()  # type: ignore[attr-defined]
-            bar.advance()
-    return answers
-
-
 def _stored(workspace: Workspace) -> EffectPlan | None:
     path = workspace.scene / FILE
     if not path.exists():
         return None
     try:
         return EffectPlan.model_validate(read_json(path))
-    except (ValidationError, UserError):  # of another version, or torn: the plan is made again
+    except (ValidationError, UserError):  # of another version, or damaged: the plan is made again
         return None
 
 

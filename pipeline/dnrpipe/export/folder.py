@@ -1,4 +1,4 @@
-"""The folder that an export writes: taken only where nothing of the user's is lost."""
+"""The folder that an export writes; an export never overwrites files of the user's."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ MARKER = ".dnrpipe-export"
 
 
 def claim(folder: Path, kind: str) -> None:
-    """Make ``folder``, or take it over from an earlier export of the same kind.
+    """Make `folder`, or take it over from an earlier export of the same kind.
 
-    Raises UserError: it is a file, or holds anything that such an export did not write.
+    Raises UserError: it is a file, or holds files that no such export wrote.
     """
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder}: is a file; name a folder with --out")
@@ -32,7 +32,7 @@ def claim(folder: Path, kind: str) -> None:
 
 
 def finish(folder: Path, kind: str, files: Collection[Path]) -> None:
-    """Note what was written, and remove what the export before had and this one has not."""
+    """List the files written, and remove those that only the earlier export has."""
     names = sorted(path.relative_to(folder).as_posix() for path in files)
     marker = folder / MARKER
     before = marker.read_text(encoding="utf-8").splitlines()[1:]

@@ -1,4 +1,4 @@
-"""`dnrpipe export-gltf`: the meshes with their atlas coordinates, and what they send back diffusely as a texture.
+"""`dnrpipe export-gltf`: the meshes with their atlas coordinates, and their diffuse outgoing light as a texture.
 
 glTF 2.0, binary (.glb), right-handed, Y up: a point (x, y, z) of the .blend is written as (x, z, -y). TEXCOORD_0 is
 the scene atlas, TEXCOORD_1 the artist's own layer where the bundle has it; glTF counts V downwards, so V becomes 1 - V.
@@ -52,7 +52,7 @@ def export_gltf(workspace: Workspace, out: Path, console: Console, *, light: boo
 
 
 def light_picture(workspace: Workspace, console: Console) -> np.ndarray:
-    """What the atlas's fronts send back and emit, in display space: uint8 [n, n, 3], row 0 at V = 1."""
+    """Diffuse outgoing and emitted light of the atlas's fronts, display space: uint8 [n, n, 3], row 0 at V = 1."""
     import torch
 
     from dnrtrain.display import DisplayTransform

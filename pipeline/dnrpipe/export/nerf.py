@@ -25,9 +25,8 @@ from dnrtrain.exr import read_exr
 
 from ..core.console import Console
 from ..core.errors import UserError
-from ..core.scene_files import read_frame, split_views
+from ..core.scene_files import read_frame, read_selection, split_views
 from ..core.workspace import Workspace
-from ..stages.trainer import read_selection
 from .folder import claim, finish
 
 POINTS = 100_000
@@ -118,7 +117,7 @@ def raytraced_views(workspace: Workspace) -> dict[str, list[View]]:
     """
     cameras = split_views(workspace)
     by_name = {view.name: view for view in cameras["train"]}
-    chosen = [by_name[name] for name in read_selection(workspace)["views"] if name in by_name]
+    chosen = [by_name[name] for name in read_selection(workspace).views if name in by_name]
     missing = [view.name for view in chosen if not workspace.raytraced("train", view.name).is_file()]
     if missing or not chosen:
         raise UserError(

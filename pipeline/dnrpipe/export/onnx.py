@@ -25,17 +25,17 @@ if TYPE_CHECKING:
     from dnrtrain.model import DNR
 
 TOLERANCE = 1e-3
-"""Largest difference from torch that is let pass: a quarter of an 8-bit step. Display space."""
+"""Largest difference from torch that passes: a quarter of an 8-bit step. Display space."""
 CHECKED = 3
-"""Views that are compared; the last is also compared at an odd size, since the file promises any."""
+"""Views to compare; the last also at an odd size, since the file promises any."""
 ODD = (61, 45)
 
 
 def export_onnx(workspace: Workspace, out: Path, console: Console) -> dict[str, Any]:
-    """Write the fine-tuned model to ``out``, compare it with torch by onnxruntime, and return what was found.
+    """Write the fine-tuned model to `out`, compare it with torch by onnxruntime, and return the differences.
 
-    Nothing is left at ``out`` where the two differ by more than TOLERANCE: that is a UserError, as are a missing model
-    and views without files.
+    Raises UserError: no model, views without files, or the two differ by more than TOLERANCE; then `out` is not
+    written.
     """
     from dnrtrain import onnx_export
     from dnrtrain.checkpoint import load_model

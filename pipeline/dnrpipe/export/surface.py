@@ -1,4 +1,4 @@
-"""What a rasteriser shows of the scene: the light that the atlas sends back diffusely, as textures."""
+"""The diffuse outgoing light of the atlas as textures, for rasterisers."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ..core.console import Console
 from ..core.errors import UserError
 from ..core.workspace import Workspace
 from ..raytrace.variants import choose_variant
-from ..workers.processes import Retry, run_tasks
+from ..workers.answers import only_answer
 
 SAMPLES = 16
 """Points per texel."""
@@ -23,8 +23,8 @@ FINER = 2
 
 @dataclass(frozen=True)
 class SurfaceMaps:
-    """radiance: float32 [2, n, n, 4] (front, back): linear Rec.709, what the texel sends back diffusely and emits;
-    opacity. normal: float32 [n, n, 3], the triangles', world space. Row 0 at V = 0. thin: backs can be seen."""
+    """radiance: float32 [2, n, n, 4] (front, back): diffuse outgoing and emitted light of the texel, linear Rec.709;
+    opacity. normal: float32 [n, n, 3], the triangles', world space. Row 0 at V = 0. thin: backs are visible."""
 
     radiance: np.ndarray
     normal: np.ndarray
@@ -44,19 +44,17 @@ def surface_maps(workspace: Workspace, console: Console) -> SurfaceMaps:
     with tempfile.TemporaryDirectory(prefix="dnrpipe-") as folder, console.bar("surface maps", 1) as bar:
         task = {"output": str(Path(folder) / "maps.npz"), "size": size, "samples": SAMPLES, "seed": 0}
         common = {"bundle": str((workspace.scene / "scene.xml").resolve()), "variant": choice.variant}
-        log = Path(folder) / "worker.log"
-        outcomes = run_tasks(
-            "dnrpipe.raytrace.surface_maps", common, [task], workers=1, log=log, environment=choice.environment
+        result = only_answer(
+            "surface maps",
+            "dnrpipe.raytrace.surface_maps",
+            common,
+            task,
+            log=Path(folder) / "worker.log",
+            console=console,
+            environment=choice.environment,
         )
-        for outcome in outcomes:
-            if isinstance(outcome, Retry):
-                console.warn(f"surface maps: {outcome.reason}; trying once more")
-            elif outcome.result is None:
-                raise UserError(f"surface maps failed twice: {outcome.error}")
-            elif outcome.result["lost"]:
-                console.warn(
-                    f"repaired: {outcome.result['lost']} samples of the surface maps were not finite and are left out"
-                )
+        if lost := result["lost"]:
+            console.warn(f"repaired: {lost} samples of the surface maps were not finite and are left out")
         bar.advance(note=f"{size}² texels")
         with np.load(task["output"], allow_pickle=False) as data:
             maps = {name: data[name] for name in data.files}

@@ -2,9 +2,9 @@
 
 index.html, viewer.js   the page
 scene.json              cameras, sizes, display figures
-scene.glb               meshes with atlas coordinates (see :mod:`.gltf`)
+scene.glb               meshes with atlas coordinates (see `gltf`)
 light-front.bin, -back  what surfaces send back diffusely: RGBA float16 [n, n, 4], row 0 at V = 0, A = opacity
-model.onnx              the network (see :mod:`.web_model`)
+model.onnx              the network (see `web_model`)
 ort/                    onnxruntime-web and its licence
 offline.js              all of the above once more as text: pages opened from disk may not read files
 """
@@ -25,10 +25,9 @@ from dnrtrain.contract import View
 
 from .. import __version__
 from ..core.console import Console
-from ..core.scene_files import read_frame, read_json
+from ..core.scene_files import read_frame, read_json, read_selection
 from ..core.workspace import Workspace
 from ..stages.session import resolve_settings
-from ..stages.trainer import read_selection
 from .browser import require_chromium
 from .folder import claim, finish
 from .gltf import glb
@@ -52,10 +51,19 @@ def export_web(
 ) -> dict[str, Any]:
     """Train the page's network, write the folder, and measure the network on the held-out views (by torch).
 
-    check: also open the page in a browser (:mod:`.web_check`).
+    Args:
+        workspace: with baked light and ray-traced views.
+        out: the folder, new or an earlier export of the same kind.
+        console: for progress.
+        epochs: of training; None: 40, more for few views.
+        check: also open the page in a browser (`web_check`).
 
-    Raises UserError: no baked light, no ray-traced views, no npm, or a folder that is not ours to write; with ``check``
-    also no Chromium.
+    Returns:
+        folder, bytes, the figures of `held_out`, and with `check` those of `check_page`.
+
+    Raises:
+        UserError: no baked light, no ray-traced views, no npm, or a folder that is not ours to write; with `check`
+            also no Chromium.
     """
     from dnrtrain import onnx_export
 
@@ -133,7 +141,7 @@ def _scene(workspace: Workspace, views: dict[str, list[View]], maps: SurfaceMaps
         "quality": quality,
         "start": first.model_dump(mode="json"),
         "distance": float(np.median([np.linalg.norm(view.position - frame.center) for view in views["train"]])),
-        "trained_on": len(read_selection(workspace)["views"]),
+        "trained_on": len(read_selection(workspace).views),
     }
 
 

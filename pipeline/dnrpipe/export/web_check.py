@@ -1,4 +1,4 @@
-"""The page in a browser against torch: the same cameras, the page's own inputs, its own pictures."""
+"""Compares the page in a browser with torch: same cameras, same inputs."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ import numpy as np
 from dnrtrain.contract import View
 
 from ..core.console import Console
-from .browser import browser
+from .browser import open_page, wait_for
 
 if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
     from dnrtrain.dataset import ViewSet
     from dnrtrain.model import DNR
 
@@ -25,13 +27,20 @@ CHANNELS = {"uv": 2, "mask": 1, "coverage": 1, "view_dir": 3, "normal": 3, "base
 def check_page(out: Path, views: Sequence[View], data: ViewSet, model: DNR, console: Console) -> dict[str, Any]:
     """Open ``out/index.html`` from disk in a headless Chromium (software GL) and render the views.
 
-    data: the same views by their files (:func:`.web_model.web_views`), with ray-traced targets.
+    Args:
+        out: the exported folder.
+        views: their cameras.
+        data: the same views by their files (`web_model.web_views`), with ray-traced targets.
+        model: the page's network.
+        console: for progress.
 
-    Returns means over the views, dB: ``psnr_torch``, the page's picture against torch on the inputs that the page
-    drew; ``psnr_files``, against torch on Blender's G-buffers; ``psnr_truth``, against the ray-traced view; also the
-    share of pixels whose mask agrees with Blender's, and milliseconds by stage.
+    Returns:
+        Means over the views, dB: `psnr_torch`, the page's picture against torch on the inputs that the page drew;
+        `psnr_files`, against torch on Blender's G-buffers; `psnr_truth`, against the ray-traced view; also
+        `mask_agrees`, the share of pixels whose mask agrees with Blender's, and milliseconds by stage.
 
-    Raises UserError: no Chromium, or the page failed in it.
+    Raises:
+        UserError: no Chromium, or the page failed in it.
     """
     import torch
 
@@ -41,15 +50,15 @@ def check_page(out: Path, views: Sequence[View], data: ViewSet, model: DNR, cons
     assert data.target is not None
     expected = render_views(model, data)
     rows: list[dict[str, float]] = []
-    with browser() as tab, console.bar("views in Chromium", len(views)) as bar:
-        tab.open((out.resolve() / "index.html").as_uri())
-        tab.evaluate("window.dnr.then(() => true)")
+    address = (out.resolve() / "index.html").as_uri()
+    with open_page(address) as (page, _), console.bar("views in Chromium", len(views)) as bar:
+        wait_for(page, "window.dnr.then(() => true)")
         for index, view in enumerate(views):
-            page = probe(tab, view)
-            batch = page_batch(data.batch([index]), page)
+            drawn = probe(page, view)
+            batch = page_batch(data.batch([index]), drawn)
             with torch.no_grad():
                 same = model(batch).rgb.clamp(0.0, 1.0)
-            shown = torch.from_numpy(page["rgb"])[None]
+            shown = torch.from_numpy(drawn["rgb"])[None]
             rows.append(
                 {
                     "psnr_torch": float(psnr(shown, same)),
@@ -59,27 +68,27 @@ def check_page(out: Path, views: Sequence[View], data: ViewSet, model: DNR, cons
                 }
             )
             bar.advance(note=f"{rows[-1]['psnr_torch']:.1f} dB")
-        figures = tab.evaluate("window.dnr.then(page => page.figures())")
+        figures = wait_for(page, "window.dnr.then(page => page.figures())")
     means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     return {**means, "views": len(rows), **{k: v for k, v in figures.items() if k not in ("fps", "frames")}}
 
 
-def probe(tab: Any, view: View) -> dict[str, np.ndarray]:
-    """What the page draws and renders of a view: its inputs and ``rgb``, float32 [C, H, W] each."""
-    answer = tab.evaluate(f"window.dnr.then(page => page.probe({json.dumps(view.model_dump(mode='json'))}))")
+def probe(page: Page, view: View) -> dict[str, np.ndarray]:
+    """What the page draws and renders of a view: its inputs and `rgb`, float32 [C, H, W] each."""
+    answer = wait_for(page, f"window.dnr.then(page => page.probe({json.dumps(view.model_dump(mode='json'))}))")
     return {
         name: np.frombuffer(base64.b64decode(answer[name]), "<f4").reshape(count, view.height, view.width).copy()
         for name, count in CHANNELS.items()
     }
 
 
-def page_batch(batch: Any, page: dict[str, np.ndarray]) -> Any:
-    """``batch`` (one view) with the page's inputs in place of those from files."""
+def page_batch(batch: Any, drawn: dict[str, np.ndarray]) -> Any:
+    """`batch` (one view) with the page's inputs instead of those from files."""
     from dataclasses import replace
 
     import torch
 
-    maps = {name: torch.from_numpy(image)[None] for name, image in page.items()}
+    maps = {name: torch.from_numpy(image)[None] for name, image in drawn.items()}
     mask = (maps["mask"] > 0.5).float()
     return replace(
         batch,

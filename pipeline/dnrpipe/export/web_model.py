@@ -1,8 +1,8 @@
 """The network of the page: the default one, over a base image that a browser can draw.
 
-A browser has no ray tracer, so its base image is the light that surfaces send back diffusely (:mod:`.surface`), looked
-up once a pixel; mirrors, glass and highlights are the network's to learn. The workspace's own network was trained over
-more than that and would be wrong over less: this one is trained anew, on the same ray-traced views.
+A browser has no ray tracer, so its base image is the diffuse outgoing light of the surfaces (`surface`), looked up once
+a pixel; the network learns mirrors, glass and highlights. The workspace's own network corrects a richer base image and
+would be wrong over this one, so the export trains another on the same ray-traced views.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 STEPS = 1500
-"""Of training at least, whatever the number of views."""
+"""Training takes at least so many, whatever the number of views."""
 
 
 def web_settings(settings: Settings, views: int, epochs: int | None) -> tuple[ModelSettings, Step2Settings]:
@@ -76,7 +76,7 @@ def base_images(views: Batch, maps: SurfaceMaps) -> Any:
 
 
 def half(image: np.ndarray) -> np.ndarray:
-    """Rounded to the texture's format, 16-bit floats; brighter than they can say is as bright as they can."""
+    """Round to the texture's format, 16-bit floats; clip what is brighter than their maximum."""
     return np.clip(image, 0, 65504).astype(np.float16).astype(np.float32)
 
 
@@ -89,17 +89,17 @@ def train(
     folder: Path,
     epochs: int | None,
 ) -> DNR:
-    """Train the page's network in ``folder``, or go on where an earlier call was stopped; float32 for inference."""
+    """Train the page's network in `folder`, or resume an interrupted training; float32 for inference."""
     from dnrtrain.checkpoint import load_model
     from dnrtrain.step2 import run_step2
 
     model, step2 = web_settings(settings, len(views), epochs)
     data = web_views(workspace, views, "train", maps)
     weights = perceptual_weights(console)
-    stamp = digest([float(maps.radiance.sum(dtype=np.float64)), [view.model_dump(mode="json") for view in views]])
+    fingerprint = digest([float(maps.radiance.sum(dtype=np.float64)), [view.model_dump(mode="json") for view in views]])
     events = run_step2(
         data, None, folder, model, step2,
-        seed=settings.finetune.seed, device=torch_device(settings), checkpoints=folder, fingerprint=stamp,
+        seed=settings.finetune.seed, device=torch_device(settings), checkpoints=folder, fingerprint=fingerprint,
         weights=weights,
     )  # fmt: skip
     done, _ = epochs_done(folder, step2.epochs, False)

@@ -27,7 +27,7 @@ class Worker:
     """Loads the bundle once.
 
     common: as of :class:`.tracer.Worker`. task: as there, without "spp", and with
-        "samples", "samples_print": path and fingerprint of what is traced so far
+        "samples", "samples_fingerprint": path and fingerprint of what is traced so far
         "add": samples per pixel to add, a multiple of GROUPS; 0: write "output"
         "goal": what was asked for and what ended it, for the file's metadata
     """
@@ -39,7 +39,7 @@ class Worker:
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
         view = View.model_validate(task["view"])
-        samples = read_samples(Path(task["samples"]), task["samples_print"], view.height, view.width)
+        samples = read_samples(Path(task["samples"]), task["samples_fingerprint"], view.height, view.width)
         return self._add(task, view, samples) if task["add"] else self._write(task, view, samples)
 
     def _add(self, task: dict[str, Any], view: View, samples: Samples) -> dict[str, Any]:

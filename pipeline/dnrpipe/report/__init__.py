@@ -1,4 +1,4 @@
-"""The report: one self-contained HTML file that says what came out, how good it is and what it cost.
+"""The report: one self-contained HTML file with the result, its quality and its cost.
 
     workspace files -> collect.py -> ReportData -> render.py -> report/report.html (+ report.json)
 
@@ -9,17 +9,13 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from .data import ReportData
 
 
 def build_report(workspace_dir: Path, *, made_at: datetime | None = None) -> Path:
-    """Write ``report/report.html`` and ``report/report.json`` (the same figures, for machines).
+    """Write `report/report.html` and `report/report.json` (the same figures, for machines).
 
-    Whatever stages have run is shown; the rest is named with the command that makes it. Returns the path
-    of the HTML file. ``made_at``: the date shown, now (UTC) when None.
+    It shows the stages that have run, and names the commands for the rest. Returns the path of the HTML file.
+    made_at: the date shown, now (UTC) when None.
 
     Raises:
         UserError: not a workspace, or one of its files is damaged.
@@ -35,20 +31,3 @@ def build_report(workspace_dir: Path, *, made_at: datetime | None = None) -> Pat
     write_text(path, render_html(data))
     write_json(path.with_suffix(".json"), data.figures())
     return path
-
-
-def build_report_data(workspace_dir: Path) -> dict[str, Any]:
-    """The figures of the report as JSON-able values, without pictures. Raises UserError."""
-    from .collect import collect
-
-    return collect(Path(workspace_dir)).figures()
-
-
-def render_html(data: ReportData) -> str:
-    """The page for collected data; see :func:`.render.render_html`."""
-    from .render import render_html as render
-
-    return render(data)
-
-
-__all__ = ["build_report", "build_report_data", "render_html"]

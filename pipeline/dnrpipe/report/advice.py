@@ -1,4 +1,4 @@
-"""What is not made yet, and what to know before trusting the figures."""
+"""The report's missing parts, and its notes on how far to trust the figures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def missing(
     training: Sequence[Training],
     quality: Quality | None,
 ) -> list[Missing]:
-    """Parts of the report that cannot be shown yet, in the order in which to make them."""
+    """Parts of the report whose stages have not run, in the order of the stages."""
     steps = {t.step for t in training}
     due = [
         (not cameras["train"], "cameras and passes", "prepare SCENE"),
@@ -44,7 +44,7 @@ def notes(
     upfront: float | None,
     break_even: int | None,
 ) -> list[str]:
-    """What a reader should know before trusting the figures, one sentence or two each."""
+    """What a reader should know before trusting the figures, one or two sentences each."""
     found = []
     if quality and (text := perceptual_note(quality, manifest.get("settings", {}))):
         found.append(text)

@@ -1,6 +1,6 @@
-"""The producer's part of the report: what it cost, what it bought, what the next minute would buy.
+"""Cost and benefit in the report: what it cost, what it bought, what the next minute would buy.
 
-From ``plan/plan.json`` (`dnrpipe plan`) and ``frontier/results.json`` (`dnrpipe frontier`) where they are there.
+Reads `plan/plan.json` (`dnrpipe plan`) and `frontier/results.json` (`dnrpipe frontier`) where they exist.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from ..studies.frames.ladder import quality_at
 from .data import Budget, FrontierSummary, PlannedRow, Quality
 
 NEXT = 60.0
-"""Seconds of work whose worth is told."""
+"""Seconds of further work that the report weighs."""
 
 
 def build_budget(root: Path, quality: Quality | None, upfront: float | None) -> Budget | None:
-    """None while nothing was spent and nothing is planned."""
+    """The part's sentences; None while nothing was spent and nothing is planned."""
     plan = _read(root / "plan" / "plan.json")
-    frontier = _frontier(root)
+    frontier = _frontier_summary(root)
     if upfront is None and plan is None and frontier is None:
         return None
     psnr = next((row.mean for row in quality.rows if row.key == "psnr"), None) if quality else None
@@ -66,7 +66,7 @@ def _following(plan: dict[str, Any] | None) -> str:
         return "Unknown; `dnrpipe plan` predicts it."
     line = [(row["seconds"]["total"]["expected"], row["psnr"]["expected"]) for row in plan["table"]]
     chosen = plan["chosen"] or plan["settings_default"]
-    now = max(chosen["seconds"]["total"]["expected"], line[0][0])  # nothing is known below the smallest choice
+    now = max(chosen["seconds"]["total"]["expected"], line[0][0])  # the plan knows nothing below its smallest choice
     here, later = quality_at(line, now), quality_at(line, now + NEXT)
     assert here is not None and later is not None  # both lie on the line
     gain = later - here
@@ -127,7 +127,7 @@ def _routes(plan: dict[str, Any] | None) -> list[str]:
     return [re.sub(r" {2,}", " · ", line.strip()) for line in route_lines(plan)]  # columns are the terminal's
 
 
-def _frontier(root: Path) -> FrontierSummary | None:
+def _frontier_summary(root: Path) -> FrontierSummary | None:
     from ..studies.frontier.command import SCHEMA
     from ..studies.frontier.words import verdict
 
@@ -144,7 +144,7 @@ def _frontier(root: Path) -> FrontierSummary | None:
 
 
 def _read(path: Path) -> dict[str, Any] | None:
-    """A file of an optional part; None where it is missing or torn, which its own command reports."""
+    """A file of an optional part; None if it is missing or damaged, which its own command reports."""
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""Workspace -> :class:`ReportData`: reads what the stages left, computes statistics, notes what is missing."""
+"""Workspace -> `ReportData`: reads the stages' files, computes statistics, lists what is missing."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from dnrtrain.contract import ContractError, SceneFrame, View, read_cameras
+from dnrtrain.records import ModelRecord
+from dnrtrain.records import Selection as SelectionRecord
 
 from ..core.errors import UserError
 from ..core.ledger import CostRecord, Ledger, break_even_frames, summarise, traced_views, upfront_seconds
@@ -35,45 +37,12 @@ STEP_TITLES = {
     1: "Step 1: rasterised images, all candidates",
     2: "Step 2: ray-traced images, chosen views",
 }
-AGENT_TERMS = ("reward", "q")  # booked beside the losses of step 1, but signed and no losses
+AGENT_TERMS = ("reward", "q")  # recorded beside the losses of step 1, but signed and no losses
 Model = TypeVar("Model", bound=BaseModel)
 
 
-class _Selection(BaseModel):
-    """``selection.json``."""
-
-    model_config = ConfigDict(extra="ignore")
-
-    policy: str
-    budget: int
-    seed: int | None = None
-    views: list[str]
-    why: list[str] = Field(default_factory=list)
-    details: dict[str, Any] = Field(default_factory=dict)
-
-
-class _Epoch(BaseModel):
-    """One entry of a checkpoint's history."""
-
-    model_config = ConfigDict(extra="ignore")
-
-    epoch: int
-    losses: dict[str, float | None] = Field(default_factory=dict)
-    val: dict[str, float | None] = Field(default_factory=dict)
-    seconds: float = 0.0
-    skipped: int = 0
-
-
-class _Checkpoint(BaseModel):
-    """``model.json``; the weights themselves are not read."""
-
-    model_config = ConfigDict(extra="ignore")
-
-    history: list[_Epoch] = Field(default_factory=list)
-
-
 class Outline(BaseModel):
-    """What a workspace holds, without pictures: quick enough to ask for while a stage runs.
+    """A workspace's figures without pictures: quick enough to read while a stage runs.
 
     psnr: dB by test view, in the order of the evaluation. costs: see `core.ledger.summarise`.
     """
@@ -88,7 +57,7 @@ def outline(root: Path) -> Outline:
     """Read a workspace's figures. Raises UserError: a file is damaged."""
     views = {split: _read_views(root, split) for split in ("train", "test")}
     metrics = _read_model(root / "evaluation" / "metrics.json", Metrics, "evaluate")
-    chosen = _read_model(root / "selection.json", _Selection, "select")
+    chosen = _read_model(root / "selection.json", SelectionRecord, "select")
     selected = {f"train/{name}" for name in chosen.views} if chosen else None
     return Outline(
         sphere=_sphere(root, views, chosen, metrics),
@@ -110,7 +79,7 @@ def collect(root: Path, *, made_at: datetime | None = None) -> ReportData:
         raise UserError(f"{root}: not a dnrpipe workspace; make one with `dnrpipe prepare SCENE`")
     cameras = {split: _read_views(root, split) for split in ("train", "val", "test")}
     metrics = _read_model(root / "evaluation" / "metrics.json", Metrics, "evaluate")
-    chosen = _read_model(root / "selection.json", _Selection, "select")
+    chosen = _read_model(root / "selection.json", SelectionRecord, "select")
     ledger = Ledger(root / "costs.jsonl")
     records, torn = ledger.read(), ledger.torn_lines()
 
@@ -188,16 +157,18 @@ def _read_views(root: Path, split: str) -> list[View]:
         raise UserError(str(error)) from None
 
 
-def _selection(root: Path, chosen: _Selection, records: Sequence[CostRecord], candidates: Sequence[View]) -> Selection:
+def _selection(
+    root: Path, chosen: SelectionRecord, records: Sequence[CostRecord], candidates: Sequence[View]
+) -> Selection:
     frame = _read_model(root / "scene" / "frame.json", SceneFrame, "prepare")
     try:
         exr = ExrPictures(root, frame) if frame else None
     except ContractError as error:
         raise UserError(str(error)) from None
-    booked = {r.name: r for r in traced_views(records, "training")}
+    tracing = {r.name: r for r in traced_views(records, "training")}
     views = []
     for order, name in enumerate(chosen.views, start=1):
-        record = booked.get(f"train/{name}")
+        record = tracing.get(f"train/{name}")
         views.append(
             ChosenView(
                 order=order,
@@ -225,7 +196,7 @@ def _selection(root: Path, chosen: _Selection, records: Sequence[CostRecord], ca
 
 def _training(root: Path, step: int) -> Training | None:
     checkpoint = _read_model(
-        root / "checkpoints" / f"step{step}" / "model.json", _Checkpoint, ("select", "finetune")[step - 1]
+        root / "checkpoints" / f"step{step}" / "model.json", ModelRecord, ("select", "finetune")[step - 1]
     )
     if checkpoint is None or not checkpoint.history:
         return None
@@ -236,8 +207,7 @@ def _training(root: Path, step: int) -> Training | None:
     for entry in history:
         number = entry.epoch - first + 1
         for term, value in entry.losses.items():
-            if value is not None:
-                curves.setdefault(term, []).append((number, value))
+            curves.setdefault(term, []).append((number, value))
         if (quality := entry.val.get("psnr")) is not None:
             psnr.append((number, quality))
     return Training(
@@ -253,7 +223,7 @@ def _training(root: Path, step: int) -> Training | None:
 
 
 def _sphere(
-    root: Path, cameras: dict[str, list[View]], chosen: _Selection | None, metrics: Metrics | None
+    root: Path, cameras: dict[str, list[View]], chosen: SelectionRecord | None, metrics: Metrics | None
 ) -> Sphere | None:
     shown = [("candidate", view) for view in cameras["train"]] + [("test", view) for view in cameras["test"]]
     if not shown:

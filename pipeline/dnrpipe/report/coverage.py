@@ -1,4 +1,4 @@
-"""Maps on the atlas: which surface the chosen views see, and from how far off the others look at it."""
+"""Maps on the atlas: which surface the chosen views see, and at what angle to the other views."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .data import CoverageMaps, Picture
 from .pictures import encode
 
 LOOKED_AT = 100
-"""Candidates that are read at most, beside the chosen ones, evenly over their list."""
+"""How many candidates are read at most, beside the chosen ones, evenly over their list."""
 SIDE = 256
 FARTHEST = 45.0
 """Degrees at which the scale of angles ends."""
@@ -26,11 +26,11 @@ UNSEEN = (214, 69, 65)
 def coverage_maps(root: Path, candidates: Sequence[View], chosen: Sequence[str]) -> CoverageMaps | None:
     """Read G-buffers of the chosen views and of up to LOOKED_AT other candidates -> two maps of the atlas.
 
-    None where passes are missing (the scene was cleared away, or is being prepared again) or nothing is seen.
+    None if passes are missing (deleted, or not yet prepared again) or the views see nothing.
     """
     others = {view.name: view for view in candidates}
     if not others.keys() >= set(chosen):
-        return None  # cameras were made again after the choice
+        return None  # the cameras are newer than the choice
     picked = [others.pop(name) for name in chosen]
     step = max(1, -(-len(others) // LOOKED_AT))
     views = [*picked, *list(others.values())[::step]]

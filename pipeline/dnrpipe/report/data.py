@@ -1,4 +1,4 @@
-"""What the report shows, as plain data: collected once, drawn by :mod:`.render`, dumped for machines.
+"""What the report shows, as plain data: `collect` fills it, `render` draws it, report.json holds it for machines.
 
 Lengths are in scene units, times in seconds (wall unless said), image metrics in display space.
 ``None`` means "not made yet" or "not measured", never zero.
@@ -27,7 +27,7 @@ class Picture(_Frozen):
 class TestView(_Frozen):
     """Metrics and pictures of one held-out view.
 
-    noise_share: part of the measured squared error that is noise of the reference itself, in [0, 1]
+    noise_share: share of the measured squared error that is the reference's own noise, in [0, 1]
     (10^((psnr − ceiling) / 10)); None where the ceiling was not measured.
     """
 
@@ -75,7 +75,7 @@ class Quality(_Frozen):
     neural_seconds: the network alone; gbuffer_seconds: Blender's passes of such a view (None where the
     ledger has none), or the base image where one is rendered (``based``);
     frame_seconds: both; traced_seconds: path tracing. All per frame, on the wall clock.
-    perceptual: LPIPS weights were there for measuring; trained_with_perceptual: L_p was among the losses.
+    perceptual: the evaluation had LPIPS weights; trained_with_perceptual: L_p was among the losses.
     """
 
     views: list[TestView]
@@ -145,9 +145,9 @@ class CoverageMaps(_Frozen):
 
 
 class Selection(_Frozen):
-    """``selection.json`` and how far its tracing has come.
+    """`selection.json`, and how many of its views are traced.
 
-    trained: whether step 1 was trained on the way. measure: what a policy's gains are counted in.
+    trained: whether step 1 was trained for it. measure: the unit of a policy's gains.
     """
 
     policy: str
@@ -202,13 +202,13 @@ class PlannedRow(_Frozen):
 
 
 class FrontierSummary(_Frozen):
-    """pictures: (what it says, data URI) of each number of frames."""
+    """pictures: (caption, data URI) of each number of frames."""
 
     pictures: list[tuple[str, str]] = Field(repr=False)
 
 
 class Budget(_Frozen):
-    """What a producer wants to know, in sentences. following: what the next minute would buy."""
+    """Cost and benefit, in sentences. following: what the next minute would buy."""
 
     cost: str
     bought: str

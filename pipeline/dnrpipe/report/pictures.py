@@ -22,8 +22,7 @@ THUMBNAIL_SIDE = 192
 def load_png(root: Path, file: str, *, side: int, heat: bool = False) -> Picture | None:
     """An image file of the workspace, reduced to ``side`` pixels if larger; None when there is no such file.
 
-    ``heat``: a one-channel error map is coloured with matplotlib's magma (perceptually uniform, readable in
-    grey); an image that is in colour already stays as it is.
+    heat: colour a one-channel error map with matplotlib's magma (perceptually uniform, readable in grey).
 
     Raises:
         UserError: the file is damaged.

@@ -61,8 +61,8 @@ class Metrics(BaseModel):
 def build_quality(root: Path, metrics: Metrics, records: Sequence[CostRecord]) -> Quality:
     """Statistics over all views; worst, median and best view at full size, the others as thumbnails.
 
-    ``records``: the ledger. Ray tracing and passes are timed by their share of the wall clock: like the
-    network, they then have the whole machine.
+    records: the ledger. Ray tracing and passes count their share of the wall clock, so that they have the whole
+    machine, as the network has.
     """
     ordered = sorted(metrics.views, key=_rank)
     middle = (len(ordered) - 1) // 2
@@ -71,10 +71,10 @@ def build_quality(root: Path, metrics: Metrics, records: Sequence[CostRecord]) -
         _view(root, view, FEATURED_SIDE if index in featured else THUMBNAIL_SIDE) for index, view in enumerate(ordered)
     ]
     names = {f"test/{view.name}" for view in views}
-    booked = [r.wall_seconds for r in traced_views(records, "evaluation", names)]
+    recorded = [r.wall_seconds for r in traced_views(records, "evaluation", names)]
     passes = {r.name: r.wall_seconds for r in records if r.stage == "prepare" and r.name in names}
     timed = [v.seconds_traced for v in views if v.seconds_traced is not None]
-    seconds = booked or timed
+    seconds = recorded or timed
     measured = [v.seconds_neural for v in views if v.seconds_neural is not None]
     neural = metrics.neural_ms / 1000 if metrics.neural_ms is not None else _mean(measured)
     # A base image that is rendered brings its G-buffer along.
@@ -154,7 +154,7 @@ def _row(
 
 
 def perceptual_note(quality: Quality, settings: dict[str, Any]) -> str | None:
-    """What to say when pretrained weights were missing in training or evaluation; None when they were there."""
+    """A note if training or evaluation had no pretrained weights, else None."""
     parts = []
     weight = settings.get("finetune", {}).get("step2", {}).get("loss", {}).get("perceptual", 0.1)
     if not quality.trained_with_perceptual and weight:

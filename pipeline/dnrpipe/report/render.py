@@ -32,9 +32,9 @@ PURPOSE_NAMES = {"training": "training", "evaluation": "evaluation", "inference"
 
 
 def render_html(data: ReportData) -> str:
-    """The page. Every string from the scene is escaped; scripts other than ours are barred by a policy.
+    """The page as HTML: the same bytes for the same data.
 
-    Same data, same bytes.
+    It escapes every string from the scene, and its content security policy allows our script only.
     """
     files = resources.files("dnrpipe.report")
     environment = Environment(

@@ -1,4 +1,4 @@
-"""Numbers as people read them, and the one sentence at the top."""
+"""The report's headline."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from .data import Quality, Selection
 
 
 def verdict(quality: Quality | None, selection: Selection | None) -> str:
-    """What came out, in plain words. Says what is not known yet."""
+    """The result in one sentence; says what is not known yet."""
     if selection is None:
         return "The scene is prepared; no views have been chosen yet."
     chosen = f"{len(selection.views)} of {selection.candidates} candidate views"

@@ -1,4 +1,4 @@
-"""The web application: routes, what their errors look like, and the description (/openapi.json)."""
+"""The web application: routes, error answers, and the description (/openapi.json)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ..core.errors import UserError
 from . import routes_jobs, routes_live, routes_server, routes_workspaces
 from .config import LOOPBACK, ServerConfig
 from .guard import Guard
-from .pruning import keep_pruned
+from .pruning import prune_regularly
 from .queue import QueueFull, WrongState
 from .root import UnknownName
 from .state import State
@@ -30,7 +30,7 @@ def create_app(state: State, token: str | None) -> FastAPI:
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        chores = (state.feed.watch(), state.live.tend(), keep_pruned(state.queue, state.root, state.config))
+        chores = (state.feed.watch(), state.live.close_idle(), prune_regularly(state.queue, state.root, state.config))
         tasks = [asyncio.create_task(chore) for chore in chores]
         yield
         for task in tasks:
@@ -67,7 +67,7 @@ def create_app(state: State, token: str | None) -> FastAPI:
 
 
 def hosts_of(config: ServerConfig) -> set[str]:
-    """Names that requests may address: those of the loopback interface; any where other machines may ask."""
+    """Host names that requests may address: those of the loopback interface; any, if the server has another one."""
     return set(LOOPBACK) if config.loopback else set()
 
 
@@ -92,7 +92,7 @@ async def _invalid(_: Request, error: Exception) -> JSONResponse:
 
 
 def _describe_token(app: FastAPI) -> None:
-    """Say in the description that a token is wanted."""
+    """Add the token to the description."""
     plain = app.openapi
 
     def described() -> dict[str, Any]:

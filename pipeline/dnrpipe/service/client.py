@@ -23,7 +23,6 @@ from pydantic import BaseModel, TypeAdapter
 
 from ..core.errors import UserError
 from .models import (
-    Health,
     Job,
     JobEvent,
     JobPage,
@@ -37,17 +36,17 @@ from .models import (
 )
 
 DEFAULT_SERVER = "http://127.0.0.1:8420"
-PATIENCE = 4.0
-"""Seconds that a server may be away (it is being started again) before that is an error."""
-PAUSE = 0.5
-LONGEST_WAIT = 60.0
-MOST_WAITS = 5
-PIECE = 1 << 20
+RETRY_SECONDS = 4.0
+"""Seconds during which the client retries a server that does not answer (it may be restarting)."""
+RETRY_INTERVAL = 0.5
+MAX_WAIT = 60.0
+MAX_REFUSALS = 5
+CHUNK = 1 << 20
 Answer = TypeVar("Answer", bound=BaseModel)
 
 
 class Refused(UserError):
-    """The server said no; ``status`` is HTTP's."""
+    """The server refused the request; `status` is the HTTP status."""
 
     def __init__(self, status: int, message: str) -> None:
         super().__init__(message)
@@ -55,9 +54,9 @@ class Refused(UserError):
 
 
 class Client:
-    """Talks to one server. Waits and asks again where it is too busy or cannot be reached for a moment.
+    """Talks to one server; retries when it is busy or does not answer.
 
-    Raises UserError: cannot be reached, or (Refused) says no.
+    Raises UserError: the server does not answer. Raises Refused: it refuses the request.
     """
 
     def __init__(
@@ -66,9 +65,9 @@ class Client:
         token: str | None = None,
         *,
         timeout: float = 60.0,
-        patience: float = PATIENCE,
+        retry_seconds: float = RETRY_SECONDS,
     ) -> None:
-        self.server, self.patience = server, patience
+        self.server, self.retry_seconds = server, retry_seconds
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         try:
             self._http = httpx.Client(base_url=server, headers=headers, timeout=timeout, verify=_trust())
@@ -84,12 +83,8 @@ class Client:
     def close(self) -> None:
         self._http.close()
 
-    def health(self) -> Health:
-        """Whether server and workers live."""
-        return self._get("/healthz", Health)
-
     def submit(self, request: JobRequest) -> Job:
-        """Queue a job. Sent again after a broken connection it is still one job."""
+        """Queue a job: one job, even if a broken connection makes the client send it again."""
         headers = {"Idempotency-Key": secrets.token_urlsafe(24)}
         return self._read(self._ask("POST", "/jobs", json=request.model_dump(mode="json"), headers=headers), Job)
 
@@ -123,8 +118,8 @@ class Client:
         return self._get(f"/jobs/{job}/logs", LogPage, {"offset": offset})
 
     def events(self, job: int, after: int = 0) -> Iterator[JobEvent]:
-        """The job's events until it has ended; a stream that breaks is taken up where it broke."""
-        last, deadline = after, time.monotonic() + self.patience
+        """The job's events until it has ended; resumes a broken stream where it broke."""
+        last, deadline = after, time.monotonic() + self.retry_seconds
         while True:
             try:
                 for event in self._stream(job, last):
@@ -132,25 +127,25 @@ class Client:
                         return
                     last = event.id
                     yield event
-                    deadline = time.monotonic() + self.patience
+                    deadline = time.monotonic() + self.retry_seconds
             except httpx.TransportError as error:
                 if time.monotonic() > deadline:
                     raise UserError(f"{self.server}: the event stream broke ({error})") from None
-            time.sleep(PAUSE)
+            time.sleep(RETRY_INTERVAL)
 
     def upload(self, path: Path, name: str | None = None, *, sent: Callable[[int], None] | None = None) -> Scene:
-        """Store a scene file on the server; ``sent`` is told the bytes of each piece."""
+        """Store a scene file on the server; calls `sent` with the size of each chunk, bytes."""
 
-        def pieces() -> Iterator[bytes]:
+        def chunks() -> Iterator[bytes]:
             with path.open("rb") as file:
-                while piece := file.read(PIECE):
-                    yield piece
+                while chunk := file.read(CHUNK):
+                    yield chunk
                     if sent is not None:
-                        sent(len(piece))
+                        sent(len(chunk))
 
         headers = {"Content-Length": str(path.stat().st_size), "Content-Type": "application/octet-stream"}
         try:
-            answer = self._http.put(f"/scenes/{name or path.name}", content=pieces(), headers=headers)
+            answer = self._http.put(f"/scenes/{name or path.name}", content=chunks(), headers=headers)
         except httpx.TransportError as error:
             raise UserError(f"{self.server}: the upload of {path} broke ({error}); try again") from None
         return self._read(_checked(answer), Scene)
@@ -191,8 +186,8 @@ class Client:
         return self._read(self._ask("GET", path, params=parameters), model)
 
     def _ask(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """What can be asked twice: everything but uploads. Submissions carry a key."""
-        deadline, turned_away = time.monotonic() + self.patience, 0
+        """Send a request, with retries: safe for everything but uploads, since submissions carry a key."""
+        deadline, refusals = time.monotonic() + self.retry_seconds, 0
         while True:
             try:
                 answer = self._http.request(method, path, **options)
@@ -201,12 +196,12 @@ class Client:
                     raise UserError(
                         f"{self.server}: cannot be reached ({error}); is `dnrpipe serve` running there?"
                     ) from None
-                time.sleep(PAUSE)
+                time.sleep(RETRY_INTERVAL)
                 continue
             wait = answer.headers.get("retry-after", "")
-            if answer.status_code == 429 and wait.isdigit() and turned_away < MOST_WAITS:
-                turned_away += 1
-                time.sleep(min(float(wait), LONGEST_WAIT))
+            if answer.status_code == 429 and wait.isdigit() and refusals < MAX_REFUSALS:
+                refusals += 1
+                time.sleep(min(float(wait), MAX_WAIT))
                 continue
             return _checked(answer)
 
@@ -219,7 +214,7 @@ class Client:
 
 @functools.cache
 def _trust() -> ssl.SSLContext:
-    """The system's certificates, read once: it takes longer than most requests."""
+    """The system's certificates, read once: reading them takes longer than most requests."""
     return ssl.create_default_context()
 
 

@@ -13,12 +13,12 @@ LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
 class ServerConfig(BaseModel):
-    """Limits and devices of a server; handed to its worker processes as JSON.
+    """Limits and devices of a server; its worker processes get it as JSON.
 
     devices: one worker each, "cpu" or "cuda:<n>". rate, burst: requests per second and at once, per client address.
-    streams: event streams and viewers open at once. viewers: workspaces viewed live at once; idle_seconds: when the
-    frame process of one that nobody looks at ends. keep_days, keep_jobs: logs and events of a job that has ended are
-    kept for so long, and of the so many that ended last. limits: of every job, where it asks for no less.
+    streams: event streams and viewers open at once. viewers: workspaces viewed live at once. idle_seconds: after so
+    long without a viewer a frame process ends. keep_days, keep_jobs: the server deletes logs and events of jobs that
+    ended longer ago, or before so many others. limits: upper bounds for every job.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -38,7 +38,7 @@ class ServerConfig(BaseModel):
     idle_seconds: float = Field(default=300.0, gt=0)
     keep_days: float = Field(default=30.0, gt=0, le=36_500)
     keep_jobs: int = Field(default=1000, ge=1)
-    free_disk_mb: int = Field(default=1024, ge=0, description="uploads and jobs are refused below this")
+    free_disk_mb: int = Field(default=1024, ge=0, description="the server refuses uploads and jobs below this")
     limits: Limits = Limits(seconds=24 * 3600.0, disk_mb=50 * 1024)
 
     @property
@@ -55,13 +55,13 @@ def default_devices() -> tuple[str, ...]:
 
 
 def default_memory_mb() -> int | None:
-    """Four fifths of the machine's memory, MiB; None where it cannot be told."""
+    """Four fifths of the machine's memory, MiB; None where the system does not say."""
     if not hasattr(os, "sysconf") or "SC_PHYS_PAGES" not in os.sysconf_names:
         return None
     return int(0.8 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**20)
 
 
 def tightest(job: Limits, server: Limits) -> Limits:
-    """Of each limit the smaller one; None is none."""
+    """The smaller of each pair of limits; None means no limit."""
     pairs = {name: (getattr(job, name), getattr(server, name)) for name in Limits.model_fields}
     return Limits(**{name: min((v for v in pair if v is not None), default=None) for name, pair in pairs.items()})

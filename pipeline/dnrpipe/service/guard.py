@@ -1,9 +1,9 @@
-"""Who may ask, how often and how much: checked before any route sees a request.
+"""Access control and rate limits: checks every request before a route sees it.
 
-The token comes in a header (``Authorization: Bearer ...``; for WebSockets, which browsers give no headers, as the
-subprotocol ``dnrpipe.token.<token>``), is compared in constant time and is never logged. A server on the loopback
-interface needs none, but answers only to the names of that interface and to pages of its own origin: web pages that the
-user visits can neither read nor send anything (DNS rebinding, cross-site requests).
+The token comes in a header (`Authorization: Bearer ...`), or as the subprotocol `dnrpipe.token.<token>` of a WebSocket,
+for which browsers send no headers. The comparison takes constant time, and no log shows the token. A server on the
+loopback interface needs no token, but answers only to the names of that interface and to pages of its own origin: web
+pages that the user visits can neither read nor send anything (DNS rebinding, cross-site requests).
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ HEADERS = {
 
 @dataclass
 class Bucket:
-    """A token bucket: ``rate`` per second, at most ``size`` at once."""
+    """A token bucket: gains `rate` tokens a second, holds at most `size`."""
 
     rate: float
     size: float
@@ -53,7 +53,7 @@ class Bucket:
     updated: float
 
     def take(self, now: float) -> float:
-        """0 when one was there, else the seconds until there is one."""
+        """Take a token: 0 if there is one, else the seconds until there is."""
         self.level = min(self.size, self.level + (now - self.updated) * self.rate)
         self.updated = now
         if self.level >= 1:
@@ -63,18 +63,18 @@ class Bucket:
 
 
 class Buckets:
-    """One bucket per client; the clients that were longest silent are forgotten."""
+    """One bucket per client; drops the clients that were silent for longest."""
 
     def __init__(self, rate: float, size: float) -> None:
         self.rate, self.size = rate, size
         self._buckets: OrderedDict[str, Bucket] = OrderedDict()
 
     def take(self, client: str) -> float:
-        """As :meth:`Bucket.take`."""
+        """Seconds until `client` may ask, 0: now; see `Bucket.take`."""
         return self._bucket(client).take(time.monotonic())
 
     def empty(self, client: str) -> bool:
-        """Whether nothing is left for ``client``; takes nothing."""
+        """Whether the bucket of `client` is empty; takes nothing."""
         bucket = self._bucket(client)
         return bucket.level + (time.monotonic() - bucket.updated) * bucket.rate < 1
 
@@ -89,8 +89,8 @@ class Buckets:
 class Guard:
     """ASGI middleware around the application.
 
-    hosts: names that the Host header may have, without port; empty: any (then there is a token). token: wanted of every
-    request but for the open paths; None: none.
+    hosts: names that the Host header may have, without port; empty: any (then there is a token). token: every request
+    needs it, but for the open paths; None: no token.
     """
 
     def __init__(self, app: ASGIApp, *, hosts: Iterable[str], token: str | None, rate: float, burst: int) -> None:
@@ -140,7 +140,7 @@ class Guard:
             )
 
     def _refusal(self, scope: Scope, headers: dict[str, str]) -> tuple[int, str, dict[str, str]] | None:
-        """(status, one line, headers) when the request is refused."""
+        """(status, one line, headers) if the guard refuses the request, else None."""
         client = _client(scope)
         host = headers.get("host", "")
         if self.hosts and _name_of(host) not in self.hosts:
@@ -167,7 +167,7 @@ class Guard:
         return None
 
     def _bounded(self, scope: Scope, receive: Receive) -> Receive:
-        """A body without a stated length is cut off at the same size; the route then sees a broken request."""
+        """Cut a body without a stated length off at the same size; the route then sees a broken request."""
         if _is_upload(scope) or scope["type"] != "http":
             return receive
         seen = 0
@@ -204,7 +204,7 @@ def _name_of(host: str) -> str:
 
 
 def _is_open(scope: Scope) -> bool:
-    """The dashboard's own files hold no data; it asks for the token itself."""
+    """Whether the path needs no token: the dashboard's files hold no data, and the dashboard asks for the token."""
     path = scope["path"]
     return scope["type"] == "http" and (path in OPEN_PATHS or path.startswith(OPEN_PREFIX))
 

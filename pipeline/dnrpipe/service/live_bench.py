@@ -26,18 +26,18 @@ from .models import NAME_PATTERN
 from .routes_live import unpack
 
 WARM_FRAMES = 40
-"""Frames that are not counted: kernels are compiled, and the pace is found."""
+"""Frames before the measurement: they compile kernels and let the pace settle."""
 TURN = 0.05
 """Radians between two frames."""
 STARTUP_SECONDS = 60.0
 
 
 def bench(workspace: str, server: str | None, *, size: int, seconds: float, console: Console) -> dict[str, Any]:
-    """Orbit for ``seconds``; frames are asked for one at a time, as the viewer in the browser does.
+    """Orbit for `seconds`, and request one frame at a time, as the viewer in the browser does.
 
     Returns frames_per_second, milliseconds (median, 90th percentile, by stage), image sizes and samples seen, the load
-    average, others_share: of the cores' time that went to other processes, and own_cpu_ms: processor time of a frame.
-    Raises UserError.
+    average, others_share: the share of the cores' time that other processes took, and own_cpu_ms: processor time of a
+    frame. Raises UserError.
     """
     with contextlib.ExitStack() as stack:
         if server is None:
@@ -57,7 +57,7 @@ def bench(workspace: str, server: str | None, *, size: int, seconds: float, cons
 
 
 def lines(result: dict[str, Any]) -> list[str]:
-    """What is printed."""
+    """The result as lines of text."""
     stages = ", ".join(f"{name} {value:.0f}" for name, value in result["stages_ms"].items())
     seen = ", ".join(f"{key}: {share:.0%}" for key, share in result["frames_at"].items())
     return [
@@ -135,7 +135,7 @@ def _cpu_times() -> tuple[float, float]:
 
 @contextlib.contextmanager
 def _server(root: Path) -> Iterator[str]:
-    """A server of our own on a free port, for the length of the measurement; its queue is left alone."""
+    """A server on a free port, for the length of the measurement; it gets no jobs."""
     command = [sys.executable, "-m", "dnrpipe.cli", "serve", "--root", str(root), "--port", "0", "--devices", "cpu"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     assert process.stdout is not None

@@ -1,10 +1,10 @@
-"""The frame process: one view at a time, as a picture, in one process that keeps scene, kernels and network.
+"""The frame process: renders one view at a time, and keeps scene, kernels and network between them.
 
-A worker of :mod:`dnrpipe.workers.processes`. What is shown (``mode``):
+A worker of `dnrpipe.workers.processes`. What it renders (`mode`):
 
-    neural      the neural renderer's picture                 base      what it corrects
+    neural      the neural renderer's picture                 base      the base image that it corrects
     normal, depth, uv, albedo, coverage                       the G-buffer
-    reference   path-traced; gets better with every request for the same view
+    reference   path-traced; every request for the same view adds samples
     error       FLIP between neural and reference so far
     nearest     the ray-traced picture of a training view
 """
@@ -36,7 +36,6 @@ from dnrtrain.dataset import view_in_memory
 from dnrtrain.display import DisplayTransform
 from dnrtrain.exr import read_exr
 
-MODES = ("neural", "base", "reference", "error", "normal", "depth", "uv", "albedo", "coverage", "nearest")
 BASE_ONLY = ("base", "albedo")
 
 
@@ -68,7 +67,7 @@ class Worker:
         self.kernels: dict[tuple[int, int], Frames] = {}
         self.renderers: dict[int, BaseRenderer] = {}
         self.traced: tuple[str, np.ndarray, int] | None = None
-        self.repaired = 0  # pixels of the picture at hand that were not finite
+        self.repaired = 0  # pixels of the current picture that were not finite
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
         view, mode = View.model_validate(task["view"]), task["mode"]

@@ -1,4 +1,4 @@
-"""How fine a frame may be while the camera moves: measured, not guessed.
+"""Adapts resolution and samples to measured frame times while the camera moves.
 
 level    share of the side, rays per pixel of the base image (None: the model's own)
 budget   milliseconds that a frame may take
@@ -15,13 +15,14 @@ STEP = 32
 """Sides are multiples of this: the U-Net halves them."""
 SMOOTHING = 0.3
 SLACK = 0.45
-"""A finer level is tried when frames take less than this share of the budget: it costs about twice as much."""
-PATIENCE = 8
+"""Below this share of the budget the pace tries a finer level, which costs about twice as much."""
+MIN_FRAMES = 8
+"""Frames at a level before it may change."""
 
 
 @dataclass
 class Pace:
-    """Chooses a level from how long frames took. The first frame at a level compiles its kernels and does not count."""
+    """Chooses a level by frame times. The first frame at a level compiles its kernels and does not count."""
 
     budget: float = BUDGET
     level: int = START
@@ -34,15 +35,15 @@ class Pace:
         share, samples = LEVELS[self.level]
         return size if share == 1 else max(2 * STEP, round(share * size / STEP) * STEP), samples
 
-    def took(self, size: int, milliseconds: float) -> None:
-        """A moving frame of a view of ``size``² took so long; changes the level where that calls for it."""
+    def record(self, size: int, milliseconds: float) -> None:
+        """Record the time of a moving frame of a view of `size`²; change the level where that calls for it."""
         if (self.level, size) not in self._known:
             self._known.add((self.level, size))
             return
         mean = self._mean
         self._mean = milliseconds if mean is None else mean + SMOOTHING * (milliseconds - mean)
         self._frames += 1
-        if self._frames < PATIENCE:
+        if self._frames < MIN_FRAMES:
             return
         if self._mean > self.budget and self.level + 1 < len(LEVELS):
             self._move(1)

@@ -1,4 +1,4 @@
-"""Frame processes: one per workspace that is being looked at, started when asked for, ended when idle."""
+"""Frame processes: one per workspace that somebody views; they start on demand and end when idle."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from .live_scene import LiveRequest, LiveScene, open_scene
 from .root import ServiceRoot
 
 FRAME_SECONDS = 120.0
-"""The first frame loads the scene and compiles kernels; one that takes longer than this hangs."""
-TEND = 2.0
+"""Timeout of a frame; the first one loads the scene and compiles kernels."""
+IDLE_CHECK = 2.0
 REFERENCE_SPP = 4
 MOST_SPP = 1024
 
 
 class LiveSession:
-    """One workspace's frame process. Frames are made one after the other, on a thread of its own: Linux kills the
-    process when the thread that started it ends."""
+    """One workspace's frame process. One thread starts it and requests all frames: Linux kills the process when the
+    thread that started it ends."""
 
     def __init__(self, scene: LiveScene) -> None:
         self.scene = scene
@@ -38,9 +38,9 @@ class LiveSession:
         self._worker = LocalWorker("dnrpipe.service.live_frames", scene.common, log, scene.environment)
 
     async def frame(self, request: LiveRequest) -> dict[str, Any]:
-        """The answer of the frame process (see :mod:`.live_frames`), with ``nearest``: the training view like this.
+        """The answer of the frame process (see `live_frames`), and `nearest`: the most similar training view.
 
-        Raises UserError: the frame cannot be made; says why.
+        Raises UserError: the frame failed; says why.
         """
         self.used = time.monotonic()
         moving = request.moving and request.mode not in ("nearest", "reference", "error")
@@ -61,19 +61,19 @@ class LiveSession:
         answer = await asyncio.get_running_loop().run_in_executor(self._thread, self._ask, task)
         total = 1000 * (time.perf_counter() - started)
         if moving:
-            self.pace.took(request.size, total)
+            self.pace.record(request.size, total)
         return answer | {"total_ms": round(total, 1), "nearest": nearest.name if nearest else None, "samples": samples}
 
     async def warm(self, request: LiveRequest) -> None:
         """Compile the kernels of moving frames before the camera moves; does nothing after the first time."""
         if not self._warm:
             self._warm = True
-            with contextlib.suppress(UserError):  # told when the frame is asked for
+            with contextlib.suppress(UserError):  # the request for the frame itself reports it
                 await self.frame(request.model_copy(update={"moving": True, "mode": "neural"}))
 
     def _ask(self, task: dict[str, Any]) -> dict[str, Any]:
         reason = ""
-        for _ in range(MAX_ATTEMPTS):  # a process that died is replaced
+        for _ in range(MAX_ATTEMPTS):  # a new process replaces one that died
             try:
                 return self._worker.ask(task, FRAME_SECONDS)
             except (TaskFailed, WorkerDied, OSError, ValueError) as error:
@@ -86,7 +86,7 @@ class LiveSession:
 
 
 class LivePool:
-    """At most ``config.viewers`` sessions; the one that was idle longest makes room for a new one."""
+    """At most `config.viewers` sessions; a new one replaces the one that was idle for longest."""
 
     def __init__(self, config: ServerConfig, root: ServiceRoot) -> None:
         self.config, self.root = config, root
@@ -98,13 +98,13 @@ class LivePool:
 
     @contextlib.asynccontextmanager
     async def session(self, name: str) -> AsyncIterator[LiveSession]:
-        """The workspace's session, a fresh one where its model has changed. Raises UserError, UnknownName."""
+        """The workspace's session; a new one where its model has changed. Raises UserError, UnknownName."""
         path = self.root.workspace(name)
         scene = await asyncio.to_thread(open_scene, path)
         async with self._lock:
             found = self._sessions.get(name)
-            if found is not None and found.scene.stamp != scene.stamp and found.viewers == 0:
-                await self._drop(name)
+            if found is not None and found.scene.fingerprint != scene.fingerprint and found.viewers == 0:
+                await self._end(name)
                 found = None
             if found is None:
                 await self._make_room()
@@ -116,19 +116,19 @@ class LivePool:
             found.viewers -= 1
             found.used = time.monotonic()
 
-    async def tend(self) -> None:
-        """End sessions that nobody has looked at for a while; runs for as long as the server does."""
+    async def close_idle(self) -> None:
+        """End sessions that nobody has viewed for a while; runs for as long as the server does."""
         while True:
-            await asyncio.sleep(TEND)
+            await asyncio.sleep(IDLE_CHECK)
             async with self._lock:
                 for name, session in list(self._sessions.items()):
                     if session.viewers == 0 and time.monotonic() - session.used > self.config.idle_seconds:
-                        await self._drop(name)
+                        await self._end(name)
 
     async def close(self) -> None:
         async with self._lock:
             for name in list(self._sessions):
-                await self._drop(name)
+                await self._end(name)
 
     async def _make_room(self) -> None:
         if len(self._sessions) < self.config.viewers:
@@ -136,7 +136,7 @@ class LivePool:
         idle = [(session.used, name) for name, session in self._sessions.items() if session.viewers == 0]
         if not idle:
             raise UserError(f"{len(self._sessions)} workspaces are being viewed, which is the limit; close one")
-        await self._drop(min(idle)[1])
+        await self._end(min(idle)[1])
 
-    async def _drop(self, name: str) -> None:
+    async def _end(self, name: str) -> None:
         await self._sessions.pop(name).close()

@@ -1,4 +1,4 @@
-"""What a live view needs to know of a workspace, and cameras from what a mouse does."""
+"""What the live viewer needs of a workspace, and its orbit cameras."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ from dnrtrain.contract import View, read_cameras
 
 from ..core.cameras import framing, look_at_view
 from ..core.errors import UserError
-from ..core.scene_files import read_frame, read_summary
+from ..core.scene_files import read_frame, read_selection, read_summary
 from ..core.settings import Settings
 from ..core.workspace import Workspace
 from ..effects.store import plan_of, trace_config, variant_for
-from ..stages.base_images import RENDERED, ready_inputs
+from ..stages.base_images import RENDERED, ready_renderer
 from ..stages.session import resolve_settings
-from ..stages.trainer import read_selection
 
 SIZES = (64, 1024)
 STEEPEST = math.radians(89.0)
@@ -40,7 +39,7 @@ class Orbit(BaseModel):
 
 
 class LiveRequest(BaseModel):
-    """What a viewer asks for. size: pixels of the side at rest; moving: quick is better than fine."""
+    """A viewer's request. size: pixels of the side at rest; moving: quick is better than fine."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -52,10 +51,10 @@ class LiveRequest(BaseModel):
 
 @dataclass(frozen=True)
 class LiveScene:
-    """common, environment: of the frame process. stamp: changes when the model does. hello: told to the viewer."""
+    """common, environment: of the frame process. fingerprint: changes when the model does. hello: the first message."""
 
     root: Path
-    stamp: str
+    fingerprint: str
     common: dict[str, Any]
     environment: dict[str, str]
     hello: dict[str, Any]
@@ -67,28 +66,28 @@ class LiveScene:
     def view(self, camera: Orbit, size: int) -> View:
         """The view of ``camera``, ``size``² pixels."""
         ce = math.cos(camera.elevation)
-        towards = np.array(
+        direction = np.array(
             [ce * math.cos(camera.azimuth), ce * math.sin(camera.azimuth), math.sin(camera.elevation)], np.float64
         )
         target = np.asarray(camera.target, np.float64)
         settings = self.settings.cameras.model_copy(update={"width": size, "height": size})
-        return look_at_view("live", target + camera.distance * towards, target, self.focal * size, settings)
+        return look_at_view("live", target + camera.distance * direction, target, self.focal * size, settings)
 
     def nearest(self, view: View) -> View | None:
-        """The ray-traced training view that is most like ``view``: by place (in scene radii) and direction."""
+        """The ray-traced training view that is most like ``view``: by position (in scene radii) and direction."""
         if not self.training:
             return None
         radius = self.hello["radius"]
 
         def difference(other: View) -> float:
-            place = np.linalg.norm(other.position - view.position) / radius
-            return float(place + 1 - other.matrix[:3, 2] @ view.matrix[:3, 2])
+            distance = np.linalg.norm(other.position - view.position) / radius
+            return float(distance + 1 - other.matrix[:3, 2] @ view.matrix[:3, 2])
 
         return min(self.training, key=difference)
 
 
 def open_scene(root: Path) -> LiveScene:
-    """Read a workspace for viewing. Raises UserError naming what has to run first."""
+    """Read a workspace for viewing. Raises UserError: it cannot be viewed yet; names the stage to run first."""
     workspace = Workspace.open(root)
     record = workspace.manifest.stages.get("finetune")
     if record is None:
@@ -100,15 +99,18 @@ def open_scene(root: Path) -> LiveScene:
     plan = plan_of(workspace, settings)
     choice = variant_for(plan, settings)
     config = trace_config(workspace, plan, choice.variant)
-    base, environment = ready_inputs(workspace, settings) if kind in RENDERED else (None, choice.environment)
+    base, environment = None, choice.environment
+    if kind in RENDERED:
+        renderer = ready_renderer(workspace, settings)
+        base, environment = renderer.common, renderer.environment
     frame, summary = read_frame(workspace), read_summary(workspace)
     radius = float(summary["bounds"]["radius"])
     pixels, distance = framing(summary, settings.cameras, radius)
-    names = set(read_selection(workspace)["views"])
+    names = set(read_selection(workspace).views)
     views = [view for view in read_cameras(workspace.cameras("train")) if view.name in names]
     return LiveScene(
         root=root,
-        stamp=json.dumps([record.output, base, config], sort_keys=True),
+        fingerprint=json.dumps([record.output, base, config], sort_keys=True),
         common={
             "scene": str(workspace.scene),
             "frame": frame.model_dump(mode="json"),

@@ -1,4 +1,4 @@
-"""What goes over the wire: jobs, events, workspaces. The OpenAPI description is made from these."""
+"""Requests and answers of the HTTP interface: jobs, events, workspaces. They define the OpenAPI description."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class _Wire(BaseModel):
 
 
 class Limits(_Wire):
-    """Where a job is stopped; None is the server's own limit.
+    """Limits at which the worker stops a job; None is the server's own limit.
 
     seconds: wall time of one attempt. memory_mb: resident memory of the job's processes together, MiB.
     disk_mb: size of the workspace, MiB.
@@ -41,7 +41,7 @@ class JobRequest(_Wire):
 
     workspace: its name; the folder is ``<root>/<name>.dnr``. scene: an uploaded scene file, for ``run`` and ``prepare``
     of a workspace that is not there yet. settings: as ``--set``, by dotted key. priority: larger goes first.
-    retries: how often a job whose process crashed is put back into the queue by itself.
+    retries: how often the queue starts a job again whose process crashed.
     """
 
     command: Command
@@ -58,11 +58,10 @@ class JobRequest(_Wire):
 
 
 class Job(_Wire):
-    """A job as the queue keeps it. Times are unix seconds; None: not yet.
+    """A job in the queue. Times are unix seconds; None: not yet.
 
-    starts: how often a process was started for it; crashes: how many of those ended by a signal, a limit aside.
-    exit_code: of the last process, negative for a signal. error: why it failed, one line. progress: the last one
-    reported.
+    starts: how many processes were started for it; crashes: how many of those ended by a signal, a limit aside.
+    exit_code: of the last process, negative for a signal. error: why it failed, one line. progress: the last report.
     """
 
     id: JobId
@@ -174,7 +173,7 @@ class CostState(_Wire):
 
 
 class PlannedStage(_Wire):
-    """A stage's wall seconds: as `dnrpipe plan` predicted them, and spent since then (None: it was done before)."""
+    """A stage's wall seconds: predicted by `dnrpipe plan`, and spent since then (None: it was done before)."""
 
     stage: str
     predicted: float
@@ -185,9 +184,9 @@ class PlannedStage(_Wire):
 class PlanState(_Wire):
     """The last plan against what its stages have cost since.
 
-    views, spp, epochs: what it reckons with; fits: whether the settings in force are these. total, low, high: seconds
-    of the stages until the renderer is there (evaluation is none of them), expected and nine times in ten; spent: on
-    the same.
+    views, spp, epochs: what the plan assumes; fits: whether the settings in force are the same. total, low, high:
+    seconds until the renderer is there (without evaluation), expected and its 90% interval; spent: seconds so far on
+    the same stages.
     """
 
     made: float
@@ -221,7 +220,7 @@ class WorkspaceDetail(_Wire):
     """What the dashboard shows of a workspace.
 
     sphere: the cameras as SVG, seen from ``eye`` (azimuth, elevation in radians); None before there are any.
-    plan: None where `dnrpipe plan` has not been.
+    plan: None if `dnrpipe plan` has not run.
     """
 
     name: str
@@ -248,6 +247,6 @@ class Health(_Wire):
 
 
 class Problem(_Wire):
-    """Every refusal: what, where and what to do, in one line."""
+    """Body of every refusal: what, where and what to do, in one line."""
 
     detail: str

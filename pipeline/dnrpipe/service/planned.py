@@ -1,4 +1,4 @@
-"""What the last plan predicted against what its stages have cost since it was made."""
+"""Compares the last plan's prediction with what its stages have cost since."""
 
 from __future__ import annotations
 
@@ -31,10 +31,18 @@ class _Plan(BaseModel):
 
 
 def plan_state(workspace: Workspace, settings: Settings, states: Mapping[str, str]) -> PlanState | None:
-    """states: of the stages, by name. None: there is no plan. Raises UserError: its file is damaged.
+    """The plan's prediction and the seconds spent since; None without a plan.
 
-    A stage that has ended has cost the wall seconds of its last run, or what its parts are booked with where it was
-    interrupted; one under way what its parts so far are booked with, which leaves out the start of processes.
+    A finished stage counts the wall seconds of its last run, or, if that was interrupted, the ledger's records of its
+    parts. A running stage counts the records so far, which leave out the start of processes.
+
+    Args:
+        workspace: whose plan, ledger and manifest are read.
+        settings: in force; the prediction for these comes first.
+        states: of the stages, by name.
+
+    Raises:
+        UserError: the plan's file is damaged.
     """
     path = plan_path(workspace)
     try:

@@ -1,4 +1,4 @@
-"""What the processes of a job use: memory from /proc, disk from its workspace; and how they are ended."""
+"""Memory and disk that a job uses, and how to end its processes."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import subprocess
 from pathlib import Path
 
 GRACE = 15.0
-"""Seconds that a job gets to stop its workers and write what it has, after SIGTERM."""
+"""Seconds between SIGTERM and SIGKILL, in which a job stops its workers and writes what it has."""
 
 
 def session_memory_mb(session: int) -> float:

@@ -1,4 +1,4 @@
-"""Logs and events of jobs that ended long ago go; the jobs stay in the list, with how they ended."""
+"""Deletes logs and events of jobs that ended long ago; the jobs stay in the list, with how they ended."""
 
 from __future__ import annotations
 
@@ -19,30 +19,30 @@ DAY = 86_400.0
 
 
 def prune(queue: Queue, root: ServiceRoot, config: ServerConfig, now: float | None = None) -> list[int]:
-    """Forget what is past ``config.keep_days`` or ``config.keep_jobs``; returns the numbers of those jobs.
+    """Prune jobs that ended more than `config.keep_days` or `config.keep_jobs` jobs ago; returns their numbers.
 
-    Jobs that wait or run are never among them, whatever their age.
+    Queued and running jobs are kept, whatever their age.
     """
     now = time.time() if now is None else now
-    there = _jobs_with_files(root.log(0).parent) | _jobs_with_files(root.events(0).parent)
+    has_files = _jobs_with_files(root.log(0).parent) | _jobs_with_files(root.events(0).parent)
 
     def remove(job: int) -> None:
         for path in (root.log(job), root.events(job)):
             path.unlink(missing_ok=True)
 
-    return queue.forget(
-        before=now - config.keep_days * DAY, beyond=config.keep_jobs, has_files=there, remove_files=remove
+    return queue.prune(
+        before=now - config.keep_days * DAY, beyond=config.keep_jobs, has_files=has_files, remove_files=remove
     )
 
 
-async def keep_pruned(queue: Queue, root: ServiceRoot, config: ServerConfig) -> None:
-    """At the start and every hour, for as long as the server runs."""
+async def prune_regularly(queue: Queue, root: ServiceRoot, config: ServerConfig) -> None:
+    """Prune at the start and every hour, for as long as the server runs."""
     while True:
         try:
-            gone = await run_in_threadpool(prune, queue, root, config)
-            if gone:
-                LOG.info("old logs and events removed", extra={"facts": {"jobs": len(gone)}})
-        except Exception:  # whatever it is (a full disk, a busy queue), the server goes on, and tries again
+            pruned = await run_in_threadpool(prune, queue, root, config)
+            if pruned:
+                LOG.info("old logs and events removed", extra={"facts": {"jobs": len(pruned)}})
+        except Exception:  # a full disk, a busy queue: the server goes on and tries again
             LOG.exception("old logs and events could not be removed")
         await asyncio.sleep(INTERVAL)
 

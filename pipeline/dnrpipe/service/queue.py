@@ -4,8 +4,8 @@
        ▲                 │
        └── crash, restart, retry
 
-A change of state is one transaction, on disk before the call returns: what was answered survives kill -9 and power
-cuts. Two jobs of one workspace never run side by side.
+Each change of state is one transaction, on disk before the call returns: it survives kill -9 and power cuts. Two jobs
+of one workspace never run at the same time.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from .models import FINAL, STATES, Job, JobEvent, JobRequest, State
 
 SCHEMA = 1
 MAX_STARTS = 6
-"""A job whose process or server died this often, without ending by itself, is given up."""
+"""A job fails for good once its process or server has died this often."""
 BATCH = 50
-"""Jobs that are forgotten in one transaction; others wait for it."""
+"""Jobs that one transaction prunes; other writers wait for it."""
 _TABLES = """
 CREATE TABLE IF NOT EXISTS jobs (
     id INTEGER PRIMARY KEY AUTOINCREMENT,
@@ -63,11 +63,11 @@ _COLUMNS = (
 
 
 class QueueFull(UserError):
-    """As many jobs wait as the server takes."""
+    """The server accepts no more queued jobs."""
 
 
 class WrongState(UserError):
-    """The job is in a state that the wish does not fit."""
+    """The job's state does not allow the request."""
 
 
 class Queue:
@@ -94,8 +94,8 @@ class Queue:
     def submit(self, request: JobRequest, *, most_queued: int | None = None, token: str | None = None) -> Job:
         """Add a job; it is on disk when this returns.
 
-        token: names this wish. A second one with the same token is the same wish, sent again by a client that never
-        saw the answer: the job that is there is returned. Raises QueueFull when ``most_queued`` jobs wait.
+        token: idempotency key. A client that never saw the answer sends its request again with the same key, and
+        gets the job that the first request made. Raises QueueFull when `most_queued` jobs wait.
         """
         with self._writing() as db:
             if token is not None:
@@ -157,7 +157,7 @@ class Queue:
             return _job(row)
 
     def finish(self, job: int, state: State, *, exit_code: int | None = None, error: str | None = None) -> None:
-        """A running job has ended. Does nothing when it is not running any more."""
+        """Record how a running job ended. Does nothing when it is not running any more."""
         assert state in FINAL
         with self._writing() as db:
             changed = db.execute(
@@ -167,8 +167,8 @@ class Queue:
             if changed.rowcount:
                 _note_state(db, job, state, error)
 
-    def put_back(self, job: int, *, crashed: bool, why: str) -> None:
-        """A running job goes back into the queue; it goes on from its checkpoints when it is claimed again."""
+    def requeue(self, job: int, *, crashed: bool, why: str) -> None:
+        """Queue a running job again; it resumes from its checkpoints when it is claimed."""
         with self._writing() as db:
             changed = db.execute(
                 "UPDATE jobs SET state = 'queued', crashes = crashes + ? WHERE id = ? AND state = 'running'",
@@ -178,8 +178,8 @@ class Queue:
                 _note_state(db, job, "queued", why)
 
     def recover(self, device: str | None = None) -> list[int]:
-        """After a crash of server or worker: what was running (on ``device``) is queued again, or cancelled if that
-        was asked for. Returns the jobs that were running."""
+        """After a crash of server or worker, queue again what was running (on `device`), or cancel it if that was
+        requested. Returns the jobs that were running."""
         with self._writing() as db:
             rows = db.execute(
                 "SELECT id, cancel_requested, starts FROM jobs WHERE state = 'running' AND (? IS NULL OR device = ?)",
@@ -201,7 +201,7 @@ class Queue:
             return [row["id"] for row in rows]
 
     def cancel(self, job: int) -> Job:
-        """A queued job is cancelled at once, a running one when its worker sees the wish. Raises WrongState."""
+        """Cancel a queued job at once, a running one when its worker sees the request. Raises WrongState."""
         with self._writing() as db:
             state = _state(db, job)
             if state in FINAL:
@@ -217,7 +217,7 @@ class Queue:
             return _job(db.execute(f"SELECT {_COLUMNS} FROM jobs WHERE id = ?", (job,)).fetchone())
 
     def retry(self, job: int) -> Job:
-        """A failed or cancelled job is queued again; what it made is kept and gone on from. Raises WrongState."""
+        """Queue a failed or cancelled job again; it resumes from what it made. Raises WrongState."""
         with self._writing() as db:
             state = _state(db, job)
             if state not in ("failed", "cancelled"):
@@ -230,13 +230,13 @@ class Queue:
             _note_state(db, job, "queued", "retried")
             return _job(row)
 
-    def cancel_wanted(self, job: int) -> bool:
-        """Whether someone asked to cancel the job."""
+    def cancel_requested(self, job: int) -> bool:
+        """Whether somebody requested that the job be cancelled."""
         row = self._db().execute("SELECT cancel_requested FROM jobs WHERE id = ?", (job,)).fetchone()
         return bool(row and row[0])
 
     def add_events(self, job: int, events: Sequence[dict[str, Any]]) -> None:
-        """Store lines of the event stream. The last progress is kept with the job, too."""
+        """Store lines of the event stream; the job keeps the last progress, too."""
         if not events:
             return
         with self._writing() as db:
@@ -259,37 +259,44 @@ class Queue:
             JobEvent(id=r["id"], job=r["job"], time=r["time"], kind=r["kind"], data=json.loads(r["data"])) for r in rows
         ]
 
-    def forget(
+    def prune(
         self, *, before: float, beyond: int, has_files: Collection[int], remove_files: Callable[[int], None]
     ) -> list[int]:
-        """Drop what was told of jobs that have ended: before the time ``before``, or longer ago than the ``beyond``
-        that ended last. Jobs themselves and their changes of state are kept. Returns the jobs, by number.
+        """Delete events and files of old jobs; the jobs and their changes of state stay.
 
-        has_files: jobs that may have files of their own, for which ``remove_files`` is called. All of it happens while
-        nothing else can write, so that no job is tried again meanwhile.
+        Each batch holds the write lock, so that nobody retries one of its jobs meanwhile.
+
+        Args:
+            before: unix seconds; jobs that ended earlier are old.
+            beyond: jobs are old, too, if this many others ended after them.
+            has_files: jobs that may have files.
+            remove_files: deletes the files of a job.
+
+        Returns:
+            The pruned jobs, by number.
         """
-        forgotten: list[int] = []
-        for batch in self._told_of(before, beyond, has_files):
+        pruned: list[int] = []
+        for batch in self._prunable_jobs(before, beyond, has_files):
             with self._writing() as db:
                 for job in batch:
                     row = db.execute("SELECT state FROM jobs WHERE id = ?", (job,)).fetchone()
                     if row["state"] in FINAL:  # still
                         db.execute("DELETE FROM events WHERE job = ? AND kind != 'state'", (job,))
                         remove_files(job)
-                        forgotten.append(job)
-        return forgotten
+                        pruned.append(job)
+        return pruned
 
-    def _told_of(self, before: float, beyond: int, has_files: Collection[int]) -> list[list[int]]:
+    def _prunable_jobs(self, before: float, beyond: int, has_files: Collection[int]) -> list[list[int]]:
         """Ended jobs past the limits that still have events or files, in batches of BATCH."""
         final = ", ".join(f"'{state}'" for state in FINAL)
         rows = self._db().execute(
-            "SELECT id, finished, EXISTS (SELECT 1 FROM events WHERE job = jobs.id AND kind != 'state') AS told"
+            "SELECT id, finished, EXISTS (SELECT 1 FROM events WHERE job = jobs.id AND kind != 'state') AS has_events"
             f" FROM jobs WHERE state IN ({final}) ORDER BY finished DESC, id DESC"
         )
         due = [
             row["id"]
             for place, row in enumerate(rows)
-            if (row["finished"] < before or place >= beyond) and (row["told"] or row["id"] in has_files)
+            if (row["finished"] < before or place >= beyond) and (row["has_events"] or row["id"] in has_files)
         ]
         return [due[start : start + BATCH] for start in range(0, len(due), BATCH)]
 

@@ -1,4 +1,4 @@
-"""The folder that a server works in, and the only way from names to paths in it.
+"""The server's folder; every path in it comes from here.
 
 root/
   <name>.dnr/          workspaces
@@ -19,11 +19,11 @@ from .models import NAME_PATTERN, SCENE_PATTERN
 
 
 class UnknownName(UserError):
-    """There is no such workspace, scene or file under the root."""
+    """The root has no such workspace, scene or file."""
 
 
 class ServiceRoot:
-    """Paths under ``folder``. Names are checked against a pattern, and what they lead to must lie in the root."""
+    """Paths under `folder`. Checks names against a pattern, and that their paths lie in the root."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder.resolve()

@@ -20,9 +20,9 @@ from .state import Shared
 from .state import State as Service
 
 KEEP_ALIVE = 15.0
-LOG_PIECE = 256 * 1024
-SERVERS_OWN = ("device", "strict")
-"""Settings that the server decides, or that have an argument of their own."""
+LOG_CHUNK = 256 * 1024
+SERVER_SETTINGS = ("device", "strict")
+"""Settings that the server decides."""
 REFUSED: dict[int | str, dict[str, Any]] = {
     code: {"model": Problem, "description": text}
     for code, text in (
@@ -59,7 +59,7 @@ def submit(
 ) -> Job:
     """Put a job into the queue. It is on disk when the answer is sent.
 
-    With an Idempotency-Key, sending it again gives the job that the first time made.
+    A request that repeats an Idempotency-Key gets the job that the first one made.
     """
     check_request(request, service)
     if shutil.disk_usage(service.root.folder).free < service.config.free_disk_mb * 2**20:
@@ -114,7 +114,7 @@ def logs(
             size = file.seek(0, 2)
             start = min(max(0, size + offset) if offset < 0 else offset, size)
             file.seek(start)
-            data = file.read(LOG_PIECE)
+            data = file.read(LOG_CHUNK)
     except FileNotFoundError:
         return LogPage(text="", offset=0, next=0, size=0)
     return LogPage(text=data.decode("utf-8", "replace"), offset=start, next=start + len(data), size=size)
@@ -140,7 +140,7 @@ async def events(
 ) -> StreamingResponse:
     """The job's events, those of the past first, then as they come.
 
-    A stream that broke is taken up by Last-Event-ID (which wins over ``after``): nothing is lost or sent twice.
+    Last-Event-ID (which wins over `after`) resumes a broken stream: nothing is lost or sent twice.
     """
     await run_in_threadpool(known_job, service, job)
     if last_event_id is not None and last_event_id.isascii() and last_event_id.isdigit():
@@ -154,7 +154,7 @@ async def events(
         try:
             yield "retry: 2000\n\n"
             while True:
-                # The state first: what was booked before it became final is in the events that are read after it.
+                # The state first: the events read after it include all that came before it became final.
                 ended = (await run_in_threadpool(known_job, service, job)).state in FINAL
                 found = await run_in_threadpool(service.queue.events, job, last)
                 for event in found:
@@ -188,7 +188,7 @@ def known_job(service: Service, job: int) -> Job:
 
 
 def check_request(request: JobRequest, service: Service) -> None:
-    """Refuse at once what its command would refuse: unknown settings, scenes, workspaces.
+    """Refuse what the job's command would refuse later: unknown settings, scenes, workspaces.
 
     Raises HTTPException 422, UnknownName.
     """
@@ -201,7 +201,7 @@ def check_request(request: JobRequest, service: Service) -> None:
         raise HTTPException(429, f"there are {service.config.most_workspaces} workspaces already; remove some")
     overrides: dict[str, Any] = {}
     for key, value in request.settings.items():
-        if key.split(".")[0] in SERVERS_OWN:
+        if key.split(".")[0] in SERVER_SETTINGS:
             raise HTTPException(422, f"settings: {key} is the server's to decide")
         text = value if isinstance(value, str) else json.dumps(value)
         overrides = merge(overrides, parse_assignment(f"{key}={text}"))

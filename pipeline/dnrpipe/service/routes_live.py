@@ -1,13 +1,13 @@
 """The live viewer's WebSocket: ``/workspaces/<name>/live``.
 
 server  {"kind": "hello", center, radius, distance, size, modes}                  text
-client  a LiveRequest as JSON, as often as it likes; only the newest one counts   text
+client  a LiveRequest as JSON, at any time; only the newest one counts            text
 server  4 bytes length of the header, little endian; header as JSON; the picture  binary
         header: type, width, height, mode, moving, samples, spp, repaired, ms by stage, total_ms, nearest
 server  {"kind": "problem", "detail": one line}                                   text
 
-After the last request of a moving camera the view is rendered once more at full quality; a reference gets better for as
-long as nothing else is asked for.
+After the last request of a moving camera the server renders the view once more at full quality; it adds samples to a
+reference until the next request.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ REFUSED = 1008
 router = APIRouter()
 
 
-class Wishes:
-    """The newest request of a viewer; older ones are forgotten."""
+class LatestRequest:
+    """The newest request of a viewer; it replaces older ones."""
 
     def __init__(self) -> None:
         self._newest: LiveRequest | None = None
@@ -72,10 +72,10 @@ async def live(socket: WebSocket, name: Annotated[str, Path(pattern=NAME_PATTERN
         with service.stream():
             async with service.live.session(name) as session:
                 await socket.send_json({"kind": "hello", **session.scene.hello})
-                wishes = Wishes()
-                reading = asyncio.create_task(_read(socket, wishes))
+                latest = LatestRequest()
+                reading = asyncio.create_task(_read(socket, latest))
                 try:
-                    await _answer(socket, session, wishes)
+                    await _answer(socket, session, latest)
                 finally:
                     reading.cancel()
                     await asyncio.gather(reading, return_exceptions=True)
@@ -86,27 +86,27 @@ async def live(socket: WebSocket, name: Annotated[str, Path(pattern=NAME_PATTERN
         await _close(socket, {"kind": "problem", "detail": " ".join(detail.split())})
 
 
-async def _read(socket: WebSocket, wishes: Wishes) -> None:
+async def _read(socket: WebSocket, latest: LatestRequest) -> None:
     try:
         while True:
             text = await socket.receive_text()
             try:
-                wishes.put(LiveRequest.model_validate_json(text))
+                latest.put(LiveRequest.model_validate_json(text))
             except ValidationError as error:
                 first = error.errors()[0]
                 where = ".".join(str(part) for part in first["loc"])
                 await socket.send_json({"kind": "problem", "detail": f"{where}: {first['msg']}"})
     except (WebSocketDisconnect, RuntimeError, KeyError):  # gone, or sent bytes where text is wanted
-        wishes.close()
+        latest.close()
 
 
-async def _answer(socket: WebSocket, session: LiveSession, wishes: Wishes) -> None:
+async def _answer(socket: WebSocket, session: LiveSession, latest: LatestRequest) -> None:
     current: LiveRequest | None = None
     unsettled = refining = False
-    while not wishes.closed:
+    while not latest.closed:
         wait = 0.0 if refining else SETTLED if unsettled else None
-        request = await wishes.take(wait)
-        if wishes.closed:
+        request = await latest.take(wait)
+        if latest.closed:
             return
         if request is not None:
             current = request
@@ -134,7 +134,7 @@ def pack(answer: dict[str, Any], request: LiveRequest) -> bytes:
 
 
 def unpack(message: bytes) -> tuple[dict[str, Any], bytes]:
-    """The inverse of :func:`pack`: (header, picture)."""
+    """The inverse of `pack`: (header, picture)."""
     (length,) = struct.unpack_from("<I", message)
     return json.loads(message[4 : 4 + length]), message[4 + length :]
 

@@ -1,4 +1,4 @@
-"""The server itself: health, metrics, and the dashboard's files."""
+"""Health, metrics, and the dashboard's files."""
 
 from __future__ import annotations
 

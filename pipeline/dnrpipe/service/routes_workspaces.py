@@ -1,4 +1,4 @@
-"""Workspaces: what is there, how far it is, its pictures and its report. Scene files: upload, list, remove."""
+"""Workspaces: state, pictures, report. Scene files: upload, list, remove."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from .state import Shared, State
 NamePath = Annotated[str, Path(pattern=NAME_PATTERN)]
 ScenePath = Annotated[str, Path(pattern=SCENE_PATTERN)]
 ViewPath = Annotated[str, Path(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}$")]
-# The page is ours, but its names come from scene files: it may run its own scripts and reach nothing.
+# The page holds names from scene files: it may run its own scripts, but load and send nothing.
 REPORT_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; base-uri 'none';"
     " form-action 'none'; frame-ancestors 'none'; sandbox allow-scripts"
@@ -143,7 +143,7 @@ def picture(
 
 @router.get("/workspaces/{name}/report", response_class=FileResponse, responses=NOT_FOUND | HTML)
 def report(name: NamePath, service: Shared) -> FileResponse:
-    """The report that the last ``run`` or ``report`` made."""
+    """The report of the last `run` or `report`."""
     path = service.root.workspace(name) / "report" / "report.html"
     if not path.is_file() or not path.resolve().is_relative_to(service.root.folder):
         raise HTTPException(404, f"{name} has no report yet; submit a job report")
@@ -178,17 +178,17 @@ async def upload(name: ScenePath, request: Request, service: Shared) -> Scene:
     declared = request.headers.get("content-length", "")
     if declared.isascii() and declared.isdigit() and int(declared) > limit:
         raise HTTPException(413, f"the file is larger than {service.config.upload_mb} MiB")
-    await run_in_threadpool(_room, service, name)
+    await run_in_threadpool(_check_space, service, name)
     temporary = target.parent / f".{secrets.token_hex(8)}.part"
     checksum, size = hashlib.sha256(), 0
     try:
         with temporary.open("xb") as file:
-            async for piece in _pieces(request):
-                size += len(piece)
+            async for chunk in _chunks(request):
+                size += len(chunk)
                 if size > limit:
                     raise HTTPException(413, f"the file is larger than {service.config.upload_mb} MiB")
-                checksum.update(piece)
-                await run_in_threadpool(file.write, piece)
+                checksum.update(chunk)
+                await run_in_threadpool(file.write, chunk)
             file.flush()
             await run_in_threadpool(os.fsync, file.fileno())
         if size == 0:
@@ -206,7 +206,7 @@ def remove(name: ScenePath, service: Shared) -> Response:
     return Response(status_code=204)
 
 
-def _room(service: State, name: str) -> None:
+def _check_space(service: State, name: str) -> None:
     """Raises HTTPException 409 or 507."""
     stored = {path.name for path in service.root.scenes.iterdir()}
     if name not in stored and len(stored) >= service.config.most_scenes:
@@ -216,9 +216,9 @@ def _room(service: State, name: str) -> None:
         raise HTTPException(507, f"less than {service.config.free_disk_mb} MiB of disk are free; make space")
 
 
-async def _pieces(request: Request) -> AsyncIterator[bytes]:
+async def _chunks(request: Request) -> AsyncIterator[bytes]:
     try:
-        async for piece in request.stream():
-            yield piece
+        async for chunk in request.stream():
+            yield chunk
     except ClientDisconnect:
         raise HTTPException(400, "the connection ended before the file did") from None

@@ -35,13 +35,13 @@ def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], Non
         raise UserError(f"--host {config.host}: others can reach it, so a token is needed; give --token-file FILE")
     if not config.root.parent.is_dir():
         raise UserError(f"--root {config.root}: {config.root.parent} does not exist")
-    # Jobs and the dashboard see the settings of workspaces, not those of whoever started the server.
+    # Jobs and the dashboard see the settings of workspaces, not those of whoever starts the server.
     for name in [n for n in os.environ if n.startswith("DNRPIPE_") and n != "DNRPIPE_CACHE"]:
         del os.environ[name]
     root = ServiceRoot(config.root).create()
     config = config.model_copy(update={"root": root.folder})
     _log_as_json()
-    with _alone(root):
+    with _exclusive(root):
         queue = Queue(root.queue)
         queue.recover()
         supervisor = Supervisor(config, queue, root.private / "workers.log")
@@ -61,13 +61,13 @@ def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], Non
         )
         try:
             socket = settings.bind_socket()
-        except SystemExit:  # uvicorn's way to say so
+        except SystemExit:  # how uvicorn reports it
             raise UserError(f"--port {config.port}: cannot be listened on at {config.host}; choose another") from None
         host = f"[{config.host}]" if ":" in config.host else config.host
         server = _Server(settings, lambda: ready(f"http://{host}:{socket.getsockname()[1]}"))
         supervisor.start()
         try:
-            with contextlib.suppress(KeyboardInterrupt):  # the usual end; uvicorn raises it again when it has shut down
+            with contextlib.suppress(KeyboardInterrupt):  # the usual end; uvicorn raises it after its shutdown
                 server.run(sockets=[socket])
         finally:
             supervisor.stop()
@@ -75,7 +75,7 @@ def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], Non
 
 
 class _Server(uvicorn.Server):
-    """Tells when it answers."""
+    """Calls `ready` once it answers requests."""
 
     def __init__(self, config: uvicorn.Config, ready: Callable[[], None]) -> None:
         super().__init__(config)
@@ -88,8 +88,8 @@ class _Server(uvicorn.Server):
 
 
 @contextlib.contextmanager
-def _alone(root: ServiceRoot) -> Iterator[None]:
-    lock = FileLock(root.lock, timeout=10)  # one that was killed may need a moment to be gone
+def _exclusive(root: ServiceRoot) -> Iterator[None]:
+    lock = FileLock(root.lock, timeout=10)  # a killed server may take a moment to end
     try:
         lock.acquire()
     except Timeout:

@@ -1,11 +1,11 @@
-"""What the routes of one application share."""
+"""The application's state, as its routes see it."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 from fastapi import Depends, HTTPException
@@ -24,7 +24,7 @@ POLL = 0.1
 
 
 class Feed:
-    """Tells event streams that there is something new: one look at the queue for all of them."""
+    """Wakes event streams when the queue has a new event: polls it once for all of them."""
 
     def __init__(self, queue: Queue) -> None:
         self.queue = queue
@@ -45,7 +45,7 @@ class Feed:
                 news.set()
 
     async def wait(self, seconds: float) -> bool:
-        """Until there is an event of any job; False when the time is up."""
+        """Wait for an event of any job. Returns False after `seconds` without one."""
         try:
             await asyncio.wait_for(self._news.wait(), seconds)
         except TimeoutError:
@@ -55,7 +55,7 @@ class Feed:
 
 @dataclass
 class State:
-    """Made once per server."""
+    """What the routes share, one per server."""
 
     config: ServerConfig
     root: ServiceRoot
@@ -64,7 +64,6 @@ class State:
     live: LivePool
     feed: Feed
     streams: int = 0
-    totals: dict[str, int] = field(default_factory=dict)
 
     @contextlib.contextmanager
     def stream(self) -> Iterator[None]:

@@ -19,13 +19,13 @@ LOG = logging.getLogger("dnrpipe.workers")
 POLL = 0.3
 LONGEST_PAUSE = 30.0
 STEADY_SECONDS = 60.0
-"""A worker that lived this long is started again at once; one that keeps dying, after longer and longer pauses."""
+"""A worker that lived this long starts again soon; one that keeps dying, after longer and longer pauses."""
 
 
 class Supervisor:
-    """Starts a worker per device, starts it again when it dies, and stops all of them in the end.
+    """Starts a worker per device, restarts those that die, and stops all of them in the end.
 
-    Everything happens in one thread: Linux kills the workers when the thread that started them ends.
+    One thread does it all: Linux kills the workers when the thread that started them ends.
     """
 
     def __init__(self, config: ServerConfig, queue: Queue, log: Path) -> None:
@@ -43,7 +43,7 @@ class Supervisor:
         return {d: (p := found.get(d)) is not None and p.poll() is None for d in self.config.devices}
 
     def stop(self) -> None:
-        """End the workers; each puts its job back into the queue."""
+        """End the workers; each requeues its job."""
         self._stopping.set()
         self._thread.join(timeout=2 * GRACE)
 
@@ -81,7 +81,7 @@ class Supervisor:
                 start_new_session=True,  # Ctrl-C in the terminal is the server's to handle
             )
         assert process.stdin is not None
-        with contextlib.suppress(OSError):  # it died at once; seen at the next turn
+        with contextlib.suppress(OSError):  # it died at once; the next turn sees it
             process.stdin.write(self.config.model_dump_json())
             process.stdin.close()
         return process

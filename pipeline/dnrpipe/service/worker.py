@@ -1,8 +1,8 @@
-"""The worker process of one device: takes a job, runs it as a command of its own, watches it, says how it ended.
+"""The worker process of one device: claims a job, runs its command, watches it and records how it ended.
 
-``python -m dnrpipe.service.worker DEVICE SERVER_PID``, with the server's configuration as JSON on standard input. The
-job's process leads a session of its own and dies with the worker, and the worker with the server: after kill -9 nothing
-goes on unseen, and the next server queues the job again.
+`python -m dnrpipe.service.worker DEVICE SERVER_PID`, with the server's configuration as JSON on standard input. The
+job's process leads its own session. It dies with the worker, and the worker dies with the server: after kill -9 nothing
+runs on unseen, and the next server queues the job again.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ IDLE = 0.3
 WATCH = 0.2
 DISK_INTERVAL = 5.0
 MACHINE_VARIABLES = ("DNRPIPE_CACHE", TIMEOUT_VARIABLE)
-"""Of the server's environment: they hold for its jobs, too."""
+"""Variables of the server's environment that its jobs inherit."""
 UNLOCK_SECONDS = 10.0
-"""How long a workspace may still be held by the processes of a worker that was killed."""
+"""How long the processes of a killed worker may still hold a workspace."""
 INTERRUPTED = 130
 
 
@@ -51,7 +51,7 @@ class Worker:
         self.stopping = False
 
     def run(self) -> None:
-        """Work until SIGTERM; then the running job is put back into the queue."""
+        """Work until SIGTERM; then requeue the running job."""
         self.queue.recover(self.device)
         while not self.stopping:
             job = self.queue.claim(self.device)
@@ -59,19 +59,19 @@ class Worker:
                 time.sleep(IDLE)
                 continue
             try:
-                self._carry_out(job)
-            except (UserError, OSError) as error:  # cannot be started: the job's failure, not the worker's end
+                self._run_job(job)
+            except (UserError, OSError) as error:  # the job cannot start; the worker goes on
                 self.queue.finish(job.id, "failed", error=" ".join(str(error).split()))
 
     def stop(self, *_: Any) -> None:
         self.stopping = True
 
-    def _carry_out(self, job: Job) -> None:
+    def _run_job(self, job: Job) -> None:
         workspace = self.root.workspace(job.request.workspace, must_exist=False)
         command = job_command(job, self.root)
         _await_lock(workspace)
         events = self.root.events(job.id)
-        events.write_bytes(b"")  # what an earlier attempt told is in the queue already
+        events.write_bytes(b"")  # the queue already has the events of earlier attempts
         with self.root.log(job.id).open("ab") as log:
             log.write(f"--- {time.strftime('%F %T')} start {job.starts} on {self.device}\n".encode())
             log.flush()
@@ -87,18 +87,18 @@ class Worker:
             )
         limits = tightest(job.request.limits, self.config.limits)
         ended = self._watch(job, process, workspace, limits, EventReader(events))
-        self._settle(job, process.returncode, ended)
+        self._record_end(job, process.returncode, ended)
 
     def _watch(
         self, job: Job, process: subprocess.Popen[bytes], workspace: Path, limits: Limits, events: EventReader
     ) -> str | None:
-        """Wait for the end. Returns why the job was ended: None by itself, "cancelled", "stopping", or a limit."""
+        """Wait until the job ends. Returns why it was stopped: "cancelled", "stopping" or a limit; None: by itself."""
         started, disk_due = time.monotonic(), 0.0
         ended = None
         while process.poll() is None:
             self.queue.add_events(job.id, events.read())
             now = time.monotonic()
-            if self.queue.cancel_wanted(job.id):
+            if self.queue.cancel_requested(job.id):
                 ended = "cancelled"
             elif self.stopping:
                 ended = "stopping"
@@ -114,28 +114,28 @@ class Worker:
                 end_group(process)
                 break
             time.sleep(WATCH)
-        end_group(process, grace=0)  # helpers that outlived their command
+        end_group(process, grace=0)  # helpers that outlive their command
         self.queue.add_events(job.id, events.read())
         return ended
 
-    def _settle(self, job: Job, code: int, ended: str | None) -> None:
+    def _record_end(self, job: Job, code: int, ended: str | None) -> None:
         queue = self.queue
-        if code == 0 and ended in (None, "cancelled", "stopping"):  # it was quicker than the wish
+        if code == 0 and ended in (None, "cancelled", "stopping"):  # it ended before it was stopped
             queue.finish(job.id, "done", exit_code=0)
         elif ended == "cancelled":
             queue.finish(job.id, "cancelled", exit_code=code)
         elif ended == "stopping":
-            queue.put_back(job.id, crashed=False, why="the server was stopped")
+            queue.requeue(job.id, crashed=False, why="the server was stopped")
         elif ended is not None:
             queue.finish(job.id, "failed", exit_code=code, error=f"{ended}; raise it and retry to go on")
         elif code < 0 and job.crashes < job.request.retries and job.starts < MAX_STARTS:
-            queue.put_back(job.id, crashed=True, why=f"its process was killed by {_signal_name(-code)}")
+            queue.requeue(job.id, crashed=True, why=f"its process was killed by {_signal_name(-code)}")
         else:
             queue.finish(job.id, "failed", exit_code=code, error=_reason(self.root.log(job.id), code))
 
 
 class EventReader:
-    """New whole lines of a job's event stream. Of several progress reports in a row only the last one is kept."""
+    """Reads new complete lines of a job's event stream; of successive progress reports it keeps the last."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.offset = path, 0
@@ -161,7 +161,7 @@ class EventReader:
 
 
 def job_command(job: Job, root: ServiceRoot) -> list[str]:
-    """The command line of a job. ``--force`` is given at its first start only: later ones go on."""
+    """The command line of a job. Only the first start gets `--force`; later ones resume."""
     request = job.request
     workspace = root.workspace(request.workspace, must_exist=False)
     command = [sys.executable, "-m", "dnrpipe.cli", request.command]
@@ -178,7 +178,7 @@ def job_command(job: Job, root: ServiceRoot) -> list[str]:
 
 
 def job_environment(device: str, events: Path) -> dict[str, str]:
-    """The worker's environment without settings of whoever started the server, on the worker's device."""
+    """The worker's environment, without the settings of whoever started the server, on the worker's device."""
     kept = {k: v for k, v in os.environ.items() if not k.startswith("DNRPIPE_") or k in MACHINE_VARIABLES}
     if device.startswith("cuda:"):
         kept |= {"CUDA_VISIBLE_DEVICES": device.removeprefix("cuda:"), "DNRPIPE_DEVICE": "cuda"}
@@ -188,7 +188,7 @@ def job_environment(device: str, events: Path) -> dict[str, str]:
 
 
 def _die_with(parent: int) -> Callable[[], None]:
-    """What a job's process does before it becomes the command; ``parent`` may be dead already, and tell no more."""
+    """For `preexec_fn`: the job's process ends with `parent`, which may already be dead."""
 
     def prepare() -> None:
         die_with_parent(parent)
@@ -197,8 +197,7 @@ def _die_with(parent: int) -> Callable[[], None]:
 
 
 def _await_lock(workspace: Path) -> None:
-    """The processes of a worker that was killed may need a moment to be gone; who else holds the workspace is told
-    by the command itself."""
+    """Give the processes of a killed worker time to end. If somebody else holds the workspace, the command says so."""
     if workspace.is_dir():
         with contextlib.suppress(Timeout), FileLock(workspace / LOCK_FILES[0], timeout=UNLOCK_SECONDS):
             pass

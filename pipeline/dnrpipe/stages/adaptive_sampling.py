@@ -1,53 +1,51 @@
-"""Views traced to a noise level or within a time: passes of samples, handed out by :mod:`.schedule`."""
+"""Views traced to a noise level or within a time: passes of samples, handed out by `raytrace.sample_schedule`."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from dnrtrain.exr import read_metadata
 
 from ..core.console import Console
-from ..core.ledger import CostRecord
-from ..core.workspace import Workspace
 from ..raytrace.sample_schedule import Goal, Schedule, Step, ViewProgress
 from ..raytrace.samples import read_facts
-from ..workers.processes import TaskResult, run_tasks
-from ..workers.view_tasks import consume, is_made, report_failed, task_name
+from ..workers.answers import answers
+from ..workers.processes import TaskResult
+from ..workers.view_tasks import Book, Failures, is_made, task_name
+from .stage import Run
 
 
-def run_passes(
+def sample_adaptively(
+    run: Run,
     label: str,
     common: dict[str, Any],
     tasks: Sequence[dict[str, Any]],
     goal: Goal,
     *,
-    workspace: Workspace,
-    console: Console,
-    stage: str,
     workers: int,
-    book: Callable[[dict[str, Any], dict[str, Any], int], CostRecord],
+    book: Book,
     environment: dict[str, str] | None = None,
 ) -> None:
     """Trace the views whose files are missing or out of date; one ledger record each, when its file is written.
 
-    tasks: of :class:`.raytrace.pass_worker.Worker`, without "add" and "goal". Samples that are on disk count, whatever
-    they were traced for. Raises TasksFailed after all other views are done when some failed twice.
+    tasks: of `raytrace.pass_worker.Worker`, without "add" and "goal". Samples that are on disk count, whatever they
+    were traced for. Raises TasksFailed after all other views are done when some failed twice.
     """
     due = {task_name(task): task for task in tasks if not is_made(task)}
     if not due:
         return
-    log, count = workspace.log(stage), max(1, min(workers, len(due)))
+    count = max(1, min(workers, len(due)))
     schedule = Schedule(goal, {name: _known(task) for name, task in due.items()}, count)
 
-    def worded(step: Step) -> dict[str, Any]:
+    def make_task(step: Step) -> dict[str, Any]:
         asked = {"noise_target": goal.noise, "time_target": goal.seconds, "max_spp": goal.limit, "ended_by": step.why}
         rehearse = goal.seconds is not None and not schedule.finish_seconds
         return {**due[step.view], "add": step.add, "goal": asked, "rehearse": rehearse}
 
-    def following(outcome: TaskResult) -> list[dict[str, Any]]:
+    def next_tasks(outcome: TaskResult) -> list[dict[str, Any]]:
         name, result = task_name(outcome.task), outcome.result
         if result is None or not outcome.task["add"]:
             schedule.finished(name)
@@ -55,36 +53,42 @@ def run_passes(
             schedule.finish_seconds = max(schedule.finish_seconds, result.pop("finish_seconds", 0.0))
             schedule.passed(name, add=outcome.task["add"], **result)
         step = schedule.next()
-        return [] if step is None else [worded(step)]
+        return [] if step is None else [make_task(step)]
 
-    first = [worded(step) for step in (schedule.next() for _ in range(count)) if step is not None]
-    module = "dnrpipe.raytrace.pass_worker"
-    outcomes = run_tasks(module, common, first, workers=count, log=log, environment=environment, follow=following)
+    first = [make_task(step) for step in (schedule.next() for _ in range(count)) if step is not None]
+    failures = Failures(label, run.console, run.log)
+    outcomes = answers(
+        "dnrpipe.raytrace.pass_worker",
+        common,
+        first,
+        workers=count,
+        log=run.log,
+        retried=failures.retried,
+        environment=environment,
+        next_tasks=next_tasks,
+    )
     if goal.seconds is not None:
-        bar = console.bar(f"{label}, seconds", math.ceil(schedule.deadline - schedule.clock()))
+        bar = run.console.bar(f"{label}, seconds", math.ceil(schedule.deadline - schedule.clock()))
     else:
-        bar = console.bar(label, len(tasks), len(tasks) - len(due))
+        bar = run.console.bar(label, len(tasks), len(tasks) - len(due))
     began = schedule.clock()
     with bar as shown:
-
-        def done(outcome: TaskResult) -> None:
+        for outcome in failures.noted(outcomes):
             written = outcome.result is not None and not outcome.task["add"]
             if written:
                 assert outcome.result is not None
-                workspace.ledger.append(book(outcome.task, outcome.result, count))
+                book(outcome.task, outcome.result, count)
             if goal.seconds is not None:
                 past = min(shown.total, int(schedule.clock() - began))
                 shown.advance(past - shown.done, note=task_name(outcome.task))
             elif written or outcome.result is None:
                 shown.advance(note=task_name(outcome.task))
-
-        failed = consume(label, outcomes, console, done)
-    _tell(label, list(due.values()), goal, console)
-    report_failed(label, failed, len(tasks), log)
+    _tell(label, list(due.values()), goal, run.console)
+    failures.report(len(tasks))
 
 
 def _known(task: dict[str, Any]) -> ViewProgress:
-    facts = read_facts(Path(task["samples"]), task["samples_print"])
+    facts = read_facts(Path(task["samples"]), task["samples_fingerprint"])
     return ViewProgress(facts.spp, facts.noise, facts.error, facts.seconds)
 
 

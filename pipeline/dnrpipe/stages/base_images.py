@@ -1,14 +1,13 @@
 """Base images: what the network corrects. Bakes the scene's light once, then renders views from it, on demand.
 
-Which one it is says ``model.base``: ``none``; ``raster``, the rasterised colour of the passes; ``baked``, baked light
-and specular paths; ``direct`` or ``path``, a few path-traced samples, denoised (direct light alone, or the plan's
-depth).
+``model.base`` says which: ``none``; ``raster``, the rasterised colour of the passes; ``baked``, baked light and
+specular paths; ``direct`` or ``path``, a few path-traced samples, denoised (direct light alone, or the plan's depth).
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +15,18 @@ import numpy as np
 
 from dnrtrain.contract import NPZ_ERRORS, View
 
-from ..core.console import Console
 from ..core.errors import UserError
-from ..core.ledger import CostRecord
+from ..core.ledger import Purpose
 from ..core.scene_files import scene_fingerprint
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest
 from ..effects.plan import EffectPlan
-from ..effects.store import plan_of, resolve_plan, trace_config
-from ..raytrace.variants import VariantChoice, choose_variant
-from ..workers.processes import Retry, run_tasks
-from ..workers.view_tasks import is_made, run_view_tasks, task_name, view_record, warn_repairs
+from ..effects.store import plan_of, trace_config
+from ..raytrace.variants import choose_variant
+from ..workers.answers import only_answer
+from ..workers.view_tasks import warn_of_repairs
+from .effect_plan import resolve_plan
+from .stage import Run
 
 LIGHT_VERSION, BASE_VERSION = 5, 11
 RENDERED = ("baked", "direct", "path")
@@ -35,6 +35,27 @@ AUTOMATIC_TEXELS = 4
 """Light map texels per pixel of an image's side: about one texel a pixel where the atlas shows a part of itself."""
 SIZES = (256, 4096)
 SPP = (32, 128)
+
+
+@dataclass(frozen=True)
+class BaseRenderer:
+    """How base images of a workspace are rendered.
+
+    Args:
+        common: what the workers share. environment: theirs.
+        light: the task that bakes the light they need, or None.
+        fingerprint: of all that decides the images but for the view.
+    """
+
+    common: dict[str, Any]
+    environment: dict[str, str]
+    light: dict[str, Any] | None
+    fingerprint: str
+
+    @property
+    def light_is_baked(self) -> bool:
+        """Whether the light is on disk, baked from the same inputs; True where none is needed."""
+        return self.light is None or _light_fingerprint(Path(self.light["output"])) == self.light["fingerprint"]
 
 
 def base_path(workspace: Workspace, split: str, name: str) -> Path:
@@ -66,110 +87,72 @@ def light_spp(settings: Settings) -> int:
 
 
 def base_views(
-    workspace: Workspace,
-    settings: Settings,
-    console: Console,
-    run_id: str,
-    *,
+    run: Run,
     views: Sequence[View],
     split: str,
-    stage: Any,
-    purpose: Any,
+    *,
     paths: Sequence[Path] | None = None,
-    held_out: View | None = None,
+    purpose: Purpose | None = None,
 ) -> list[dict[str, Any]]:
-    """Render the base images of ``views`` that are missing or out of date; returns all tasks ([] where none is due).
+    """Render the base images of the views that are missing or out of date -> all tasks, [] where none is rendered.
 
-    paths: where they go instead of ``base/<split>``. held_out: a test view, which evaluation will want, rendered by
-    the same worker while it is there and booked as evaluation's; its task is not returned. Raises UserError where this
-    machine has no jit variant of Mitsuba.
+    Args:
+        paths: where they go instead of ``base/<split>``.
+        purpose: they are booked under, instead of the stage's.
+
+    Raises UserError where this machine has no jit variant of Mitsuba.
     """
-    kind = settings.model.base
-    if kind not in RENDERED or not views:
+    if run.settings.model.base not in RENDERED or not views:
         return []
-    plan = resolve_plan(workspace, settings, console, run_id, stage)
-    common, environment, stamp = _prepared(workspace, settings, console, run_id, plan, stage)
-    paths = paths or [base_path(workspace, split, view.name) for view in views]
-    tasks = [_task(view, path, stamp) for view, path in zip(views, paths, strict=True)]
-    ahead = [] if held_out is None else [_task(held_out, base_path(workspace, "test", held_out.name), stamp)]
-
-    def book(task: dict[str, Any], result: dict[str, Any], workers: int) -> CostRecord:
-        record = view_record(
-            run=run_id,
-            stage="evaluate" if task in ahead else stage,
-            purpose="evaluation" if task in ahead else purpose,
-            task=task,
-            result=result,
-            workers=workers,
-            device=f"mitsuba {common['variant']}",
-        )
-        return record.model_copy(update={"name": f"base/{task_name(task)}"})
-
-    run_view_tasks(
+    renderer = base_renderer(run.workspace, run.settings, resolve_plan(run))
+    bake_light(run, renderer)
+    paths = paths or [base_path(run.workspace, split, view.name) for view in views]
+    tasks = [_task(view, path, renderer.fingerprint) for view, path in zip(views, paths, strict=True)]
+    run.view_tasks(
         "base images",
         "dnrpipe.raytrace.base_worker",
-        common,
-        [*tasks, *ahead],
-        workspace=workspace,
-        console=console,
-        stage=stage,
+        renderer.common,
+        tasks,
         workers=1,  # a kernel to compile; its threads fill the machine
-        book=book,
-        environment=environment,
+        book=run.book_views(f"mitsuba {renderer.common['variant']}", prefix="base/", purpose=purpose),
+        environment=renderer.environment,
     )
-    warn_repairs(tasks, console)
+    warn_of_repairs(tasks, run.console)
     return tasks
 
 
-def base_is_made(workspace: Workspace, settings: Settings, split: str, view: View) -> bool:
-    """Whether the view's base image is on disk and up to date; looks at files alone, without Mitsuba."""
-    # No file depends on the variant that rendered it.
-    *_, stamp = renderer_inputs(workspace, settings, plan_of(workspace, settings), VariantChoice("llvm_ad_rgb", {}, ""))
-    return is_made(_task(view, base_path(workspace, split, view.name), stamp))
-
-
-def _task(view: View, path: Path, stamp: str) -> dict[str, Any]:
+def _task(view: View, path: Path, fingerprint: str) -> dict[str, Any]:
     data = view.model_dump(mode="json")
-    return {"view": data, "output": str(path), "fingerprint": digest([BASE_VERSION, stamp, data])}
+    return {"view": data, "output": str(path), "fingerprint": digest([BASE_VERSION, fingerprint, data])}
 
 
-def _prepared(
-    workspace: Workspace, settings: Settings, console: Console, run_id: str, plan: EffectPlan, stage: Any
-) -> tuple[dict[str, Any], dict[str, str], str]:
-    """(what the workers share, their environment, a hash of all that decides the images but for the view)."""
-    common, environment, task, stamp = renderer_inputs(workspace, settings, plan)
-    if task is not None:
-        bake_light(workspace, console, run_id, stage, common, environment, task)
-    return common, environment, stamp
-
-
-def ready_inputs(workspace: Workspace, settings: Settings) -> tuple[dict[str, Any], dict[str, str]]:
-    """(what base image workers share, their environment) of a workspace whose light is baked; writes no results.
+def ready_renderer(workspace: Workspace, settings: Settings) -> BaseRenderer:
+    """The renderer of a workspace whose light is baked; writes no results.
 
     Raises UserError: ``model.base`` is not rendered, or the light is not baked or out of date.
     """
     if settings.model.base not in RENDERED:
         raise UserError(f"base images of kind {settings.model.base} are not rendered")
-    common, environment, task, _ = renderer_inputs(workspace, settings, plan_of(workspace, settings))
-    if task is not None and not light_is_baked(task):
+    renderer = base_renderer(workspace, settings, plan_of(workspace, settings))
+    if not renderer.light_is_baked:
         raise UserError(f"{workspace.root}: the baked light is out of date; run `dnrpipe raytrace-selected` first")
-    return common, environment
+    return renderer
 
 
-def renderer_inputs(
-    workspace: Workspace, settings: Settings, plan: EffectPlan, choice: VariantChoice | None = None
-) -> tuple[dict[str, Any], dict[str, str], dict[str, Any] | None, str]:
-    """(what the workers share, their environment, the task that bakes the light or None, a hash of all that decides
-    the images but for the view). choice: instead of the variant that this machine can run."""
+def base_renderer(workspace: Workspace, settings: Settings, plan: EffectPlan) -> BaseRenderer:
+    """How base images are rendered under the settings and the effect plan.
+
+    Raises UserError where this machine has no jit variant of Mitsuba.
+    """
     chosen, kind = settings.base, settings.model.base
-    choice = choice or choose_variant(settings.raytrace.variant)
+    choice = choose_variant(settings.raytrace.variant)
     if choice.variant.startswith("scalar"):
         raise UserError(
             f"model.base={kind} needs a jit variant of Mitsuba (LLVM or CUDA; see `dnrpipe doctor`);"
             " or choose --set model.base=raster"
         )
     config = trace_config(workspace, plan, choice.variant)
-    light = [config["integrator"], config["max_depth"], sorted(plan.left_out), scene_fingerprint(workspace)]
+    inputs = [config["integrator"], config["max_depth"], sorted(plan.left_out), scene_fingerprint(workspace)]
     common: dict[str, Any] = {
         "bundle": config["bundle"],
         "variant": choice.variant,
@@ -178,7 +161,7 @@ def renderer_inputs(
     }
     if kind == "baked":
         common |= {"light": str(light_path(workspace)), "denoise": chosen.denoise}
-        task = {
+        light = {
             "output": common["light"],
             "size": light_size(settings),
             "spp": light_spp(settings),
@@ -186,8 +169,9 @@ def renderer_inputs(
             "max_depth": config["max_depth"],
             "seed": settings.raytrace.seed,
         }
-        task["fingerprint"] = digest([LIGHT_VERSION, light, {k: v for k, v in task.items() if k != "output"}])
-        return common, choice.environment, task, digest([task["fingerprint"], chosen.samples, chosen.denoise])
+        light["fingerprint"] = digest([LIGHT_VERSION, inputs, {k: v for k, v in light.items() if k != "output"}])
+        fingerprint = digest([light["fingerprint"], chosen.samples, chosen.denoise])
+        return BaseRenderer(common, choice.environment, light, fingerprint)
     direct = kind == "direct"
     common |= {
         "integrator": "path" if direct else config["integrator"],
@@ -195,72 +179,47 @@ def renderer_inputs(
         "spp": chosen.spp,
         "seed": settings.raytrace.seed,
     }
-    stamp = digest([kind, light, chosen.spp, chosen.samples, settings.raytrace.seed])
-    return common, choice.environment, None, stamp
+    fingerprint = digest([kind, inputs, chosen.spp, chosen.samples, settings.raytrace.seed])
+    return BaseRenderer(common, choice.environment, None, fingerprint)
 
 
-def light_is_baked(task: dict[str, Any]) -> bool:
-    """Whether the light of :func:`renderer_inputs` is on disk."""
-    return _light_print(Path(task["output"])) == task["fingerprint"]
-
-
-def bake_light(
-    workspace: Workspace,
-    console: Console,
-    run_id: str,
-    stage: Any,
-    common: dict[str, Any],
-    environment: dict[str, str],
-    task: dict[str, Any],
-) -> dict[str, Any] | None:
+def bake_light(run: Run, renderer: BaseRenderer) -> dict[str, Any] | None:
     """Bake the light where it is missing or of other inputs -> the worker's answer; None where nothing was due.
 
-    common, environment, task: of :func:`renderer_inputs`. Booked in the ledger under ``stage``.
     Raises UserError: it failed twice.
     """
-    if light_is_baked(task):
+    task = renderer.light
+    if task is None or renderer.light_is_baked:
         return None
-    result: dict[str, Any] = {}
-    shared = {"bundle": common["bundle"], "variant": common["variant"]}
-    with console.bar("baking light", 1) as bar:
-        outcomes = run_tasks(
+    variant = renderer.common["variant"]
+    with run.console.bar("baking light", 1) as bar:
+        result = only_answer(
+            "baking light",
             "dnrpipe.raytrace.light_worker",
-            shared,
-            [task],
-            workers=1,
-            log=workspace.log(stage),
-            environment=environment,
+            {"bundle": renderer.common["bundle"], "variant": variant},
+            task,
+            log=run.log,
+            console=run.console,
+            environment=renderer.environment,
         )
-        for outcome in outcomes:
-            if isinstance(outcome, Retry):
-                console.warn(f"baking light: {outcome.reason}; trying once more")
-                continue
-            if outcome.result is None:
-                raise UserError(f"baking light failed twice: {outcome.error}; see {workspace.log(stage)}")
-            result = outcome.result
-            bar.advance(note=f"{task['size']}² texels, {task['spp']} spp")
-            if result["lost"]:
-                console.warn(f"repaired: {result['lost']} samples of the baked light were not finite and are left out")
-            workspace.ledger.append(
-                CostRecord(
-                    time=time.time(),
-                    run=run_id,
-                    stage=stage,
-                    purpose="training",
-                    unit="scene",
-                    name="light",
-                    seconds=result["seconds"],
-                    cpu_seconds=result["cpu_seconds"],
-                    device=f"mitsuba {common['variant']}",
-                    spp=task["spp"],
-                    peak_mb=result["peak_mb"],
-                    detail={"texels": result["texels"], "lost": result["lost"]},
-                )
-            )
+        bar.advance(note=f"{task['size']}² texels, {task['spp']} spp")
+    if result["lost"]:
+        run.console.warn(f"repaired: {result['lost']} samples of the baked light were not finite and are left out")
+    run.book(
+        "training",
+        "scene",
+        "light",
+        result["seconds"],
+        cpu_seconds=result["cpu_seconds"],
+        device=f"mitsuba {variant}",
+        spp=task["spp"],
+        peak_mb=result["peak_mb"],
+        detail={"texels": result["texels"], "lost": result["lost"]},
+    )
     return result
 
 
-def _light_print(path: Path) -> str | None:
+def _light_fingerprint(path: Path) -> str | None:
     try:
         with np.load(path, allow_pickle=False) as data:
             return str(data["fingerprint"])

@@ -9,25 +9,23 @@ from typing import Any
 import numpy as np
 
 from dnrtrain.atomic import write_json
-from dnrtrain.contract import ContractError, View
+from dnrtrain.contract import ContractError
 from dnrtrain.exr import read_metadata
 
-from ..core.console import Console
 from ..core.errors import UserError
 from ..core.images import flip_error, write_png
-from ..core.ledger import CostRecord
 from ..core.scene_files import split_views
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest
 from .base_images import RENDERED, base_path, base_views
 from .raytrace import trace_views
-from .stage import Outcome
+from .stage import Outcome, Run
 from .trainer import load, perceptual_weights, torch_device
 
 NEURAL_REPEATS = 5
 
 
-def run(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
+def evaluate(run: Run) -> Outcome:
     """Trace the test views, render them with the DNR, measure, write pictures and ``metrics.json``."""
     import torch
 
@@ -36,21 +34,12 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
     from dnrtrain.model import render_views
     from dnrtrain.perceptual import Lpips
 
+    workspace, settings, console = run.workspace, run.settings, run.console
     views = split_views(workspace)["test"]
     if not views:
         raise UserError("evaluate: the workspace has no test views; prepare again with cameras.test > 0")
-    trace_views(
-        workspace,
-        settings,
-        console,
-        run_id,
-        views=views,
-        split="test",
-        spp=settings.raytrace.evaluation_spp,
-        stage="evaluate",
-        purpose="evaluation",
-    )
-    base_views(workspace, settings, console, run_id, views=views, split="test", stage="evaluate", purpose="evaluation")
+    trace_views(run, views, "test")
+    base_views(run, views, "test")
     device = torch_device(settings)
     model = load_model(workspace.checkpoints("step2"), device)
     perceptual = perceptual_weights(console)
@@ -85,7 +74,15 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
                 write_png(workspace.evaluation / f"{view.name}.{kind}.png", picture)
                 files[kind] = f"evaluation/{view.name}.{kind}.png"
             console.events.send("picture", split="test", view=view.name, files=files, psnr=row["psnr"])
-            workspace.ledger.append(_record(run_id, view, seconds, device))
+            run.book(
+                "evaluation",
+                "view",
+                f"neural/{view.name}",
+                seconds,
+                device=device,
+                width=view.width,
+                height=view.height,
+            )
             bar.advance(note=f"{row['psnr']:.2f} dB")
     torch_name = torch.cuda.get_device_name() if device.startswith("cuda") else "cpu"
     report = {
@@ -97,7 +94,7 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
         "reference_noise_target": settings.raytrace.evaluation_noise,
         "neural_ms": 1000 * float(np.median([row["seconds_neural"] for row in rows])),
     }
-    _remove_strangers(workspace, {view.name for view in views})
+    _remove_other_pictures(workspace, {view.name for view in views})
     write_json(workspace.evaluation / "metrics.json", report)
     mean = report["mean"]
     console.say(
@@ -158,22 +155,7 @@ def _mean(rows: list[dict[str, Any]]) -> dict[str, float | None]:
     return result
 
 
-def _remove_strangers(workspace: Workspace, names: set[str]) -> None:
+def _remove_other_pictures(workspace: Workspace, names: set[str]) -> None:
     for path in workspace.evaluation.glob("[!.]*.png"):
         if path.name.rsplit(".", 2)[0] not in names:
             path.unlink()
-
-
-def _record(run_id: str, view: View, seconds: float, device: str) -> CostRecord:
-    return CostRecord(
-        time=time.time(),
-        run=run_id,
-        stage="evaluate",
-        purpose="evaluation",
-        unit="view",
-        name=f"neural/{view.name}",
-        seconds=seconds,
-        device=device,
-        width=view.width,
-        height=view.height,
-    )

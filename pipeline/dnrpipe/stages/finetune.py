@@ -1,11 +1,12 @@
-"""What a held-out view looks like while fine-tuning goes on: which view, its inputs, its files.
+"""Stage `finetune`: step 2 on the selected ray-traced views, with a held-out view to look at while it goes on.
 
 preview/
   prediction.png   the view by the weights of now, display space, SIDE pixels at most
   truth.png        its ray-traced reference, where one is on disk
   preview.json     split, view, epoch, epochs, psnr (None without a reference), truth, time (unix seconds)
+  base/            its base image
 
-It is looked at and never used: no setting, stop or choice depends on it.
+The picture is looked at and never used: no setting, stop or choice depends on it.
 """
 
 from __future__ import annotations
@@ -18,19 +19,15 @@ from dnrtrain.atomic import write_json
 from dnrtrain.contract import ContractError, View
 from dnrtrain.events import Previewed
 
-from ..core.console import Console
 from ..core.errors import UserError
-from ..core.ledger import CostRecord
-from ..core.scene_files import split_views
+from ..core.scene_files import read_selection, split_views
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest, file_sha256
-from ..effects.store import plan_of
 from ..workers.view_tasks import TasksFailed
-from .base_images import RENDERED, base_is_made, base_views
-from .pipeline import STAGES, fingerprint
+from .base_images import base_views
 from .raytrace import reference_is_made
-from .stage import Outcome
-from .trainer import epochs_done, follow, load, perceptual_weights, read_selection, torch_device
+from .stage import Outcome, Run
+from .trainer import epochs_done, follow, load, perceptual_weights, torch_device
 
 if TYPE_CHECKING:
     import numpy as np
@@ -43,6 +40,41 @@ LARGEST = 1 << 21
 """Pixels. Training goes by squares of a view; a picture shows the whole, which would take more memory than that."""
 
 
+def finetune(run: Run) -> Outcome:
+    """Step 2: fine-tune the coarse DNR on the selected ray-traced views."""
+    from dnrtrain.step2 import run_step2
+
+    workspace, settings = run.workspace, run.settings
+    by_name = {view.name: view for view in split_views(workspace)["train"]}
+    names = read_selection(workspace).views
+    dataset = load(workspace, [by_name[name] for name in names], "train", raytraced=True, base=settings.model.base)
+    folder = workspace.checkpoints("step2")
+    weights = perceptual_weights(run.console)
+    picture = LivePicture(run, dataset)
+    events = run_step2(
+        dataset,
+        None,
+        workspace.checkpoints("step1"),
+        run.effect_plan.model(settings.model),
+        settings.finetune.step2,
+        seed=settings.finetune.seed,
+        device=torch_device(settings),
+        checkpoints=folder,
+        fingerprint=digest([run.fingerprint, weights is not None]),
+        weights=weights,
+        preview=picture.preview,
+    )
+    for event in follow(run, events, settings.finetune.step2.epochs):
+        if isinstance(event, Previewed):
+            picture.show(event)
+    return Outcome(file_sha256(folder / "model.safetensors"), {"perceptual": weights is not None, "views": len(names)})
+
+
+def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
+    """(epochs trained, epochs wanted)."""
+    return epochs_done(workspace.checkpoints("step2"), settings.finetune.step2.epochs, True)
+
+
 def shown_view(workspace: Workspace, settings: Settings) -> View | None:
     """The middle one of the test views; None: previews are off, or there are no test views."""
     views = split_views(workspace).get("test")
@@ -50,14 +82,16 @@ def shown_view(workspace: Workspace, settings: Settings) -> View | None:
 
 
 class LivePicture:
-    """The pictures of one fine-tuning. ``preview``: what the trainer is given; None: there are none, which was said."""
+    """The pictures of one fine-tuning. ``preview``: what the trainer is given; None: there are none, which was said.
 
-    def __init__(
-        self, workspace: Workspace, settings: Settings, console: Console, run_id: str, training: ViewSet
-    ) -> None:
-        self.workspace, self.console, self.run_id = workspace, console, run_id
+    training: the views that are trained on.
+    """
+
+    def __init__(self, run: Run, training: ViewSet) -> None:
+        self.run, self.workspace, self.console = run, run.workspace, run.console
         self.split = "train"
         self.preview: Preview | None = None
+        settings, console = run.settings, run.console
         if settings.finetune.preview_seconds == 0:
             return
         if importlib.util.find_spec("PIL") is None:
@@ -68,39 +102,32 @@ class LivePicture:
             return
         from dnrtrain.preview import Preview
 
-        views = self._held_out(settings) or training.subset([0])
+        views = self._held_out() or training.subset([0])
         self.preview = Preview(views, settings.finetune.preview_seconds)
 
-    def _held_out(self, settings: Settings) -> ViewSet | None:
+    def _held_out(self) -> ViewSet | None:
         """The view's inputs; None, with the reason said, where a training view must do."""
+        settings = self.run.settings
         view = shown_view(self.workspace, settings)
         if view is None:
             self.console.say("no test views: the pictures while it trains are of a training view")
             return None
+        base = self.workspace.preview / "base" / f"{view.name}.exr"
         try:
-            self._base(settings, view)
-            traced = reference_is_made(self.workspace, settings, view)
-            views = load(self.workspace, [view], "test", raytraced=traced, base=settings.model.base)
-        except (ContractError, UserError, TasksFailed) as error:  # evaluation's files: training does without them
+            base_views(self.run, [view], "test", paths=[base], purpose="evaluation")
+            views = load(
+                self.workspace,
+                [view],
+                "test",
+                raytraced=reference_is_made(self.workspace, settings, view),
+                base=settings.model.base,
+                base_files=[base],
+            )
+        except (ContractError, UserError, TasksFailed) as error:  # training does without them
             self.console.warn(f"view {view.name} cannot be shown ({error}); the pictures are of a training view")
             return None
         self.split = "test"
         return views
-
-    def _base(self, settings: Settings, view: View) -> None:
-        """Its base image, as evaluation makes it; as a rule `raytrace-selected` has made it already."""
-        if settings.model.base not in RENDERED or base_is_made(self.workspace, settings, "test", view):
-            return
-        base_views(
-            self.workspace,
-            settings,
-            self.console,
-            self.run_id,
-            views=[view],
-            split="test",
-            stage="evaluate",
-            purpose="evaluation",
-        )
 
     def show(self, event: Previewed) -> None:
         """Write the picture, tell of it, and book what it took. A full disk costs the picture, not the training."""
@@ -123,18 +150,12 @@ class LivePicture:
             self.console.warn(f"{folder}: the picture of epoch {event.epoch} cannot be written ({error.strerror})")
             return
         self.console.events.send("preview", stage="finetune", files=files, **facts)
-        self.workspace.ledger.append(self._record(event, event.seconds + time.monotonic() - started))
-
-    def _record(self, event: Previewed, seconds: float) -> CostRecord:
         height, width = event.image.shape[:2]
-        return CostRecord(
-            time=time.time(),
-            run=self.run_id,
-            stage="finetune",
-            purpose="evaluation",
-            unit="view",
-            name=f"preview/{event.view}",
-            seconds=seconds,
+        self.run.book(
+            "evaluation",
+            "view",
+            f"preview/{event.view}",
+            event.seconds + time.monotonic() - started,
             device=event.device,
             width=width,
             height=height,
@@ -154,41 +175,3 @@ def _small(image: np.ndarray) -> Any:
     channels = [Image.fromarray(np.ascontiguousarray(image[..., c], np.float32)).resize(size, Image.Resampling.BOX)
                 for c in range(3)]  # fmt: skip
     return np.stack([np.asarray(channel) for channel in channels], axis=-1)
-
-
-def run_finetune(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
-    """Step 2: fine-tune the coarse DNR on the selected ray-traced views."""
-    from dnrtrain.step2 import run_step2
-
-    from .previews import LivePicture  # which imports this module
-
-    by_name = {view.name: view for view in split_views(workspace)["train"]}
-    names = read_selection(workspace)["views"]
-    dataset = load(workspace, [by_name[name] for name in names], "train", raytraced=True, base=settings.model.base)
-    stamp = fingerprint(STAGES["finetune"], workspace, settings)
-    assert stamp is not None
-    folder = workspace.checkpoints("step2")
-    weights = perceptual_weights(console)
-    picture = LivePicture(workspace, settings, console, run_id, dataset)
-    events = run_step2(
-        dataset,
-        None,
-        workspace.checkpoints("step1"),
-        plan_of(workspace, settings).model(settings.model),
-        settings.finetune.step2,
-        seed=settings.finetune.seed,
-        device=torch_device(settings),
-        checkpoints=folder,
-        fingerprint=digest([stamp, weights is not None]),
-        weights=weights,
-        preview=picture.preview,
-    )
-    for event in follow(events, "finetune", settings.finetune.step2.epochs, workspace, console, run_id):
-        if isinstance(event, Previewed):
-            picture.show(event)
-    return Outcome(file_sha256(folder / "model.safetensors"), {"perceptual": weights is not None, "views": len(names)})
-
-
-def finetune_progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
-    """(epochs trained, epochs wanted)."""
-    return epochs_done(workspace.checkpoints("step2"), settings.finetune.step2.epochs, True)

@@ -11,7 +11,7 @@ from ..core.errors import UserError
 from ..core.settings import PassSettings
 from ..effects.bundle import bundle_facts
 from ..effects.plan import plan_effects
-from ..workers.processes import Retry, run_tasks
+from .opening import open_scene
 
 LISTED = 12  # names per line
 ORDER = ("approximated", "baked", "ignored", "missing")
@@ -35,7 +35,8 @@ def inspect_scene(scene: Path) -> dict[str, Any]:
         raise UserError(f"{scene}: no such file")
     with tempfile.TemporaryDirectory(prefix="dnrpipe-inspect-") as folder:
         bundle = Path(folder) / "bundle"
-        answer = _ask(scene, bundle, Path(folder) / "log")
+        task = {"source": str(scene.resolve()), "folder": str(bundle), "bake_size": PassSettings().bake_size}
+        answer, _ = open_scene("dnrpipe.blender.inspection", scene, task, Path(folder) / "log")
         facts = bundle_facts(bundle / "scene.xml") if bundle.exists() else {}  # nothing visible: nothing converted
     census = answer["census"]
     findings = {kind: [f for f in census["findings"] if f["kind"] == kind] for kind in ("exact", *ORDER)}
@@ -48,19 +49,6 @@ def inspect_scene(scene: Path) -> dict[str, Any]:
         "findings": findings,
         "effects": [effect.model_dump(mode="json", exclude={"cost", "error"}) for effect in plan.effects],
     }
-
-
-def _ask(scene: Path, folder: Path, log: Path) -> dict[str, Any]:
-    task = {"source": str(scene.resolve()), "folder": str(folder), "bake_size": PassSettings().bake_size}
-    for outcome in run_tasks("dnrpipe.blender.inspection", {}, [task], workers=1, log=log):
-        if isinstance(outcome, Retry):
-            continue
-        if outcome.died:
-            raise UserError(f"{scene}: Blender could not open it ({outcome.error}): damaged or truncated?")
-        if outcome.result is None:
-            raise UserError(str(outcome.error))
-        return outcome.result
-    raise AssertionError("run_tasks answers every task")
 
 
 def exact(census: dict[str, Any]) -> dict[str, list[str]]:

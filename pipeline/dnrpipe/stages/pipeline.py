@@ -7,7 +7,6 @@ state              = missing | partial | stale | done
 
 from __future__ import annotations
 
-import importlib
 import os
 import platform
 import shutil
@@ -15,16 +14,18 @@ import time
 from pathlib import Path
 from typing import Any
 
-from dnrtrain.selector.names import ACTIVE_NAMES, SHIPPED_WEIGHTS
+from dnrtrain.contract import DamagedFile
 
 from .. import __version__
-from ..core.console import Console, clock
+from ..core.console import clock
 from ..core.effect_names import NEURAL
 from ..core.errors import UserError
+from ..core.ledger import StageName
 from ..core.scene_files import scene_fingerprint
 from ..core.settings import Settings
-from ..core.workspace import Workspace, digest, file_sha256
-from .stage import Outcome, Stage
+from ..core.workspace import Workspace, digest
+from . import evaluate, finetune, prepare, raytrace, select
+from .stage import Outcome, Run, Stage
 
 
 def _light(settings: Settings) -> dict[str, Any]:
@@ -54,26 +55,9 @@ def _base(settings: Settings) -> list[Any]:
 
 def _selection(settings: Settings) -> list[Any]:
     """Settings that decide which views are chosen, and the coarse model where there is one."""
-    parts: list[Any] = []
-    if settings.select.rounds > 1:  # what is traced decides what is chosen next
-        parts = [settings.select.rounds, STAGES["raytrace"].settings(settings)]
-    if settings.select.policy == "dqn":
-        parts.append(_selector_weights(settings))
     if not settings.trains_step1:
-        return [settings.select.model_dump(include={"budget", "policy", "seed"}), *parts]
-    if settings.select.policy in ACTIVE_NAMES:
-        parts.append([settings.select.active.model_dump(), settings.starts_coarse])
-    select = settings.select.model_dump(exclude={"rounds", "weights", "active"})
-    if select["policy"] == "rl-paper":
-        select["policy"] = "rl"  # its first name: what was trained under it stays done
-    return [settings.model.coarse().model_dump(), select, _neural(settings), *parts]
-
-
-def _selector_weights(settings: Settings) -> str:
-    """Hash of the learned selector's weights; "" while there are none."""
-    named = settings.select.weights
-    path = Path(named) if named else SHIPPED_WEIGHTS
-    return file_sha256(path) if path.is_file() else ""
+        return [settings.select.model_dump(include={"budget", "policy", "seed"})]
+    return [settings.model.coarse().model_dump(), settings.select.model_dump(), _neural(settings)]
 
 
 def _neural(settings: Settings) -> dict[str, list[str]]:
@@ -97,8 +81,8 @@ STAGES: dict[str, Stage] = {
                 s.passes.model_dump(exclude={"workers"}),
                 *(["raster"] if s.model.base == "raster" else []),
             ],
-            run="dnrpipe.stages.prepare:run",
-            progress="dnrpipe.stages.prepare:progress",
+            make=prepare.prepare,
+            progress=prepare.progress,
         ),
         Stage(
             name="select",
@@ -108,8 +92,8 @@ STAGES: dict[str, Stage] = {
             reads=("passes", "cameras"),
             writes=("selection.json", "checkpoints/step1"),
             settings=_selection,
-            run="dnrpipe.stages.select:run",
-            progress="dnrpipe.stages.select:progress",
+            make=select.select_views,
+            progress=select.progress,
         ),
         Stage(
             name="raytrace",
@@ -123,8 +107,8 @@ STAGES: dict[str, Stage] = {
                 _light(s),
                 _base(s),
             ],
-            run="dnrpipe.stages.raytrace:run",
-            progress="dnrpipe.stages.raytrace:progress",
+            make=raytrace.raytrace_selected,
+            progress=raytrace.progress,
         ),
         Stage(
             name="finetune",
@@ -134,8 +118,8 @@ STAGES: dict[str, Stage] = {
             reads=("passes", "raytraced/train", "base/train", "checkpoints/step1"),
             writes=("checkpoints/step2", "preview"),
             settings=lambda s: [s.model.model_dump(), s.finetune.model_dump(exclude={"preview_seconds"}), _neural(s)],
-            run="dnrpipe.stages.trainer:run_finetune",
-            progress="dnrpipe.stages.trainer:finetune_progress",
+            make=finetune.finetune,
+            progress=finetune.progress,
         ),
         Stage(
             name="evaluate",
@@ -149,8 +133,8 @@ STAGES: dict[str, Stage] = {
                 _light(s),
                 _base(s),
             ],
-            run="dnrpipe.stages.evaluate:run",
-            progress="dnrpipe.stages.evaluate:progress",
+            make=evaluate.evaluate,
+            progress=evaluate.progress,
         ),
     )
 }
@@ -178,7 +162,7 @@ def state(stage: Stage, workspace: Workspace, settings: Settings) -> str:
     Work done without perceptual weights is stale once they are here; the other way round it stays.
     """
     record = workspace.manifest.stages.get(stage.name)
-    present, wanted = _call(stage.progress, workspace, settings)
+    present, wanted = stage.progress(workspace, settings)
     if record is None:
         return "partial" if present else "missing"
     if record.fingerprint != fingerprint(stage, workspace, settings):
@@ -190,14 +174,12 @@ def state(stage: Stage, workspace: Workspace, settings: Settings) -> str:
     return "done" if present >= wanted else "partial"
 
 
-def run_stage(
-    name: str, workspace: Workspace, settings: Settings, console: Console, *, force: bool = False
-) -> dict[str, Any]:
+def run_stage(name: StageName, run: Run, *, force: bool = False) -> dict[str, Any]:
     """Run one stage if it is due. Returns its facts; ``"ran"`` says whether it did anything.
 
     Raises UserError: a stage that it needs has not run or is out of date.
     """
-    stage = STAGES[name]
+    stage, workspace, settings, console = STAGES[name], run.workspace, run.settings, run.console
     require_inputs(stage, workspace, settings)
     if not force and state(stage, workspace, settings) == "done":
         console.say(f"{stage.command}: up to date")
@@ -208,43 +190,42 @@ def run_stage(
                 f"{workspace.manifest.source.path}: the scene file is gone; --force would lose its conversion"
             )
         clear(stage, workspace)
+    inputs = fingerprint(stage, workspace, settings)
+    assert inputs is not None  # they were required above
     record = workspace.manifest.stages.get(name)
-    if record is not None and record.fingerprint != fingerprint(stage, workspace, settings):
+    if record is not None and record.fingerprint != inputs:
         record.fingerprint = ""  # its files are about to change: not done until this run has finished
     started = time.monotonic()
-    run_id = f"{name}-{int(time.time()):x}"
     workspace.manifest.versions = {"dnrpipe": __version__, "python": platform.python_version()}
     workspace.manifest.settings = settings.model_dump(mode="json")
     workspace.save()
-    outcome = _run_mending(stage, workspace, settings, console, run_id)
+    outcome = _make(stage, run, inputs)
     seconds = time.monotonic() - started
-    done = fingerprint(stage, workspace, settings)
-    assert done is not None  # its inputs were required above
+    done = fingerprint(stage, workspace, settings)  # anew: `prepare` finds out which files a scene refers to
+    assert done is not None
     workspace.finish_stage(name, fingerprint=done, output=outcome.output, seconds=seconds, detail=outcome.detail)
     console.say(f"{stage.command}: done in {clock(seconds)}")
     return {"stage": name, "ran": True, "seconds": seconds, **outcome.detail}
 
 
-def _run_mending(stage: Stage, workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
+def _make(stage: Stage, run: Run, inputs: str) -> Outcome:
     """Run the stage; a damaged file that it meets is named, thrown away and made again by the stage it is from.
 
     Raises DamagedFile: the file is of no stage, or was damaged again.
     """
-    from dnrtrain.contract import DamagedFile
-
     met: set[Path] = set()
     while True:
         try:
-            return _call(stage.run, workspace, settings, console, run_id)
+            return stage.make(run.for_stage(stage.name, inputs))
         except DamagedFile as damage:
-            owner = owner_of(damage.path, workspace)
+            owner = owner_of(damage.path, run.workspace)
             if owner is None or damage.path in met:
                 raise
             met.add(damage.path)
-            console.warn(f"{damage.path}: damaged ({damage.reason}); `dnrpipe {owner.command}` makes it again")
-            discard(damage.path, owner, workspace)
+            run.console.warn(f"{damage.path}: damaged ({damage.reason}); `dnrpipe {owner.command}` makes it again")
+            discard(damage.path, owner, run.workspace)
             if owner.name != stage.name:
-                run_stage(owner.name, workspace, settings, console)
+                run_stage(owner.name, run)
 
 
 def owner_of(path: Path, workspace: Workspace) -> Stage | None:
@@ -306,7 +287,7 @@ def status(workspace: Workspace, settings: Settings) -> list[dict[str, Any]]:
     """One row per stage: name, command, state, units present and wanted, seconds of its last run."""
     rows = []
     for stage in STAGES.values():
-        present, wanted = _call(stage.progress, workspace, settings)
+        present, wanted = stage.progress(workspace, settings)
         record = workspace.manifest.stages.get(stage.name)
         rows.append(
             {
@@ -322,8 +303,3 @@ def status(workspace: Workspace, settings: Settings) -> list[dict[str, Any]]:
             }
         )
     return rows
-
-
-def _call(target: str, *arguments: Any) -> Any:
-    module, _, function = target.partition(":")
-    return getattr(importlib.import_module(module), function)(*arguments)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import shutil
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +15,14 @@ from ..blender.finding_lines import finding_lines
 from ..core.cameras import depth_range, make_cameras
 from ..core.console import Console
 from ..core.errors import UserError
-from ..core.ledger import CostRecord
 from ..core.scene_files import read_frame, read_json, read_summary, scene_fingerprint
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest, file_sha256
-from ..effects.store import keep_plan, plan_of
-from ..workers.processes import Retry, run_tasks
-from ..workers.view_tasks import run_view_tasks, view_record, warn_repairs, worker_count
+from ..effects.store import keep_plan
+from ..workers.view_tasks import warn_of_repairs, worker_count
 from .baking import FOLDER, bake
-from .stage import Outcome
+from .opening import open_scene
+from .stage import Outcome, Run
 
 MAX_BAKE_ROUNDS = 4
 """Values whose need shows only after others are baked take further rounds; two are the rule."""
@@ -33,43 +31,23 @@ PASSES_VERSION = 1
 RASTERISED = ("train", "val")
 
 
-def run(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
+def prepare(run: Run) -> Outcome:
     """Do what is missing: convert the scene, place the cameras, render the passes."""
-    summary, views = scene_and_views(workspace, settings, console, run_id)
-    _plan_effects(workspace, settings, console)
-    scene_print = scene_fingerprint(workspace)
-    engine, reason = _raster_engine(workspace, settings, console)
-    raster = settings.model.base == "raster"  # then test views need it, too
-    tasks = [
-        pass_task(workspace, settings, view, split, scene_print, engine, raster=split in RASTERISED or raster)
-        for split in SPLITS
-        for view in views[split]
-    ]
-
-    def book(task: dict[str, Any], result: dict[str, Any], workers: int) -> CostRecord:
-        purpose = "evaluation" if Path(task["output"]).parent.name == "test" else "training"
-        return view_record(
-            run=run_id,
-            stage="prepare",
-            purpose=purpose,
-            task=task,
-            result=result,
-            workers=workers,
-            device="cpu",
-        )
-
-    run_view_tasks(
+    workspace = run.workspace
+    summary, views = scene_and_views(run)
+    _plan_effects(run)
+    engine, reason = _raster_engine(run)
+    raster = run.settings.model.base == "raster"  # then test views need it, too
+    wanted = [(split, view) for split in SPLITS for view in views[split]]
+    tasks = draw_passes(
+        run,
         "passes",
-        "dnrpipe.blender.passes.worker",
-        pass_common(workspace, settings, engine),
-        tasks,
-        workspace=workspace,
-        console=console,
-        stage="prepare",
-        workers=worker_count(settings.passes.workers),
-        book=book,
+        [view for _, view in wanted],
+        [workspace.passes(split, view.name) for split, view in wanted],
+        engine,
+        raster=[split in RASTERISED or raster for split, _ in wanted],
     )
-    warn_repairs(tasks, console)
+    warn_of_repairs(tasks, run.console)
     return Outcome(
         # Views, scene and engine are all in the tasks' fingerprints.
         digest([[Path(task["output"]).parent.name, task["fingerprint"]] for task in tasks]),
@@ -82,20 +60,18 @@ def run(workspace: Workspace, settings: Settings, console: Console, run_id: str)
     )
 
 
-def _plan_effects(workspace: Workspace, settings: Settings, console: Console) -> None:
+def _plan_effects(run: Run) -> None:
     """Write the effect plan, as far as it is known without its pilot, and say what is on."""
-    plan = plan_of(workspace, settings)
-    keep_plan(workspace, plan)
+    plan = run.effect_plan
+    keep_plan(run.workspace, plan)
     named = [effect.title for effect in plan.effects if effect.on and effect.part == "light"]
-    console.say(f"effects: {', '.join(named) or 'none'} (`dnrpipe effects` says why)")
+    run.console.say(f"effects: {', '.join(named) or 'none'} (`dnrpipe effects` says why)")
 
 
-def scene_and_views(
-    workspace: Workspace, settings: Settings, console: Console, run_id: str
-) -> tuple[dict[str, Any], dict[str, list[View]]]:
+def scene_and_views(run: Run) -> tuple[dict[str, Any], dict[str, list[View]]]:
     """Convert the scene and place the cameras, where that is not done: (summary, views by split). No passes."""
-    summary = _convert(workspace, settings, console, run_id)
-    return summary, _place_cameras(workspace, settings, summary)
+    summary = _convert(run)
+    return summary, _place_cameras(run.workspace, run.settings, summary)
 
 
 def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
@@ -107,41 +83,49 @@ def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
     return min(present, wanted), wanted
 
 
-def pass_task(
-    workspace: Workspace,
-    settings: Settings,
-    view: View,
-    split: str,
-    scene_print: str,
+def draw_passes(
+    run: Run,
+    label: str,
+    views: Sequence[View],
+    paths: Sequence[Path],
     engine: str,
     *,
-    raster: bool,
-    output: Path | None = None,
-) -> dict[str, Any]:
-    """Task of :class:`dnrpipe.blender.passes.worker.Worker` for one view; its fingerprint names all that decides it."""
-    data = view.model_dump(mode="json")
-    coverage = settings.passes.coverage_samples
-    colour = [engine, settings.passes.raster_samples] if raster else None
-    return {
-        "view": data,
-        "output": str(output or workspace.passes(split, view.name)),
-        "raster": raster,
-        "fingerprint": digest([PASSES_VERSION, scene_print, data, coverage, colour]),
-    }
+    raster: Sequence[bool],
+) -> list[dict[str, Any]]:
+    """G-buffers of the views, those that are missing or out of date, by Blender. Returns all tasks.
+
+    Args:
+        label: of the progress bar.
+        paths: a file for each view.
+        engine: for rasterised colour.
+        raster: for each view, whether it gets rasterised colour.
+    """
+    passes = run.settings.passes
+    tasks = []
+    for view, path, coloured in zip(views, paths, raster, strict=True):
+        data = view.model_dump(mode="json")
+        colour = [engine, passes.raster_samples] if coloured else None
+        decisive = [PASSES_VERSION, run.scene_fingerprint, data, passes.coverage_samples, colour]
+        tasks.append({"view": data, "output": str(path), "raster": coloured, "fingerprint": digest(decisive)})
+    run.view_tasks(
+        label,
+        "dnrpipe.blender.passes.worker",
+        {
+            "scene_dir": str(run.workspace.scene),
+            "raster_engine": engine,
+            "raster_samples": passes.raster_samples,
+            "coverage_samples": passes.coverage_samples,
+        },
+        tasks,
+        workers=worker_count(passes.workers),
+        book=run.book_views("cpu"),
+    )
+    return tasks
 
 
-def pass_common(workspace: Workspace, settings: Settings, engine: str) -> dict[str, Any]:
-    """What all pass workers share."""
-    return {
-        "scene_dir": str(workspace.scene),
-        "raster_engine": engine,
-        "raster_samples": settings.passes.raster_samples,
-        "coverage_samples": settings.passes.coverage_samples,
-    }
-
-
-def _convert(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> dict[str, Any]:
+def _convert(run: Run) -> dict[str, Any]:
     """Open the scene in a worker and write ``scene/``, whole or not at all."""
+    workspace, settings, console = run.workspace, run.settings, run.console
     marker = workspace.scene / "prepared.json"
     if marker.exists() and read_json(marker)["fingerprint"] == scene_fingerprint(workspace):
         summary = read_summary(workspace)
@@ -156,7 +140,7 @@ def _convert(workspace: Workspace, settings: Settings, console: Console, run_id:
     fresh = workspace.root / "scene.new"
     if fresh.exists():
         shutil.rmtree(fresh)
-    _run_conversion(source, fresh, workspace, settings, console)
+    _run_conversion(run, source, fresh)
     _refuse_if_strict(source, fresh, settings)
     # The old scene stays until the new one is whole; killed in between, the next run converts again.
     if workspace.scene.exists():
@@ -166,17 +150,7 @@ def _convert(workspace: Workspace, settings: Settings, console: Console, run_id:
     for warning in summary["warnings"]:
         console.warn(warning)
     _show_findings(workspace, console)
-    workspace.ledger.append(
-        CostRecord(
-            time=time.time(),
-            run=run_id,
-            stage="prepare",
-            purpose="training",
-            unit="scene",
-            name="convert",
-            seconds=time.monotonic() - started,
-        )
-    )
+    run.book("training", "scene", "convert", time.monotonic() - started)
     # frame.json is not among them: near and far follow the cameras.
     files = {
         str(path.relative_to(workspace.scene)): file_sha256(path)
@@ -187,39 +161,22 @@ def _convert(workspace: Workspace, settings: Settings, console: Console, run_id:
     return summary
 
 
-def _run_conversion(source: Path, folder: Path, workspace: Workspace, settings: Settings, console: Console) -> None:
+def _run_conversion(run: Run, source: Path, folder: Path) -> None:
     """Convert; where the worker asks for bakes, bake them and convert again."""
+    workspace, settings = run.workspace, run.settings
     size, refused = settings.passes.bake_size, list[str]()
     for _ in range(MAX_BAKE_ROUNDS):
         options = {"folder": str(workspace.root / FOLDER), "size": size, "refused": refused}
         task = {"source": str(source), "scene_dir": str(folder), "strict": settings.strict, "bakes": options}
-        pending = _attempt(source, task, workspace, console).get("bakes")
-        if pending is None:
-            return
-        refused += bake(workspace, console, source, folder / "geometry.npz", pending, size, settings.passes.workers)
-    raise RuntimeError(f"{source}: the same textures are to be baked again and again")
-
-
-def _attempt(source: Path, task: dict[str, Any], workspace: Workspace, console: Console) -> dict[str, Any]:
-    """The worker's result, or what went wrong as a UserError; a second try is told of where it helped."""
-    result: dict[str, Any] = {}
-    first = ""
-    with console.bar("scene", 1) as bar:
-        for outcome in run_tasks("dnrpipe.blender.prepare", {}, [task], workers=1, log=workspace.log("prepare")):
-            if isinstance(outcome, Retry):
-                first = outcome.reason
-                continue
-            if outcome.errno == errno.ENOSPC:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), task["scene_dir"])
-            if outcome.died:
-                raise UserError(f"{source}: Blender could not open it ({outcome.error}): damaged or truncated?")
-            if outcome.result is None:
-                raise UserError(str(outcome.error))
-            result = outcome.result
+        with run.console.bar("scene", 1) as bar:
+            result, first_failure = open_scene("dnrpipe.blender.prepare", source, task, run.log)
             bar.advance()
-    if first:
-        console.warn(f"scene: {first}; opening it once more went well")
-    return result
+        if first_failure:
+            run.console.warn(f"scene: {first_failure}; opening it once more went well")
+        if result.get("bakes") is None:
+            return
+        refused += bake(run, source, folder / "geometry.npz", result["bakes"])
+    raise RuntimeError(f"{source}: the same textures are to be baked again and again")
 
 
 def _refuse_if_strict(source: Path, scene_dir: Path, settings: Settings) -> None:
@@ -234,7 +191,7 @@ def _refuse_if_strict(source: Path, scene_dir: Path, settings: Settings) -> None
             else f"{f['kind']} {f['feature']}"
             for f in found
         ]
-        raise UserError(f"{source}: {', '.join(names)}; mend the scene, or leave out --strict (--set strict=false)")
+        raise UserError(f"{source}: {', '.join(names)}; repair the scene, or leave out --strict (--set strict=false)")
 
 
 def _show_findings(workspace: Workspace, console: Console) -> None:
@@ -266,16 +223,16 @@ def _place_cameras(workspace: Workspace, settings: Settings, summary: dict[str, 
     return views
 
 
-def _raster_engine(workspace: Workspace, settings: Settings, console: Console) -> tuple[str, str]:
+def _raster_engine(run: Run) -> tuple[str, str]:
     """The engine for rasterised colour, probed once per workspace: a busy machine must not change it midway."""
     from ..blender.passes.choice import choose_raster
 
-    record = workspace.root / "passes" / "raster.json"
+    record = run.workspace.root / "passes" / "raster.json"
     if record.exists():
         chosen = read_json(record)
-        if chosen["requested"] == settings.passes.raster:
+        if chosen["requested"] == run.settings.passes.raster:
             return chosen["engine"], chosen["reason"]
-    engine, reason = choose_raster(settings.passes.raster)
-    console.say(f"raster colour by {engine}: {reason}")
-    write_json(record, {"requested": settings.passes.raster, "engine": engine, "reason": reason})
+    engine, reason = choose_raster(run.settings.passes.raster)
+    run.console.say(f"raster colour by {engine}: {reason}")
+    write_json(record, {"requested": run.settings.passes.raster, "engine": engine, "reason": reason})
     return engine, reason

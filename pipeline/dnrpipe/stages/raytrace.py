@@ -9,52 +9,29 @@ from typing import Any
 from dnrtrain.contract import ContractError, View
 from dnrtrain.exr import read_metadata
 
-from ..core.console import Console
-from ..core.ledger import CostRecord
-from ..core.scene_files import scene_fingerprint, split_views
+from ..core.scene_files import read_selection, scene_fingerprint, split_views
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest
 from ..effects.plan import EffectPlan
-from ..effects.store import lenses, plan_of, resolve_plan, trace_config, variant_for
+from ..effects.store import lenses, plan_of, trace_config, variant_for
 from ..raytrace.sample_schedule import Goal
-from ..workers.view_tasks import is_made, run_view_tasks, task_name, view_record, warn_repairs, worker_count
-from .adaptive_sampling import run_passes
+from ..workers.view_tasks import is_made, task_name, warn_of_repairs, worker_count
+from .adaptive_sampling import sample_adaptively
 from .base_images import RENDERED, base_path, base_views
-from .stage import Outcome
-from .trainer import read_selection
+from .effect_plan import resolve_plan
+from .stage import Outcome, Run
 
 TRACE_VERSION = 3
 SAMPLES_VERSION = 1
 
 
-def run(workspace: Workspace, settings: Settings, console: Console, run_id: str) -> Outcome:
+def raytrace_selected(run: Run) -> Outcome:
     """Trace the selected views that are not on disk yet, and render the base images that go with them."""
-    from .previews import shown_view  # which imports this module
-
+    workspace, settings = run.workspace, run.settings
     by_name = {view.name: view for view in split_views(workspace)["train"]}
-    selected = [by_name[name] for name in read_selection(workspace)["views"]]
-    tasks = trace_views(
-        workspace,
-        settings,
-        console,
-        run_id,
-        views=selected,
-        split="train",
-        spp=settings.raytrace.spp,
-        stage="raytrace",
-        purpose="training",
-    )
-    bases = base_views(
-        workspace,
-        settings,
-        console,
-        run_id,
-        views=selected,
-        split="train",
-        stage="raytrace",
-        purpose="training",
-        held_out=shown_view(workspace, settings),
-    )
+    selected = [by_name[name] for name in read_selection(workspace).views]
+    tasks = trace_views(run, selected, "train")
+    bases = base_views(run, selected, "train")
     made: list[Any] = [task["fingerprint"] for task in [*tasks, *bases]]
     spp = [(read_metadata(Path(task["output"])) or {}).get("spp") for task in tasks]
     if goal_of(settings, "train") is not None:
@@ -68,7 +45,7 @@ def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
     if not workspace.selection.exists():
         return 0, settings.select.budget
     try:
-        names = read_selection(workspace)["views"]
+        names = read_selection(workspace).views
     except ContractError:
         return 0, settings.select.budget  # damaged: the stage mends it when it runs
     rendered = settings.model.base in RENDERED
@@ -79,58 +56,46 @@ def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
     return sum(made), len(names)
 
 
-def trace_views(
-    workspace: Workspace,
-    settings: Settings,
-    console: Console,
-    run_id: str,
-    *,
-    views: list[View],
-    split: str,
-    spp: int,
-    stage: str,
-    purpose: str,
-) -> list[dict[str, Any]]:
-    """Path-trace ``views`` into ``raytraced/<split>``; views already there are kept. Returns all tasks.
+def trace_views(run: Run, views: list[View], split: str, *, spp: int | None = None) -> list[dict[str, Any]]:
+    """Path-trace the views into ``raytraced/<split>``; views already there are kept. Returns all tasks.
 
-    spp: samples per pixel, where the settings name no noise or time for the split (:func:`goal_of`).
+    spp: samples per pixel instead of the settings', where these name no noise or time for the split (`goal_of`).
     """
-    plan = resolve_plan(workspace, settings, console, run_id, stage)
+    settings, console = run.settings, run.console
+    plan = resolve_plan(run)
     goal = goal_of(settings, split)
-    tasks = _tasks(workspace, settings, plan, views, split, spp)
+    tasks = _tasks(run.workspace, settings, plan, views, split, spp)
     if all(is_made(task) for task in tasks):
         return tasks
     choice = variant_for(plan, settings)
-    config = trace_config(workspace, plan, choice.variant)
+    config = trace_config(run.workspace, plan, choice.variant)
     console.say(f"ray tracing with Mitsuba {choice.variant}, {plan.integrator}, depth {plan.max_depth}")
     workers = 1 if choice.variant.startswith("cuda") else worker_count(settings.raytrace.workers)
-
-    def book(task: dict[str, Any], result: dict[str, Any], count: int) -> CostRecord:
-        return view_record(
-            run=run_id,
-            stage=stage,
-            purpose=purpose,
-            task=task,
-            result=result,
-            workers=count,
-            device=f"mitsuba {choice.variant}",
-        )
-
+    book = run.book_views(f"mitsuba {choice.variant}")
     label = "ray tracing" if split == "train" else "ray tracing test views"
     common = {"bundle": config["bundle"], "variant": choice.variant, "threads": 1}
-    arguments: dict[str, Any] = {
-        "workspace": workspace,
-        "console": console,
-        "stage": stage,
-        "workers": workers,
-        "book": book,
-        "environment": choice.environment,
-    }
     if goal is None:
-        run_view_tasks(label, "dnrpipe.raytrace.tracer", common, tasks, **arguments)
+        run.view_tasks(
+            label,
+            "dnrpipe.raytrace.tracer",
+            common,
+            tasks,
+            workers=workers,
+            book=book,
+            environment=choice.environment,
+        )
     else:
-        run_passes(label, common, tasks, goal, **arguments)
-    warn_repairs(tasks, console)
+        sample_adaptively(
+            run,
+            label,
+            common,
+            tasks,
+            goal,
+            workers=workers,
+            book=book,
+            environment=choice.environment,
+        )
+    warn_of_repairs(tasks, console)
     return tasks
 
 
@@ -139,15 +104,21 @@ def reference_is_made(workspace: Workspace, settings: Settings, view: View) -> b
     plan = plan_of(workspace, settings)
     if plan.max_depth is None:
         return False  # the pilot that decides it has not run, or was of another scene
-    (task,) = _tasks(workspace, settings, plan, [view], "test", settings.raytrace.evaluation_spp)
+    (task,) = _tasks(workspace, settings, plan, [view], "test")
     return is_made(task)
 
 
 def _tasks(
-    workspace: Workspace, settings: Settings, plan: EffectPlan, views: list[View], split: str, spp: int
+    workspace: Workspace,
+    settings: Settings,
+    plan: EffectPlan,
+    views: list[View],
+    split: str,
+    spp: int | None = None,
 ) -> list[dict[str, Any]]:
-    """What :func:`trace_views` has to do, with the fingerprints of the files that come out."""
-    scene_print = scene_fingerprint(workspace)
+    """What `trace_views` has to do, with the fingerprints of the files that come out."""
+    scene = scene_fingerprint(workspace)
+    spp = spp or (settings.raytrace.evaluation_spp if split == "test" else settings.raytrace.spp)
     known = lenses(workspace, settings) if plan.on("depth-of-field") else {}
     goal = goal_of(settings, split)
     tasks: list[dict[str, Any]] = [
@@ -170,11 +141,11 @@ def _tasks(
             del task["spp"], decisive["spp"]
             path = workspace.raytraced(split, task_name(task).partition("/")[2])
             task["samples"] = str(path.parent / "samples" / f"{path.stem}.npz")
-            task["samples_print"] = digest([SAMPLES_VERSION, scene_print, decisive, light])
+            task["samples_fingerprint"] = digest([SAMPLES_VERSION, scene, decisive, light])
             decisive["goal"] = [goal.noise, goal.seconds, goal.limit]
         if wanted:
             task["denoise"] = decisive["denoise"] = True
-        task["fingerprint"] = digest([TRACE_VERSION, scene_print, decisive, light])
+        task["fingerprint"] = digest([TRACE_VERSION, scene, decisive, light])
     return tasks
 
 

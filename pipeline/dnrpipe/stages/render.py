@@ -13,62 +13,63 @@ import numpy as np
 from dnrtrain.atomic import atomic_path, write_json
 from dnrtrain.contract import View, write_cameras
 
-from ..core.console import Console
 from ..core.errors import UserError
 from ..core.images import write_png
-from ..core.ledger import CostRecord
-from ..core.scene_files import read_frame, scene_fingerprint
-from ..core.settings import Settings
-from ..core.workspace import Workspace, digest
-from ..workers.view_tasks import run_view_tasks, view_record, worker_count
+from ..core.scene_files import read_frame
+from ..core.workspace import digest
 from .base_images import RENDERED, base_views
 from .pipeline import STAGES, require_inputs
-from .prepare import pass_common, pass_task
+from .prepare import draw_passes
+from .stage import Run
 from .trainer import torch_device
 
 FPS = 24
 
 
 def render_novel(
-    workspace: Workspace,
-    settings: Settings,
-    console: Console,
+    run: Run,
     views: Sequence[View],
     *,
     name: str,
     frames: str,
     movie: str,
 ) -> dict[str, Any]:
-    """Render ``views`` into ``renders/<name>/``. frames: png, exr or both; movie: mp4, webp or none.
+    """Render the views into ``renders/<name>/``.
 
-    Needs a fine-tuned model (UserError otherwise). G-buffers and frames that are there are kept when the
-    cameras and the model are the same; a changed model redoes the frames.
+    G-buffers and frames that are there are kept when the cameras and the model are the same; a changed model redoes
+    the frames.
+
+    Args:
+        run: of stage render.
+        frames: png, exr or both. movie: mp4, webp or none.
+
+    Raises UserError: no fine-tuned model, or cameras that no movie can hold.
     """
     from dnrtrain.checkpoint import load_model
     from dnrtrain.dataset import load_views
     from dnrtrain.model import render_radiance, render_views
 
+    workspace, settings = run.workspace, run.settings
     require_inputs(STAGES["evaluate"], workspace, settings)  # what evaluate needs is what this needs
     if movie != "none" and len({(view.width, view.height) for view in views}) > 1:
         raise UserError("render: the cameras have several image sizes, which no movie can hold; use --movie none")
     folder = workspace.root / "renders" / name
-    run_id = f"render-{int(time.time()):x}"
-    model_stamp = workspace.manifest.stages["finetune"].output
-    stamp = digest([model_stamp, scene_fingerprint(workspace), [v.model_dump(mode="json") for v in views]])
-    stamp_file = folder / "frames.json"
-    if folder.exists() and (not stamp_file.exists() or stamp_file.read_text().strip() != f'"{stamp}"'):
+    model_fingerprint = workspace.manifest.stages["finetune"].output
+    fingerprint = digest([model_fingerprint, run.scene_fingerprint, [v.model_dump(mode="json") for v in views]])
+    record = folder / "frames.json"
+    if folder.exists() and (not record.exists() or record.read_text().strip() != f'"{fingerprint}"'):
         for path in [*folder.glob("frame_*"), *folder.glob(f"{name}.*")]:
             path.unlink()
-    write_json(stamp_file, stamp)
+    write_json(record, fingerprint)
     write_cameras(folder / "cameras.json", views, name)
-    paths = _inputs(workspace, settings, console, views, folder, run_id)
+    paths = _inputs(run, views, folder)
     kind = settings.model.base
     device = torch_device(settings)
     model = load_model(workspace.checkpoints("step2"), device)
     frame = read_frame(workspace)
     pictures: list[np.ndarray] = []
     seconds: list[float] = []
-    with console.bar("frames", len(views)) as bar:
+    with run.console.bar("frames", len(views)) as bar:
         for view, path in zip(views, paths, strict=True):
             data = load_views(
                 [path],
@@ -90,19 +91,14 @@ def render_novel(
             if frames in ("exr", "both"):
                 radiance = render_radiance(model, data)
                 write_frame_exr(folder / f"frame_{view.name}.exr", picture, radiance, data, view)
-            workspace.ledger.append(
-                CostRecord(
-                    time=time.time(),
-                    run=run_id,
-                    stage="render",
-                    purpose="inference",
-                    unit="view",
-                    name=f"neural/{view.name}",
-                    seconds=seconds[-1],
-                    device=device,
-                    width=view.width,
-                    height=view.height,
-                )
+            run.book(
+                "inference",
+                "view",
+                f"neural/{view.name}",
+                seconds[-1],
+                device=device,
+                width=view.width,
+                height=view.height,
             )
             bar.advance()
     result: dict[str, Any] = {
@@ -169,74 +165,23 @@ def write_webp(path: Path, pictures: Sequence[np.ndarray]) -> None:
         first.save(temporary, save_all=True, append_images=rest, duration=1000 // FPS, loop=0, quality=85)
 
 
-def _inputs(
-    workspace: Workspace, settings: Settings, console: Console, views: Sequence[View], frames: Path, run_id: str
-) -> list[Path]:
+def _inputs(run: Run, views: Sequence[View], frames: Path) -> list[Path]:
     """Files with what the network sees of each view. Base images that are rendered bring the G-buffer along."""
-    if settings.model.base in RENDERED:
-        paths = [frames / "base" / f"{view.name}.exr" for view in views]
-        _drop_strangers(paths)
-        base_views(
-            workspace,
-            settings,
-            console,
-            run_id,
-            views=views,
-            split="novel",
-            stage="render",
-            purpose="inference",
-            paths=paths,
-        )
-        return paths
-    paths = [frames / "gbuffers" / f"{view.name}.exr" for view in views]
-    _drop_strangers(paths)
-    _gbuffers(workspace, settings, console, views, paths, run_id)
+    rendered = run.settings.model.base in RENDERED
+    paths = [frames / ("base" if rendered else "gbuffers") / f"{view.name}.exr" for view in views]
+    _drop_other_views(paths)
+    if rendered:
+        base_views(run, views, "novel", paths=paths)
+    else:
+        raster = run.settings.model.base == "raster"
+        engine = run.workspace.manifest.stages["prepare"].detail["raster_engine"] if raster else "cycles-direct"
+        draw_passes(run, "G-buffers", views, paths, engine, raster=[raster] * len(views))
     return paths
 
 
-def _drop_strangers(paths: Sequence[Path]) -> None:
+def _drop_other_views(paths: Sequence[Path]) -> None:
     folder = paths[0].parent
     if folder.exists():
         wanted = {path.name for path in paths}
         if any(path.name not in wanted for path in folder.glob("[!.]*.exr")):
             shutil.rmtree(folder)
-
-
-def _gbuffers(
-    workspace: Workspace,
-    settings: Settings,
-    console: Console,
-    views: Sequence[View],
-    paths: Sequence[Path],
-    run_id: str,
-) -> None:
-    scene_print = scene_fingerprint(workspace)
-    raster = settings.model.base == "raster"
-    engine = workspace.manifest.stages["prepare"].detail["raster_engine"] if raster else "cycles-direct"
-    tasks = [
-        pass_task(workspace, settings, view, "novel", scene_print, engine, raster=raster, output=path)
-        for view, path in zip(views, paths, strict=True)
-    ]
-
-    def book(task: dict[str, Any], result: dict[str, Any], workers: int) -> CostRecord:
-        return view_record(
-            run=run_id,
-            stage="render",
-            purpose="inference",
-            task=task,
-            result=result,
-            workers=workers,
-            device="cpu",
-        )
-
-    run_view_tasks(
-        "G-buffers",
-        "dnrpipe.blender.passes.worker",
-        pass_common(workspace, settings, engine),
-        tasks,
-        workspace=workspace,
-        console=console,
-        stage="render",
-        workers=worker_count(settings.passes.workers),
-        book=book,
-    )

@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..core.errors import UserError
+from ..core.ledger import StageName
+from .stage import Run
 
 if TYPE_CHECKING:
     from ..core.console import Console
@@ -82,7 +84,12 @@ class Session:
     def __exit__(self, *exception: Any) -> None:
         self.stack.__exit__(*exception)
 
-    def stages(self, *names: str) -> None:
+    @property
+    def run(self) -> Run:
+        """The command's work on the workspace, under the settings in force."""
+        return Run(self.workspace, self.settings, self.console)
+
+    def stages(self, *names: StageName) -> None:
         """Run stages in order; flags are remembered once the first one's inputs are known to be there."""
         from ..core.scene_files import has_test_views
         from .pipeline import STAGES, require_inputs, run_stage
@@ -98,9 +105,7 @@ class Session:
                 self.console.warn("no test views: nothing is evaluated; prepare with cameras.test > 0")
                 continue
             try:
-                self.answers[name] = run_stage(
-                    name, self.workspace, self.settings, self.console, force=self.options["force"]
-                )
+                self.answers[name] = run_stage(name, self.run, force=self.options["force"])
             except UserError:
                 if name == "prepare":
                     self._take_back()
@@ -127,10 +132,8 @@ class Session:
     def _check(self, settings: Settings, workspace: Workspace | None) -> None:
         """Refuse bad camera files and a budget above the candidates before any work is done or folder made."""
         from ..core.cameras import KEYWORDS, read_camera_file
-        from .select import check_budget, check_rounds
+        from .select import check_budget
 
-        if self.command in ("run", "select"):
-            check_rounds(settings.select)
         record = workspace.manifest.stages.get("prepare") if workspace else None
         if settings.cameras.source not in KEYWORDS and (self.command == "prepare" or self.scene is not None):
             read_camera_file(Path(settings.cameras.source), settings.cameras)

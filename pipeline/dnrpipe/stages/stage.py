@@ -1,12 +1,130 @@
-"""What a stage is."""
+"""What a stage is, and what it is given: `Run`, made once per command."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
+from ..core.console import Console
+from ..core.ledger import CostRecord, Purpose, StageName, Unit
+from ..core.scene_files import scene_fingerprint
 from ..core.settings import Settings
+from ..core.workspace import Workspace
+from ..effects.plan import EffectPlan
+from ..effects.store import plan_of
+from ..workers.view_tasks import Book, run_view_tasks, task_name
+
+
+@dataclass(frozen=True)
+class Run:
+    """One command's work on a workspace. Every stage gets one, as `for_stage` makes it.
+
+    Args:
+        workspace, settings, console: of the command.
+        stage: what the ledger books work under, and whose log workers write.
+        id: names this run in the ledger.
+        fingerprint: hash of all that the stage under way computes from; "" where none is.
+    """
+
+    workspace: Workspace
+    settings: Settings
+    console: Console
+    stage: StageName = "prepare"
+    id: str = ""
+    fingerprint: str = ""
+
+    def for_stage(self, stage: StageName, fingerprint: str = "") -> Run:
+        """The same command's work on a stage; what it knew of the scene is read anew."""
+        return replace(self, stage=stage, id=f"{stage}-{int(time.time()):x}", fingerprint=fingerprint)
+
+    @cached_property
+    def effect_plan(self) -> EffectPlan:
+        """Which effects are simulated, as far as files tell: the path depth is None while its pilot has not run."""
+        return plan_of(self.workspace, self.settings)
+
+    @cached_property
+    def scene_fingerprint(self) -> str:
+        """Hash of what the scene is converted from."""
+        return scene_fingerprint(self.workspace)
+
+    @property
+    def log(self) -> Path:
+        """Where workers of the stage write what libraries print."""
+        return self.workspace.log(self.stage)
+
+    def book(self, purpose: Purpose, unit: Unit, name: str, seconds: float, **facts: Any) -> None:
+        """Append a record to the ledger. facts: further fields of `CostRecord`."""
+        self.workspace.ledger.append(
+            CostRecord(
+                time=time.time(),
+                run=self.id,
+                stage=self.stage,
+                purpose=purpose,
+                unit=unit,
+                name=name,
+                seconds=seconds,
+                **facts,
+            )
+        )
+
+    def book_views(self, device: str, *, prefix: str = "", purpose: Purpose | None = None) -> Book:
+        """What `run_view_tasks` books each view by.
+
+        Args:
+            device: as the ledger names it.
+            prefix: of the view's name.
+            purpose: None: by the stage, and by the split that the view's file lies in.
+        """
+        fields = {"seconds", "cpu_seconds", "peak_mb", "spp", "noise"}
+
+        def book(task: dict[str, Any], result: dict[str, Any], workers: int) -> None:
+            self.book(
+                purpose or self._purpose(task),
+                "view",
+                prefix + task_name(task),
+                device=device,
+                workers=workers,
+                width=task["view"]["width"],
+                height=task["view"]["height"],
+                detail={key: value for key, value in result.items() if key not in fields},
+                **{key: value for key, value in result.items() if key in fields},
+            )
+
+        return book
+
+    def _purpose(self, task: dict[str, Any]) -> Purpose:
+        if self.stage == "render":
+            return "inference"
+        split = Path(task["output"]).parent.name
+        return "evaluation" if self.stage == "evaluate" or split.endswith("test") else "training"
+
+    def view_tasks(
+        self,
+        label: str,
+        module: str,
+        common: dict[str, Any],
+        tasks: Sequence[dict[str, Any]],
+        *,
+        workers: int,
+        book: Book,
+        environment: dict[str, str] | None = None,
+    ) -> None:
+        """`run_view_tasks` with the run's console and log."""
+        run_view_tasks(
+            label,
+            module,
+            common,
+            tasks,
+            console=self.console,
+            log=self.log,
+            workers=workers,
+            book=book,
+            environment=environment,
+        )
 
 
 @dataclass(frozen=True)
@@ -19,19 +137,27 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage. ``run`` and ``progress`` are "module:function", imported when called.
+    """One stage: a function of files in a workspace.
 
-    run(workspace, settings, console, run_id) -> Outcome
-    progress(workspace, settings) -> (units present, units wanted)
+    Args:
+        name: in the manifest and the ledger.
+        command: of the command line.
+        does: in a few words.
+        needs: stages that must be done before.
+        reads, writes: files and folders of the workspace.
+        settings: those that decide what it makes, JSON-able.
+        make: does what is missing.
+        progress: (units present, units wanted), by looking at files alone.
+        version: raised when the same inputs give other files.
     """
 
-    name: str
+    name: StageName
     command: str
     does: str
-    needs: tuple[str, ...]
+    needs: tuple[StageName, ...]
     reads: tuple[str, ...]
     writes: tuple[str, ...]
     settings: Callable[[Settings], Any]
-    run: str
-    progress: str
+    make: Callable[[Run], Outcome]
+    progress: Callable[[Workspace, Settings], tuple[int, int]]
     version: int = 1

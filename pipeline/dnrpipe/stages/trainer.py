@@ -2,53 +2,40 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
-import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-from dnrtrain.contract import DamagedFile, View, read_cameras
+from dnrtrain.contract import DamagedFile, View
 from dnrtrain.events import Diverged, EpochEnd, Event, Note
+from dnrtrain.records import PROGRESS, Progress, read
 
 from ..core.console import Bar, Console
 from ..core.errors import UserError
-from ..core.ledger import CostRecord
 from ..core.scene_files import read_frame
 from ..core.settings import Settings
 from ..core.workspace import Workspace
 from .base_images import RENDERED, base_path
+from .stage import Run
 
 if TYPE_CHECKING:
     from dnrtrain.dataset import Base, ViewSet
 
 
-def read_selection(workspace: Workspace) -> dict[str, Any]:
-    """``selection.json``. Raises UserError: there is none. DamagedFile: it does not read, or names other views."""
-    path = workspace.selection
-    try:
-        selection = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UserError(f"{workspace.root}: no views selected yet; run `dnrpipe select` first") from None
-    except (ValueError, RecursionError) as error:
-        raise DamagedFile(path, str(error)) from None
-    names = selection.get("views") if isinstance(selection, dict) else None
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise DamagedFile(path, "has no list of views")
-    cameras = workspace.cameras("train")
-    unknown = sorted(set(names) - {view.name for view in read_cameras(cameras)}) if cameras.exists() else []
-    if unknown:
-        raise DamagedFile(path, f"views {', '.join(unknown)[:200]} are no candidates")
-    return selection
-
-
 def load(
-    workspace: Workspace, views: list[View], split: str, *, raytraced: bool = False, base: Base = "none"
+    workspace: Workspace,
+    views: list[View],
+    split: str,
+    *,
+    raytraced: bool = False,
+    base: Base = "none",
+    base_files: Sequence[Path] | None = None,
 ) -> ViewSet:
     """G-buffers of the views, with rasterised (train, val) or ray-traced targets, or none (test).
 
-    base: the base image to load beside them (:mod:`.base`).
+    Args:
+        base: the kind of base image to load beside them.
+        base_files: where rendered ones lie, instead of ``base/<split>``.
     """
     from dnrtrain.dataset import load_views
 
@@ -61,7 +48,7 @@ def load(
         folder=workspace.scene,
         target=split != "test" or raytraced,
         base=base,
-        base_files=[base_path(workspace, split, view.name) for view in views] if base in RENDERED else None,
+        base_files=(base_files or [base_path(workspace, split, v.name) for v in views]) if base in RENDERED else None,
     )
 
 
@@ -91,31 +78,26 @@ def perceptual_weights(console: Console) -> Any:
 
 
 def epochs_done(folder: Path, wanted: int, finished: bool) -> tuple[int, int]:
+    """(epochs trained, epochs wanted) by the files of a training; all of them where it is ``finished``."""
     if finished and (folder / "model.safetensors").exists():
         return wanted, wanted
-    for name in ("checkpoint.json", "model.json"):
-        path = folder / name
-        with contextlib.suppress(OSError, ValueError, TypeError, AttributeError, RecursionError):
-            return min(int(json.loads(path.read_text()).get("epoch", 0)), wanted - 1), wanted
-    return 0, wanted  # no epoch, or a damaged book of them: the stage itself reads the weights
+    try:
+        return min(read(folder / PROGRESS, Progress).epoch, wanted - 1), wanted
+    except (OSError, DamagedFile):  # no epoch, or a damaged file: the stage itself reads the weights
+        return 0, wanted
 
 
-def follow(
-    events: Iterator[Event],
-    stage: Literal["select", "finetune"],
-    epochs: int,
-    workspace: Workspace,
-    console: Console,
-    run_id: str,
-) -> Iterator[Event]:
+def follow(run: Run, events: Iterator[Event], epochs: int) -> Iterator[Event]:
     """Pass events through while showing a bar and booking every epoch."""
-    with console.bar("step 1" if stage == "select" else "step 2", epochs) as bar:
+    console = run.console
+    with console.bar("step 1" if run.stage == "select" else "step 2", epochs) as bar:
         for event in events:
             if isinstance(event, EpochEnd):
-                _book_epoch(event, stage, workspace, run_id, bar)
+                _book_epoch(run, event, f"epoch {event.epoch}")
+                _show_epoch(event, bar)
                 console.events.send(
                     "epoch",
-                    stage=stage,
+                    stage=run.stage,
                     epoch=event.epoch,
                     epochs=event.epochs,
                     losses=event.losses,
@@ -125,17 +107,26 @@ def follow(
                 if event.skipped:
                     console.warn(f"epoch {event.epoch}: skipped {event.skipped} non-finite steps")
             elif isinstance(event, Diverged):
-                workspace.ledger.append(_epoch_record(event, f"epoch {event.epoch} (diverged)", stage, run_id))
+                _book_epoch(run, event, f"epoch {event.epoch} (diverged)")
                 console.warn(event.text)
             elif isinstance(event, Note):
                 console.warn(event.text)
             yield event
 
 
-def _book_epoch(
-    event: EpochEnd, stage: Literal["select", "finetune"], workspace: Workspace, run_id: str, bar: Bar
-) -> None:
-    workspace.ledger.append(_epoch_record(event, f"epoch {event.epoch}", stage, run_id))
+def _book_epoch(run: Run, event: EpochEnd | Diverged, name: str) -> None:
+    run.book(
+        "training",
+        "epoch",
+        name,
+        event.seconds,
+        cpu_seconds=event.cpu_seconds,
+        device=event.device,
+        steps=event.steps,
+    )
+
+
+def _show_epoch(event: EpochEnd, bar: Bar) -> None:
     behind = event.epoch - bar.done - 1  # epochs that an earlier run did
     if behind > 0:
         bar.advance(behind)
@@ -144,20 +135,3 @@ def _book_epoch(
     if "psnr" in event.val:
         note += f", val {event.val['psnr']:.2f} dB"
     bar.advance(note=note)
-
-
-def _epoch_record(
-    event: EpochEnd | Diverged, name: str, stage: Literal["select", "finetune"], run_id: str
-) -> CostRecord:
-    return CostRecord(
-        time=time.time(),
-        run=run_id,
-        stage=stage,
-        purpose="training",
-        unit="epoch",
-        name=name,
-        seconds=event.seconds,
-        cpu_seconds=event.cpu_seconds,
-        device=event.device,
-        steps=event.steps,
-    )

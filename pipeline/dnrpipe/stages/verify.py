@@ -22,7 +22,10 @@ from .pipeline import discard, owner_of
 
 @dataclass(frozen=True)
 class Fault:
-    """One file with something wrong. stage: the command that makes it again, or None; leftover: litter of a kill."""
+    """One file with something wrong.
+
+    stage: the command that makes it again, or None. leftover: left by a run that was killed.
+    """
 
     path: Path
     reason: str
@@ -48,14 +51,14 @@ def examine(workspace: Workspace, console: Console) -> tuple[int, list[Fault]]:
                 text = str(error).removeprefix(f"{path}: ")
                 owner = owner_of(path, workspace)
                 faults.append(Fault(path, text, owner.command if owner else None))
-    faults += [Fault(path, "left behind by a run that was killed", None, True) for path in _litter(workspace.root)]
+    faults += [Fault(path, "left behind by a run that was killed", None, True) for path in _leftovers(workspace.root)]
     return len(work), faults
 
 
 def repair(workspace: Workspace, faults: list[Fault]) -> list[str]:
-    """Throw away what is damaged or litter -> the commands that make it again, in pipeline order.
+    """Throw away what is damaged or left over -> the commands that make it again, in pipeline order.
 
-    Files of no stage stay, but for litter: what they are is for their owner to say.
+    Files of no stage stay, but for leftovers: what they are is for their owner to say.
     """
     from .pipeline import STAGES
 
@@ -150,7 +153,7 @@ def _frame(workspace: Workspace) -> None:
 
 
 def _selection(workspace: Workspace) -> None:
-    from .trainer import read_selection
+    from ..core.scene_files import read_selection
 
     read_selection(workspace)
 
@@ -184,6 +187,6 @@ def _ledger(workspace: Workspace, path: Path) -> None:
         raise DamagedFile(path, f"{torn} lines do not read and are left out of all sums")
 
 
-def _litter(root: Path) -> list[Path]:
+def _leftovers(root: Path) -> list[Path]:
     """Temporary names of :func:`dnrtrain.atomic.atomic_path` whose process has gone."""
     return sorted(path for path in root.rglob(".*.tmp*") if path.is_file())

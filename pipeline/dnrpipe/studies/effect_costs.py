@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from ..core.effect_names import FORCEABLE, NAMES, EffectName
 from ..core.errors import UserError
-from ..core.ledger import CostRecord
 from ..effects.plan import Effect, EffectPlan
-from ..effects.store import keep_plan, pilot_views, plan_of, resolve_plan, run_pilots, trace_config, variant_for
+from ..effects.store import keep_plan, pilot_views, plan_of, trace_config, variant_for
 from ..raytrace.statistics import Measured
+from ..stages.effect_plan import resolve_plan, run_pilots
+from ..stages.stage import Run
 
 if TYPE_CHECKING:
     from ..core.settings import Settings
@@ -59,9 +61,8 @@ def show_effects(session: Session, *, measure: bool) -> None:
             raise UserError(f"--enable {name}: there is nothing to simulate ({plan.effect(name).evidence[0]})")
     workspace.save()
     if measure:
-        run_id = f"effects-{int(time.time()):x}"
-        plan = resolve_plan(workspace, settings, console, run_id, "prepare")
-        plan = measure_plan(session, plan, run_id)
+        run = replace(session.run, id=f"effects-{int(time.time()):x}")
+        plan = measure_plan(session, run, resolve_plan(run))
         keep_plan(workspace, plan)
     if not console.json_mode:
         console.say(table(plan))
@@ -77,7 +78,7 @@ def _require_scene(session: Session) -> None:
         raise UserError(f"effects: prepare {why} for {session.workspace.root}; run `dnrpipe prepare` first")
 
 
-def measure_plan(session: Session, plan: EffectPlan, run_id: str) -> EffectPlan:
+def measure_plan(session: Session, run: Run, plan: EffectPlan) -> EffectPlan:
     """The plan with cost and error of every effect that changes how views are traced.
 
     Each effect is compared with the same plan but for that effect, on a few training views with the same seeds.
@@ -97,22 +98,13 @@ def measure_plan(session: Session, plan: EffectPlan, run_id: str) -> EffectPlan:
         views = pilot_views(workspace, settings, plan if plan.on("depth-of-field") else other)
         task = {"kind": "compare", "with": pair[0], "without": pair[1], "views": views, "spp": MEASURE_SPP}
         rows.append((effect.name, task))
-    answers = run_pilots(workspace, [task for _, task in rows], choice, console, "measuring effects", "effects")
+    log = workspace.log("effects")
+    results = run_pilots([task for _, task in rows], choice, console, "measuring effects", log)
     measured = {}
-    for (name, _), answer in zip(rows, answers, strict=True):
-        measured[name] = {key: Measured.model_validate(answer[key]) for key in ("cost", "error")}
-        workspace.ledger.append(
-            CostRecord(
-                time=time.time(),
-                run=run_id,
-                stage="prepare",
-                purpose="evaluation",
-                unit="scene",
-                name=f"effect/{name}",
-                seconds=answer["seconds"],
-                device=f"mitsuba {choice.variant}",
-            )
-        )
+    for (name, _), result in zip(rows, results, strict=True):
+        measured[name] = {key: Measured.model_validate(result[key]) for key in ("cost", "error")}
+        device = f"mitsuba {choice.variant}"
+        run.book("evaluation", "scene", f"effect/{name}", result["seconds"], device=device)
     effects = tuple(effect.model_copy(update=measured.get(effect.name, {})) for effect in plan.effects)
     return plan.model_copy(update={"effects": effects})
 

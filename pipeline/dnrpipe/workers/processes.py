@@ -2,7 +2,7 @@
 
 A renderer runs in a process of its own: bpy is process-global state, and a bad LLVM or GL driver kills
 the process it lives in. The parent survives, reports, retries a task once on a fresh worker, and goes on.
-A worker that does not answer is killed after a while: see :class:`Patience`.
+A worker that does not answer is killed after a while: see :class:`TaskTimeout`.
 
 Protocol: ``python -m dnrpipe.workers.processes MODULE PARENT``. The worker calls ``MODULE.Worker(common)`` once, then
 ``worker(task) -> result`` for every JSON line on standard input. Answers are JSON lines on a private copy
@@ -23,13 +23,13 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ..core.errors import UserError
-from .timeouts import Patience
+from .timeouts import TaskTimeout
 
 MAX_ATTEMPTS = 2
 
@@ -73,8 +73,8 @@ def run_tasks(
     log: Path,
     timeout: float | None = None,
     environment: dict[str, str] | None = None,
-    follow: Callable[[TaskResult], Sequence[dict[str, Any]]] | None = None,
-) -> Iterator[TaskResult | Retry]:
+    next_tasks: Callable[[TaskResult], Sequence[dict[str, Any]]] | None = None,
+) -> Generator[TaskResult | Retry, None, None]:
     """Run ``tasks`` on ``workers`` processes; yield a TaskResult per task, and a Retry for each new try.
 
     Args:
@@ -83,11 +83,11 @@ def run_tasks(
         log: file to which the workers' output is appended.
         timeout: seconds after which a silent task counts as hung; its worker is killed. None: see :mod:`.patience`.
         environment: variables added to the workers' environment.
-        follow: called with each TaskResult before it is yielded; returns tasks to do after it.
+        next_tasks: called with each TaskResult before it is yielded; returns tasks to do after it.
 
-    Closing the iterator (Ctrl-C in the consumer) kills the workers. Raises UserError: see :class:`Patience`.
+    Closing the iterator (Ctrl-C in the consumer) kills the workers. Raises UserError: see :class:`TaskTimeout`.
     """
-    patience = Patience(timeout)
+    task_timeout = TaskTimeout(timeout)
     pending: queue.SimpleQueue[tuple[dict[str, Any], int]] = queue.SimpleQueue()
     for task in tasks:
         pending.put((task, 1))
@@ -97,8 +97,8 @@ def run_tasks(
     slots = [_Slot() for _ in range(max(1, min(workers, len(tasks))))]
     log.parent.mkdir(parents=True, exist_ok=True)
     # Workers end without Blender's own clean-up (see _worker_main); what it leaves in the temporary folder goes here.
-    litter = tempfile.TemporaryDirectory(prefix="dnrpipe-workers-", ignore_cleanup_errors=True)
-    surroundings = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), litter.name) | (environment or {})
+    temp_dir = tempfile.TemporaryDirectory(prefix="dnrpipe-workers-", ignore_cleanup_errors=True)
+    worker_environment = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), temp_dir.name) | (environment or {})
 
     def serve(slot: _Slot) -> None:
         # The thread lives as long as its worker: PR_SET_PDEATHSIG follows the spawning thread.
@@ -111,9 +111,9 @@ def run_tasks(
                 started = time.monotonic()
                 try:
                     if slot.process is None or slot.process.poll() is not None:
-                        slot.process = _spawn(module, common, log, surroundings)
-                    answer = _ask(slot.process, task, patience.limit(attempt), patience.words())
-                except (WorkerDied, OSError, ValueError) as death:  # also: cannot be started, torn answer
+                        slot.process = _spawn(module, common, log, worker_environment)
+                    answer = _ask(slot.process, task, task_timeout.limit(attempt), task_timeout.reason())
+                except (WorkerDied, OSError, ValueError) as death:  # also: cannot be started, truncated answer
                     _kill(slot.process)
                     slot.process = None
                     answer = {"error": " ".join(str(death).split()), "retry": True, "died": True}
@@ -124,7 +124,7 @@ def run_tasks(
                     _close(slot.process, force=True)
                     slot.process = None
                 if "error" not in answer:
-                    patience.took(seconds)
+                    task_timeout.took(seconds)
                     outcomes.put(TaskResult(task, answer["result"], None, attempt, seconds))
                 elif attempt < MAX_ATTEMPTS and answer.get("retry", True):
                     outcomes.put(Retry(task, answer["error"]))
@@ -142,7 +142,7 @@ def run_tasks(
         while open_tasks.value > 0:
             outcome = outcomes.get()
             if isinstance(outcome, TaskResult):
-                more = follow(outcome) if follow is not None else ()
+                more = next_tasks(outcome) if next_tasks is not None else ()
                 for task in more:
                     pending.put((task, 1))
                 open_tasks.value += len(more) - 1
@@ -154,7 +154,7 @@ def run_tasks(
                 _kill(slot.process)
         for thread in threads:
             thread.join(timeout=10)
-        litter.cleanup()
+        temp_dir.cleanup()
 
 
 class WorkerDied(RuntimeError):
@@ -219,7 +219,7 @@ def _spawn(module: str, common: dict[str, Any], log: Path, environment: dict[str
         process.stdin.write(json.dumps(common) + "\n")
         process.stdin.flush()
     except OSError:
-        raise WorkerDied(_epitaph(process)) from None
+        raise WorkerDied(_exit_reason(process)) from None
     return process
 
 
@@ -243,13 +243,13 @@ def _ask(process: subprocess.Popen[str], task: dict[str, Any], timeout: float, w
         except OSError:
             line = ""
         if not line:
-            raise WorkerDied(f"worker hung for {timeout:.0f} s{why}" if hung.is_set() else _epitaph(process))
+            raise WorkerDied(f"worker hung for {timeout:.0f} s{why}" if hung.is_set() else _exit_reason(process))
         return json.loads(line)
     finally:
         timer.cancel()
 
 
-def _epitaph(process: subprocess.Popen[str]) -> str:
+def _exit_reason(process: subprocess.Popen[str]) -> str:
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(timeout=5)
     code = process.returncode

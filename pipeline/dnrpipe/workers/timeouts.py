@@ -16,7 +16,7 @@ SLOWEST = 30.0
 """A task may take so many times the longest one so far."""
 
 
-class Patience:
+class TaskTimeout:
     """The limit of each task of one run.
 
     Args:
@@ -41,7 +41,7 @@ class Patience:
         """A task ended after so many seconds."""
         self.longest = max(seconds, self.longest or 0.0)
 
-    def words(self) -> str:
+    def reason(self) -> str:
         """What the limit came from."""
         if self.fixed is not None or self.longest is None:
             return ""

@@ -1,10 +1,8 @@
-"""Run a list of per-view tasks on workers: skip what is on disk, book what was done, show progress."""
+"""Tasks that write one file each: skip what is made, tell of progress, book what was done, report failures."""
 
 from __future__ import annotations
 
-import errno
 import os
-import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,9 +10,11 @@ from typing import Any
 from dnrtrain.exr import read_metadata
 
 from ..core.console import Console
-from ..core.ledger import CostRecord
-from ..core.workspace import Workspace
-from .processes import Retry, TaskResult, run_tasks
+from .answers import answers
+from .processes import Retry, TaskResult
+
+Book = Callable[[dict[str, Any], dict[str, Any], int], None]
+"""Called with a finished task, its result and the number of workers side by side; writes it into the ledger."""
 
 
 class TasksFailed(RuntimeError):
@@ -38,71 +38,64 @@ def run_view_tasks(
     common: dict[str, Any],
     tasks: Sequence[dict[str, Any]],
     *,
-    workspace: Workspace,
     console: Console,
-    stage: str,
+    log: Path,
     workers: int,
-    book: Callable[[dict[str, Any], dict[str, Any], int], CostRecord],
+    book: Book,
     environment: dict[str, str] | None = None,
-) -> int:
-    """Run the tasks whose files are missing or out of date; returns how many were run.
+) -> None:
+    """Run the tasks whose files are missing or out of date.
 
-    ``book(task, result, workers)`` gives the ledger record of a finished task. Raises TasksFailed after all
-    other tasks are done when some failed twice.
+    Args:
+        label: what the progress bar and warnings call them.
+        module, common, environment: of `processes.run_tasks`.
+        workers: processes at most.
+
+    Raises TasksFailed after all other tasks are done when some failed twice. Raises OSError: the disk is full.
     """
     due = [task for task in tasks if not is_made(task)]
     if not due:
-        return 0
+        return
     count = max(1, min(workers, len(due)))
-    log = workspace.log(stage)
+    failures = Failures(label, console, log)
     with console.bar(label, len(tasks), len(tasks) - len(due)) as bar:
-        outcomes = run_tasks(module, common, due, workers=count, log=log, environment=environment)
-
-        def done(outcome: TaskResult) -> None:
+        for outcome in failures.noted(
+            answers(module, common, due, workers=count, log=log, retried=failures.retried, environment=environment)
+        ):
             if outcome.result is not None:
-                workspace.ledger.append(book(outcome.task, outcome.result, count))
+                book(outcome.task, outcome.result, count)
             bar.advance(note=task_name(outcome.task) if outcome.result is not None else "")
-
-        failed = consume(label, outcomes, console, done)
-    report_failed(label, failed, len(tasks), log)
-    return len(due)
+    failures.report(len(tasks))
 
 
-def consume(
-    label: str,
-    outcomes: Iterator[TaskResult | Retry],
-    console: Console,
-    done: Callable[[TaskResult], None],
-) -> list[str]:
-    """Go through the outcomes of tasks, telling of retries and failures; names of the tasks that failed.
+class Failures:
+    """The tasks of one list that failed twice: warned of as they come, raised together at the end."""
 
-    done: called with every TaskResult. Raises OSError: the disk is full. The workers end with this call.
-    """
-    failed: list[str] = []
-    try:
+    def __init__(self, label: str, console: Console, log: Path) -> None:
+        self.label, self.console, self.log = label, console, log
+        self.names: list[str] = []
+
+    def retried(self, retry: Retry) -> None:
+        """Tell of a task that is tried once more."""
+        self.console.warn(f"{self.label}: {task_name(retry.task)}: {retry.reason}; trying once more")
+
+    def noted(self, outcomes: Iterator[TaskResult]) -> Iterator[TaskResult]:
+        """The outcomes, with failures noted."""
         for outcome in outcomes:
-            name = task_name(outcome.task)
-            if isinstance(outcome, Retry):
-                console.warn(f"{label}: {name}: {outcome.reason}; trying once more")
-                continue
-            if outcome.errno == errno.ENOSPC:
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), outcome.task["output"])
             if outcome.result is None:
-                console.warn(f"{label}: {name} failed twice: {outcome.error}")
-                failed.append(name)
-            done(outcome)
-    finally:
-        outcomes.close()  # type: ignore[attr-defined]
-    return failed
+                name = task_name(outcome.task)
+                self.console.warn(f"{self.label}: {name} failed twice: {outcome.error}")
+                self.names.append(name)
+            yield outcome
 
-
-def report_failed(label: str, failed: Sequence[str], total: int, log: Path) -> None:
-    """Raise TasksFailed where there are any."""
-    if failed:
-        raise TasksFailed(
-            f"{label}: {len(failed)} of {total} failed ({', '.join(failed[:5])}{'…' if len(failed) > 5 else ''});"
-            f" the others are done. See {log}; run the same command to try again"
-        )
+    def report(self, total: int) -> None:
+        """Raise TasksFailed where there are any."""
+        if self.names:
+            listed = f"{', '.join(self.names[:5])}{'…' if len(self.names) > 5 else ''}"
+            raise TasksFailed(
+                f"{self.label}: {len(self.names)} of {total} failed ({listed});"
+                f" the others are done. See {self.log}; run the same command to try again"
+            )
 
 
 def task_name(task: dict[str, Any]) -> str:
@@ -111,39 +104,7 @@ def task_name(task: dict[str, Any]) -> str:
     return f"{output.parent.name}/{output.stem}" if "view" in task else output.name
 
 
-def view_record(
-    *,
-    run: str,
-    stage: Any,
-    purpose: Any,
-    task: dict[str, Any],
-    result: dict[str, Any],
-    workers: int,
-    device: str,
-) -> CostRecord:
-    """The ledger record of one view."""
-    known = {"seconds", "cpu_seconds", "peak_mb", "spp", "noise"}
-    return CostRecord(
-        time=time.time(),
-        run=run,
-        stage=stage,
-        purpose=purpose,
-        unit="view",
-        name=task_name(task),
-        seconds=result["seconds"],
-        cpu_seconds=result.get("cpu_seconds", 0.0),
-        device=device,
-        workers=workers,
-        width=task["view"]["width"],
-        height=task["view"]["height"],
-        spp=result.get("spp"),
-        peak_mb=result.get("peak_mb"),
-        noise=result.get("noise"),
-        detail={k: v for k, v in result.items() if k not in known},
-    )
-
-
-def warn_repairs(tasks: Sequence[dict[str, Any]], console: Console) -> None:
+def warn_of_repairs(tasks: Sequence[dict[str, Any]], console: Console) -> None:
     """Say which views hold pixels that were not finite: traced or read again, or set to zero."""
     for task in tasks:
         metadata = read_metadata(Path(task["output"])) or {}

@@ -7,8 +7,8 @@ from typing import ClassVar
 import numpy as np
 
 from ..contract import ContractError
-from .demand import BINS, directions
 from .explain import explained
+from .geometry import BINS, direction_bins
 from .greedy import lazy_greedy
 from .pool import choose_useful
 from .protocol import Candidates, Choice, Tick
@@ -62,7 +62,7 @@ def _choose(candidates: Candidates, budget: int, tick: Tick | None) -> Choice:
 
 def _spread_over_bins(sightings: Sightings) -> tuple[np.ndarray, np.ndarray]:
     """Sightings -> (cell · BINS + bin int32 [E, 3], pixels float32 [E, 3]), over the nearest bins."""
-    axes = directions().T
+    axes = direction_bins().T
     keys = np.empty((len(sightings.cells), NEIGHBOURS), np.int32)
     amounts = np.empty((len(sightings.cells), NEIGHBOURS), np.float32)
     for view in range(len(sightings)):

@@ -1,4 +1,4 @@
-"""Cameras as points: the space in which geometric policies measure distance."""
+"""Distances between cameras, and bins of the sphere of directions."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import numpy as np
 
 from .protocol import Candidates
 
-BLOCK = 1_000_000
+BINS = 32
+"""Bins of the sphere of directions, about 40 degrees wide."""
 
 
 def camera_features(candidates: Candidates) -> np.ndarray:
@@ -46,18 +47,10 @@ def distances(features: np.ndarray, some: np.ndarray) -> np.ndarray:
     return np.sqrt(total, out=total)
 
 
-def even_shares(features: np.ndarray, scale: float) -> np.ndarray:
-    """What each candidate should count where places count alike, however many candidates stand there: float32 [N].
-
-    1 over the kernel density of the candidates there (Gaussian of standard deviation ``scale``), summing to 1: of k
-    candidates within much less than ``scale`` each counts 1 / k.
-    """
-    count = len(features)
-    block = max(1, BLOCK // max(1, count))
-    density = np.empty(count)
-    for first in range(0, count, block):
-        some = np.arange(first, min(first + block, count))
-        away = distances(features, some) / np.float32(max(scale, 1e-6))
-        density[some] = np.exp(-0.5 * np.square(away)).sum(axis=1, dtype=np.float64)
-    shares = 1.0 / density  # at least 1: each candidate is at its own place
-    return (shares / shares.sum()).astype(np.float32)
+def direction_bins() -> np.ndarray:
+    """Centres of the bins of the sphere: BINS unit vectors on a Fibonacci spiral, float32 [BINS, 3]."""
+    k = np.arange(BINS) + 0.5
+    z = 1.0 - 2.0 * k / BINS
+    angle = np.pi * (1.0 + 5.0**0.5) * k
+    flat = np.sqrt(1.0 - z * z)
+    return np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1).astype(np.float32)

@@ -42,14 +42,6 @@ class Facilities:
         return float(near @ self.weights)
 
 
-def beside(problem: Facilities, kept: Sequence[int]) -> Facilities:
-    """The problem of further views: demand is never farther than from the nearest of ``kept``."""
-    near = problem.nothing.copy()
-    for view in kept:
-        np.minimum(near, problem.rows(np.array([view]))[0], out=near)
-    return Facilities(problem.count, lambda some: np.minimum(problem.rows(some), near), problem.weights, near)
-
-
 def build(
     problem: Facilities, budget: int, among: Sequence[int] | None = None, tick: Tick | None = None
 ) -> tuple[list[int], list[float]]:

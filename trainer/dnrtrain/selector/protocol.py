@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
-from ..contract import ContractError
+from ..contract import ContractError, View
 
 if TYPE_CHECKING:
     from .sightings import Sightings
@@ -41,6 +41,13 @@ class Candidates:
             )
         if self.sightings is not None and len(self.sightings) != count:
             raise ContractError(f"{count} cameras but sightings of {len(self.sightings)} views: must agree")
+
+    @staticmethod
+    def of_views(views: Sequence[View], sightings: Sightings | None = None) -> Candidates:
+        """The cameras of ``views`` as candidates."""
+        positions = np.stack([view.position for view in views])
+        directions = np.stack([-view.matrix[:3, 2] for view in views])  # a camera looks along its -Z
+        return Candidates(positions, directions, sightings)
 
     def __len__(self) -> int:
         return len(self.positions)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..contract import RASTER_CHANNELS, ContractError, View, require_channels
+from ..contract import ContractError, View, require_channels
 
 if TYPE_CHECKING:
     from ..dataset import ViewSet
@@ -24,7 +24,6 @@ GRID = 64
 """Cells per side of the atlas."""
 LOOK_SIDE = 256
 """Of larger images every k-th pixel is looked at, so that about this many a side remain (256 to 511)."""
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 CHANNELS = ("uv.U", "uv.V", "mask")
 
 
@@ -37,10 +36,7 @@ class Sightings:
     cells     int32 [E]
     pixels    float32 [E] pixels that fall on the cell, as a share of the view's pixels
     toward    float32 [E, 3] unit world-space direction from the surface to the camera, mean over those pixels
-    colours   float32 [E, 3] mean raster colour over those pixels, display RGB (gamma 2.2); 0 where there is none
     seen      float32 [N] share of the view's pixels that hit a surface
-    detail    float32 [N] mean absolute difference of neighbouring pixels' displayed luminance in the raster image,
-              over the surface; 0 where the view has no raster colour
     pictures  uint64 [N] hash of what is seen in which pixel: equal for duplicates
     """
 
@@ -49,9 +45,7 @@ class Sightings:
     cells: np.ndarray
     pixels: np.ndarray
     toward: np.ndarray
-    colours: np.ndarray
     seen: np.ndarray
-    detail: np.ndarray
     pictures: np.ndarray
 
     def __len__(self) -> int:
@@ -72,9 +66,7 @@ class Sightings:
             self.cells[where],
             self.pixels[where],
             self.toward[where],
-            self.colours[where],
             self.seen[order],
-            self.detail[order],
             self.pictures[order],
         )
 
@@ -86,9 +78,7 @@ class Sighting:
     cells: np.ndarray
     pixels: np.ndarray
     toward: np.ndarray
-    colours: np.ndarray
     seen: float
-    detail: float
     picture: int
 
 
@@ -130,9 +120,7 @@ def collect(looks: Iterable[Sighting], grid: int = GRID) -> Sightings:
         np.concatenate([np.zeros(0, np.int32), *(one.cells for one in every)]),
         np.concatenate([np.zeros(0, np.float32), *(one.pixels for one in every)]),
         np.concatenate([np.zeros((0, 3), np.float32), *(one.toward for one in every)]),
-        np.concatenate([np.zeros((0, 3), np.float32), *(one.colours for one in every)]),
         np.array([one.seen for one in every], np.float32),
-        np.array([one.detail for one in every], np.float32),
         np.array([one.picture for one in every], np.uint64),
     )
 
@@ -143,7 +131,7 @@ def look_at(channels: dict[str, np.ndarray], view: View, grid: int = GRID) -> Si
 
 
 def sightings_of(views: ViewSet, grid: int = GRID) -> Sightings:
-    """Sightings of views in memory; without colours and detail."""
+    """Sightings of views in memory."""
     maps = views.tensors
     u, v = (0.5 * maps.uv[:, k].cpu().numpy() + 0.5 for k in range(2))
     mask, toward = maps.mask[:, 0].cpu().numpy(), maps.view_dir.permute(0, 2, 3, 1).cpu().numpy()
@@ -165,42 +153,12 @@ def _look(channels: dict[str, np.ndarray], toward: np.ndarray, grid: int) -> Sig
     sums = np.stack([np.bincount(place, toward[:, k], len(cells)) for k in range(3)], axis=1)
     length = np.linalg.norm(sums, axis=1, keepdims=True)
     counts = np.bincount(place, minlength=len(cells))
-    shown = _display(channels, part)
     digest = hashlib.blake2b(np.packbits(mask).tobytes(), digest_size=8)
     digest.update(np.stack([u, v]).tobytes())
     return Sighting(
         cells.astype(np.int32),
         (counts / mask.size).astype(np.float32),
         (sums / np.maximum(length, 1e-12)).astype(np.float32),
-        _mean_colours(shown, mask, place, counts),
         float(mask.mean()),
-        _detail(shown, mask),
         int.from_bytes(digest.digest(), "little"),
     )
-
-
-def _display(channels: dict[str, np.ndarray], part: tuple[slice, slice]) -> np.ndarray | None:
-    """Raster colour as it is shown, about: linear premultiplied ^ (1 / 2.2), [H, W, 3]; None where there is none."""
-    if not set(RASTER_CHANNELS) <= set(channels):
-        return None
-    linear = np.stack([channels[name][part] for name in "RGB"], axis=-1)
-    return np.clip(linear, 0.0, 1.0) ** (1 / 2.2)
-
-
-def _mean_colours(shown: np.ndarray | None, mask: np.ndarray, place: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Mean over the pixels of each cell, float32 [E, 3]; ``place`` is the cell of every pixel in ``mask``."""
-    if shown is None:
-        return np.zeros((len(counts), 3), np.float32)
-    inside = shown[mask]
-    sums = np.stack([np.bincount(place, inside[:, k], len(counts)) for k in range(3)], axis=1)
-    return (sums / np.maximum(counts, 1)[:, None]).astype(np.float32)
-
-
-def _detail(shown: np.ndarray | None, mask: np.ndarray) -> float:
-    if shown is None or not mask.any():
-        return 0.0
-    grey = shown @ LUMINANCE
-    across = np.abs(np.diff(grey, axis=1))[mask[:, 1:] & mask[:, :-1]]
-    down = np.abs(np.diff(grey, axis=0))[mask[1:] & mask[:-1]]
-    pairs = across.size + down.size
-    return float((across.sum() + down.sum()) / pairs) if pairs else 0.0

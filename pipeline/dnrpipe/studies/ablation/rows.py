@@ -175,4 +175,4 @@ def needs_coarse(row: Row, settings: Settings) -> bool:
 
 def step1_policy(row: Row) -> str:
     """Rows that do not use the RL selector share one coarse model: it is trained the same for all of them."""
-    return "rl" if row.views == "rl" else "farthest"
+    return "rl-paper" if row.views == "rl" else "farthest"

@@ -28,7 +28,7 @@ from ...stages.trainer import perceptual_weights
 from ..cells.cell import CELL_VERSION, STEP1_SHARE
 from ..cells.provenance import code_state
 from ..cells.scenes import Scene, make_bases, prepare_scene, trace_references, trace_train, traced_split
-from ..cells.worker_pool import Crew, make_crew
+from ..cells.worker_pool import WorkerPool, make_pool
 from .rows import Row, needs_base, needs_coarse, settings_of, step1_policy
 
 
@@ -54,7 +54,7 @@ class Ablation:
     console: Console
     device: str = ""
     threads: int = 0
-    crew: Crew = field(init=False)
+    worker_pool: WorkerPool = field(init=False)
     perceptual: bool = False
     scenes: list[Scene] = field(default_factory=list)
     references: dict[str, dict[str, str]] = field(default_factory=dict)
@@ -69,8 +69,8 @@ class Ablation:
     def run(self) -> None:
         """Prepare all scenes, then go seed by seed, so that a whole table of the first seed exists early."""
         request = self.request
-        self.crew = make_crew(request.base, request.jobs, request.out / "logs" / "cells.log", self.console)
-        self.device, self.threads = self.crew.device, self.crew.threads
+        self.worker_pool = make_pool(request.base, request.jobs, request.out / "logs" / "cells.log", self.console)
+        self.device, self.threads = self.worker_pool.device, self.worker_pool.threads
         self.perceptual = perceptual_weights(self.console) is not None
         with self.console.bar("scenes", len(request.scenes)) as bar:
             for source in request.scenes:
@@ -218,7 +218,7 @@ class Ablation:
         return settings.model_copy(update={"model": model})
 
     def _work(self, label: str, tasks: Sequence[dict[str, Any]]) -> None:
-        self.crew.work(label, "dnrpipe.studies.cells.cell", tasks)
+        self.worker_pool.work(label, "dnrpipe.studies.cells.cell", tasks)
 
 
 def _read(task: dict[str, Any]) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from .scenes import base_file, raster_file
 
 if TYPE_CHECKING:
     from dnrtrain.dataset import ViewSet
+    from dnrtrain.records import ModelRecord
 
 STEP1_SHARE = 1 / 3
 """Share of the training time that step 1 may take where all rows train equally long."""
@@ -76,7 +77,7 @@ class Worker:
             settings.select.step1.epochs = min(max(1, int(task["seconds"] / pace)), settings.select.step1.epochs)
         selected = next(e for e in self._coarse(task, settings, workspace, folder) if isinstance(e, Selected))
         epochs = settings.select.step1.epochs
-        return {"key": task["key"], "selected": selected.views, "epochs": epochs, **_training_cost(folder)}
+        return {"key": task["key"], "selected": selected.views, "epochs": epochs, **training_cost(folder)}
 
     def _coarse(self, task: dict[str, Any], settings: Settings, workspace: Workspace, folder: Path) -> Iterator[Event]:
         from dnrtrain.step1 import run_step1
@@ -85,8 +86,7 @@ class Worker:
         return run_step1(
             views,
             None,
-            views.camera_positions,
-            settings.model.coarse(),
+            settings.model,
             settings.select.step1,
             policy=task["policy"],
             budget=settings.select.budget,
@@ -94,8 +94,6 @@ class Worker:
             device=self.device,
             checkpoints=folder,
             fingerprint=task["key"],
-            active=settings.select.active,
-            coarse=settings.starts_coarse,
         )
 
     def _cell(self, task: dict[str, Any], settings: Settings, workspace: Workspace) -> dict[str, Any]:
@@ -151,7 +149,7 @@ class Worker:
             settings.finetune.step2.epochs = int(left / pace)
         for _ in self._step2(task, settings, workspace, folder):
             pass
-        cost = _training_cost(folder)
+        cost = training_cost(folder)
         return {
             "epochs": settings.finetune.step2.epochs,
             "seconds_per_epoch": pace,
@@ -170,9 +168,9 @@ class Worker:
                 scratch = folder.with_name(f"{folder.name}.pace")
                 for _ in train(scratch):
                     pass
-                last = _history(scratch)[-1]
+                last = _record(scratch).history[-1]
                 shutil.rmtree(scratch)
-                write_json(file, self._clock(last))
+                write_json(file, self._clock(last.data()))
         return float(json.loads(file.read_text()))
 
     def _clock(self, cost: dict[str, Any]) -> float:
@@ -260,23 +258,21 @@ def load_cell_views(
     return load_views(passes, images, frame, cameras=chosen, folder=workspace.scene, **extra)
 
 
-def _history(folder: Path) -> list[dict[str, Any]]:
+def _record(folder: Path) -> ModelRecord:
     from dnrtrain.checkpoint import read_record
 
     record = read_record(folder)
     assert record is not None  # its step has just finished
-    return record["history"]
+    return record
 
 
-def _training_cost(folder: Path) -> dict[str, Any]:
+def training_cost(folder: Path) -> dict[str, Any]:
     """Sums over all epochs, those of an interrupted run included, and what the choice at the end took."""
-    from dnrtrain.checkpoint import read_record
-
-    record = read_record(folder)
-    assert record is not None  # its step has just finished
-    cost = {key: sum(e[key] for e in record["history"]) for key in ("seconds", "cpu_seconds", "steps", "skipped")}
-    for key, value in record.get("choosing", {}).items():
-        cost[key] += value
+    record = _record(folder)
+    names = ("seconds", "cpu_seconds", "steps", "skipped")
+    cost: dict[str, Any] = {name: sum(getattr(epoch, name) for epoch in record.history) for name in names}
+    for name, value in record.choosing.items():
+        cost[name] += value
     return cost
 
 

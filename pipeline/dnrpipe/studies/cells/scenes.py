@@ -6,20 +6,19 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from dnrtrain.contract import View
 
 from ...core.console import Console
 from ...core.errors import UserError
-from ...core.ledger import CostRecord
-from ...core.scene_files import read_json, scene_fingerprint, split_views
+from ...core.ledger import StageName
+from ...core.scene_files import read_json, split_views
 from ...core.settings import Settings
 from ...core.workspace import Source, Workspace, file_sha256
 from ...stages.pipeline import run_stage
-from ...stages.prepare import pass_common, pass_task
+from ...stages.prepare import draw_passes
 from ...stages.raytrace import trace_views
-from ...workers.view_tasks import run_view_tasks, view_record, worker_count
+from ...stages.stage import Run
 
 COLLECTION = Path(__file__).resolve().parents[4] / "blender_scenes"
 """The scenes of the repository; installed from a wheel there are none, and scenes are named by their files."""
@@ -40,6 +39,10 @@ class Scene:
     inputs: str
     run_id: str = field(default_factory=lambda: f"ablate-{int(time.time()):x}")
 
+    def run(self, settings: Settings, console: Console, stage: StageName) -> Run:
+        """Work on the scene, booked under the stage."""
+        return Run(self.workspace, settings, console, stage, self.run_id)
+
     def farthest(self, budget: int) -> list[str]:
         """Farthest-point selection: the same views for every seed."""
         return self._baseline("farthest", budget, 0)
@@ -49,17 +52,14 @@ class Scene:
         return self._baseline("random", budget, seed)
 
     def _baseline(self, policy: str, budget: int, seed: int) -> list[str]:
-        import numpy as np
-
         from dnrtrain.selector.policies import untrained
         from dnrtrain.selector.protocol import Candidates
 
         names = list(self.train)
-        positions = np.stack([self.train[name].position for name in names])
-        directions = np.stack([-self.train[name].matrix[:3, 2] for name in names])
+        candidates = Candidates.of_views([self.train[name] for name in names])
         rule = untrained(policy)
         assert rule is not None  # both names above are rules
-        return [names[i] for i in rule.choose(Candidates(positions, directions), budget, seed).views]
+        return [names[i] for i in rule.choose(candidates, budget, seed).views]
 
 
 def find_scenes(text: str | None) -> list[Path]:
@@ -91,7 +91,7 @@ def prepare_scene(source: Path, out: Path, settings: Settings, console: Console)
 
 def prepared(name: str, workspace: Workspace, settings: Settings, console: Console) -> Scene:
     """The workspace's passes, made where they are missing. Raises UserError: no test views, too few candidates."""
-    run_stage("prepare", workspace, settings, Console(json_mode=console.json_mode, quiet=True))
+    run_stage("prepare", Run(workspace, settings, Console(json_mode=console.json_mode, quiet=True)))
     views = split_views(workspace)
     if not views.get("test"):
         raise UserError(f"{name}: has no test views to measure on; set cameras.test > 0")
@@ -143,16 +143,10 @@ def make_bases(scene: Scene, settings: Settings, console: Console, train: Sequen
     chosen = {"train": [scene.train[name] for name in train], "test": list(scene.test.values())}
     made = {}
     for split, views in chosen.items():
-        test = split == "test"
         tasks = base_views(
-            workspace,
-            settings,
-            console,
-            scene.run_id,
-            views=views,
-            split=split,
-            stage="evaluate" if test else "finetune",
-            purpose="evaluation" if test else "training",
+            scene.run(settings, console, "evaluate" if split == "test" else "finetune"),
+            views,
+            split,
             paths=[base_file(workspace, settings.model.base, split, view.name) for view in views],
         )
         made |= {f"{split}/{view.name}": task["fingerprint"] for view, task in zip(views, tasks, strict=True)}
@@ -172,61 +166,26 @@ def raster_file(workspace: Workspace, view: str) -> Path:
 
 
 def _raster_test_views(scene: Scene, settings: Settings, console: Console) -> dict[str, str]:
-    workspace = scene.workspace
-    engine = read_json(workspace.root / "passes" / "raster.json")["engine"]
-    scene_print = scene_fingerprint(workspace)
-    tasks = [
-        pass_task(
-            workspace,
-            settings,
-            view,
-            "test",
-            scene_print,
-            engine,
-            raster=True,
-            output=raster_file(workspace, view.name),
-        )
-        for view in scene.test.values()
-    ]
-
-    def book(task: dict[str, Any], result: dict[str, Any], workers: int) -> CostRecord:
-        return view_record(
-            run=scene.run_id,
-            stage="prepare",
-            purpose="evaluation",
-            task=task,
-            result=result,
-            workers=workers,
-            device="cpu",
-        )
-
-    run_view_tasks(
+    engine = read_json(scene.workspace.root / "passes" / "raster.json")["engine"]
+    tasks = draw_passes(
+        scene.run(settings, console, "prepare"),
         "rasterised test views",
-        "dnrpipe.blender.passes.worker",
-        pass_common(workspace, settings, engine),
-        tasks,
-        workspace=workspace,
-        console=console,
-        stage="prepare",
-        workers=worker_count(settings.passes.workers),
-        book=book,
+        list(scene.test.values()),
+        [raster_file(scene.workspace, name) for name in scene.test],
+        engine,
+        raster=[True] * len(scene.test),
     )
     return {name: task["fingerprint"] for name, task in zip(scene.test, tasks, strict=True)}
 
 
 def _trace(
-    scene: Scene, settings: Settings, console: Console, views: list[View], split: str, spp: int | None = None
+    scene: Scene,
+    settings: Settings,
+    console: Console,
+    views: list[View],
+    split: str,
+    spp: int | None = None,
 ) -> dict[str, str]:
-    test = split == "test"
-    tasks = trace_views(
-        scene.workspace,
-        settings,
-        console,
-        scene.run_id,
-        views=views,
-        split=split,
-        spp=settings.raytrace.evaluation_spp if test else spp or settings.raytrace.spp,
-        stage="evaluate" if test else "raytrace",
-        purpose="evaluation" if test else "training",
-    )
+    run = scene.run(settings, console, "evaluate" if split == "test" else "raytrace")
+    tasks = trace_views(run, views, split, spp=spp)
     return {view.name: task["fingerprint"] for view, task in zip(views, tasks, strict=True)}

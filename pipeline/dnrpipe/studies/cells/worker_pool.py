@@ -11,12 +11,12 @@ from ...core.console import Console
 from ...core.errors import UserError
 from ...core.settings import Settings
 from ...stages.trainer import torch_device
-from ...workers.processes import Retry, run_tasks
+from ...workers.answers import answers, warn_of_retries
 from ...workers.view_tasks import TasksFailed, worker_count
 
 
 @dataclass(frozen=True)
-class Crew:
+class WorkerPool:
     """``device``: torch's. ``threads``: of each worker, 0 = torch's own choice. ``log``: what workers print."""
 
     device: str
@@ -37,19 +37,20 @@ class Crew:
         common = {"threads": self.threads, "device": self.device}
         failed: list[str] = []
         with self.console.bar(label, len(tasks), len(tasks) - len(due)) as bar:
-            outcomes = run_tasks(module, common, due, workers=self.workers, log=self.log, environment=threads)
-            try:
-                for outcome in outcomes:
-                    if isinstance(outcome, Retry):
-                        self.console.warn(f"{outcome.task['label']}: {outcome.reason}; trying once more")
-                    elif outcome.result is None:
-                        self.console.warn(f"{outcome.task['label']} failed: {outcome.error}")
-                        failed.append(outcome.task["label"])
-                        bar.advance()
-                    else:
-                        bar.advance(note=outcome.task["label"])
-            finally:
-                outcomes.close()  # type: ignore[attr-defined]
+            for outcome in answers(
+                module,
+                common,
+                due,
+                workers=self.workers,
+                log=self.log,
+                retried=lambda retry: warn_of_retries(retry.task["label"], self.console)(retry),
+                environment=threads,
+            ):
+                label_of = outcome.task["label"]
+                if outcome.result is None:
+                    self.console.warn(f"{label_of} failed: {outcome.error}")
+                    failed.append(label_of)
+                bar.advance(note=label_of if outcome.result is not None else "")
         if failed:
             raise TasksFailed(
                 f"{label}: {len(failed)} of {len(due)} failed ({', '.join(failed[:5])}); the others are done."
@@ -65,7 +66,7 @@ def check_amounts(seconds: float | None, seeds: int, jobs: int) -> None:
         raise UserError(f"--seeds {seeds} --jobs {jobs}: at least 1 seed; jobs from 0 (one per core)")
 
 
-def make_crew(settings: Settings, jobs: int, log: Path, console: Console, *, single: bool = False) -> Crew:
+def make_pool(settings: Settings, jobs: int, log: Path, console: Console, *, single: bool = False) -> WorkerPool:
     """``jobs`` workers, or 0: one per core, one on a GPU.
 
     Cells side by side on a thread each finish more per hour than one after the other on all cores. single: one thread
@@ -75,4 +76,4 @@ def make_crew(settings: Settings, jobs: int, log: Path, console: Console, *, sin
     on_gpu = device.startswith("cuda")
     workers = jobs or (1 if on_gpu else cores)
     threads = 0 if on_gpu else 1 if single else max(1, cores // workers)
-    return Crew(device, threads, workers, log, console)
+    return WorkerPool(device, threads, workers, log, console)

@@ -3,5 +3,5 @@
 scene      a workspace opened for timing: Mitsuba, plan, views, display
 rival      the ladder: samples x what the denoiser is given
 ours       G-buffer, base image, network
-ladder     best picture by milliseconds, lead at equal time, crossover (numpy only)
+ladder     best picture by milliseconds, crossover (numpy only)
 """

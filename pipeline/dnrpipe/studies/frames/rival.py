@@ -25,7 +25,6 @@ from ...raytrace.denoise import Quality, denoise
 from ...raytrace.finite import masked
 from .scene import BenchScene, Clock
 
-SAMPLES = (1, 2, 4, 8, 16, 64)
 MANY = 16
 """From so many stratified primary rays on, auxiliary images count as clean."""
 

@@ -19,8 +19,10 @@ from ...core.errors import UserError
 from ...core.scene_files import read_frame, read_summary, scene_fingerprint, split_views
 from ...core.settings import Settings
 from ...core.workspace import Workspace, digest
-from ...effects.store import lenses, resolve_plan, trace_config, variant_for
+from ...effects.store import lenses, trace_config, variant_for
+from ...stages.effect_plan import resolve_plan
 from ...stages.session import resolve_settings
+from ...stages.stage import Run
 
 
 @dataclass
@@ -88,7 +90,7 @@ def open_scene(root: Path, views: int | list[View], threads: int, settings: Sett
 
     workspace = Workspace.open(root)
     settings = settings or resolve_settings(workspace, {}, None)
-    plan = resolve_plan(workspace, settings, Console(quiet=True), "bench", "evaluate")
+    plan = resolve_plan(Run(workspace, settings, Console(quiet=True), "evaluate", "bench"))
     if plan.on("depth-of-field") and lenses(workspace, settings):
         raise UserError(f"{root}: its cameras have depth of field, which the frame benchmark cannot time")
     chosen = split_views(workspace)["test"][:views] if isinstance(views, int) else views

@@ -19,7 +19,7 @@ from ...core.settings import Settings
 from ...core.workspace import digest
 from ...workers.view_tasks import worker_count
 from ..cells.provenance import made_by, read_made
-from ..cells.worker_pool import Crew, check_amounts
+from ..cells.worker_pool import WorkerPool, check_amounts
 from .account import break_evens, pareto, point_of, settle_frames
 from .cycles import PREFIX
 from .plot import plot
@@ -151,11 +151,11 @@ def _rival(run: Frontier, settings: Settings, samples: tuple[int, ...], cores: i
         "output": str(output),
         "label": "path tracing",
     }
-    crew: Crew = replace(run.crew, threads=cores, workers=1)
-    crew.work("path tracing of the test views", "dnrpipe.studies.frontier.rivals", [task])
+    worker_pool: WorkerPool = replace(run.worker_pool, threads=cores, workers=1)
+    worker_pool.work("path tracing of the test views", "dnrpipe.studies.frontier.rivals", [task])
     found = json.loads(output.read_text(encoding="utf-8"))
     if lost := sum(rung.get("masked", 0) for rung in found["rungs"] if not rung["denoised"]):
-        crew.console.warn(f"repaired: {lost} pixels of the path-traced test views were not finite and are black")
+        worker_pool.console.warn(f"repaired: {lost} pixels of the path-traced test views were not finite and are black")
     return found
 
 
@@ -176,13 +176,13 @@ def _cycles(run: Frontier, settings: Settings, samples: tuple[int, ...], cores: 
         "output": str(folder / "frames.json"),
         "label": "Cycles",
     }
-    crew: Crew = replace(run.crew, threads=cores, workers=1)
-    crew.work("Cycles on the test views", "dnrpipe.blender.passes.cycles_frames", [task])
+    worker_pool: WorkerPool = replace(run.worker_pool, threads=cores, workers=1)
+    worker_pool.work("Cycles on the test views", "dnrpipe.blender.passes.cycles_frames", [task])
     measured = digest([key, run.perceptual])
     output = run.request.out / "rivals" / f"{measured}.json"
     names = {"workspace": str(workspace.root), "views": [view.name for view in views], "label": "Cycles"}
     task = {**names, "frames": task["output"], "folder": str(folder), "output": str(output)}
-    crew.work("measuring Cycles", "dnrpipe.studies.frontier.cycles", [task])
+    worker_pool.work("measuring Cycles", "dnrpipe.studies.frontier.cycles", [task])
     return json.loads(output.read_text(encoding="utf-8"))["rungs"]
 
 

@@ -80,10 +80,6 @@ class Frontier(Ablation):
         """The scene, once :meth:`run` has prepared it."""
         return self.scenes[0]
 
-    def views_of(self, row: Row, seed: int = 0) -> list[str]:
-        """Training views of a row that needs no step 1 for them."""
-        return self._views(self.scene, row, seed, {}) if row.network else []
-
 
 def make_frontier(
     workspace: Workspace, settings: Settings, rows: Sequence[Row], out: Path, jobs: int, seeds: int, console: Console

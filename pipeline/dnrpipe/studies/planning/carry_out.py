@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from dnrtrain.atomic import write_json
 
-from ...core.ledger import total
+from ...core.ledger import StageName, total
 from ...core.scene_files import split_views
 from ...core.units import duration
 from .choose import STEPS, Predictor, cheapest_of_the_best
@@ -33,7 +33,7 @@ def apply(session: Session, record: dict[str, Any], prior: Prior | None = None) 
     """
     workspace = session.workspace
     before = len(workspace.ledger.read())
-    names = ["select", "raytrace", "finetune"]
+    names: list[StageName] = ["select", "raytrace", "finetune"]
     if split_views(workspace).get("test"):
         names.append("evaluate")
     session.adopt(overrides_of(record))

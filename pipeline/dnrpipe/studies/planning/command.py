@@ -9,7 +9,7 @@ from typing import Any
 
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import DamagedFile
-from dnrtrain.selector.names import ACTIVE_NAMES, TRAINED_NAMES
+from dnrtrain.selector.names import TRAINED_NAMES
 
 from ...core.console import Console
 from ...core.errors import UserError
@@ -17,7 +17,7 @@ from ...core.scene_files import read_json, split_views
 from ...core.settings import Settings
 from ...core.workspace import Workspace
 from ...effects.store import plan_of
-from ...stages.base_images import light_is_baked, renderer_inputs
+from ...stages.base_images import base_renderer
 from .choose import Predictor, best_within, budgets, cheapest_reaching
 from .pilot import FOLDER, run_pilot
 from .quality import Gain, Prior, load_prior, measured_gains, scene_gain, views_error, with_noise
@@ -85,8 +85,9 @@ def make_predictor(workspace: Workspace, settings: Settings, pilot: Pilot, prior
     """Costs and quality of any choice in this workspace, by its pilot."""
     assert pilot.frames is not None and pilot.training is not None  # the pilot is complete
     plan = plan_of(workspace, settings)
-    _, _, light, _ = renderer_inputs(workspace, settings, plan)
-    due = None if light is None or light_is_baked(light) else (light["size"], light["spp"])
+    renderer = base_renderer(workspace, settings, plan)
+    light = renderer.light
+    due = None if light is None or renderer.light_is_baked else (light["size"], light["spp"])
     width, height = settings.cameras.width, settings.cameras.height
     patch = settings.finetune.step2.patch or max(width, height)
     frames, training = pilot.frames, pilot.training
@@ -204,11 +205,4 @@ def _policy_seconds(workspace: Workspace, settings: Settings, step_seconds: floa
     trains = policy_of(workspace, settings) in TRAINED_NAMES or settings.finetune.step2.start == "coarse"
     if not trains:
         return RULE_SECONDS
-    steps = settings.select.step1.epochs * len(split_views(workspace)["train"])
-    if policy_of(workspace, settings) in ACTIVE_NAMES:
-        from dnrtrain.selector.active import active_steps
-
-        select = settings.select
-        own = active_steps(select.policy, select.active, select.budget)
-        steps = own + (steps if settings.starts_coarse or not own else 0)
-    return steps * step_seconds
+    return settings.select.step1.epochs * len(split_views(workspace)["train"]) * step_seconds

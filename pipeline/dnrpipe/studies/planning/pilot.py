@@ -24,13 +24,14 @@ from dnrtrain.contract import DamagedFile
 
 from ...core.console import Console
 from ...core.errors import UserError
-from ...core.ledger import CostRecord
 from ...core.scene_files import read_json, scene_fingerprint
 from ...core.settings import Settings
 from ...core.workspace import Workspace, digest
 from ...effects.plan import EffectPlan
-from ...effects.store import lenses, resolve_plan
-from ...stages.base_images import RENDERED, light_is_baked, renderer_inputs
+from ...effects.store import lenses
+from ...stages.base_images import RENDERED, base_renderer
+from ...stages.effect_plan import resolve_plan
+from ...stages.stage import Run
 from .pilot_parts import FOLDER, HELD_OUT, REFERENCE_SPP, RESOLUTION, SPP, STEPS, VIEWS, Piloting
 from .records import LightPart, Pilot, Record
 
@@ -53,19 +54,18 @@ def run_pilot(workspace: Workspace, settings: Settings, console: Console) -> Pil
             f"plan: model.base={settings.model.base} has no base image that can be rendered on its own; plan with"
             f" --set model.base=baked (the presets draft and standard), or one of {', '.join(RENDERED)}"
         )
-    run_id = f"plan-{int(time.time()):x}"
-    plan = resolve_plan(workspace, settings, console, run_id, "plan")
+    run = Run(workspace, settings, console).for_stage("plan")
+    plan = resolve_plan(run)
     if plan.on("depth-of-field") and lenses(workspace, settings):
         raise UserError(f"plan: the cameras of {workspace.root} have depth of field, whose frames cannot be timed yet")
-    piloting = Piloting(workspace, settings, console, run_id, plan)
+    piloting = Piloting(run, plan)
     stamp = _stamp(workspace, settings, plan)
     found = read_pilot(workspace)
     first = piloting.train[0]
     if found is None or found.fingerprint != stamp:
         shutil.rmtree(piloting.folder, ignore_errors=True)
         found = Pilot(fingerprint=stamp, size=(first.width, first.height), load=_load())
-    _, _, light, _ = renderer_inputs(workspace, settings, plan)
-    bake = found.light is None and light is not None and not light_is_baked(light)  # removed since, perhaps
+    bake = found.light is None and not base_renderer(workspace, settings, plan).light_is_baked  # removed, perhaps
     if found.frames is not None and not bake:
         return found
     piloting.folder.mkdir(parents=True, exist_ok=True)
@@ -85,7 +85,7 @@ def run_pilot(workspace: Workspace, settings: Settings, console: Console) -> Pil
         found = found.model_copy(update={name: made, "seconds": found.seconds + seconds})
         write_json(pilot_path(workspace), found.model_dump(mode="json"))
         booked = made.bake.seconds if isinstance(made, LightPart) and made.kept else 0.0
-        _book(workspace, run_id, name, seconds - booked)
+        run.book("training", "scene", f"pilot: {name}", seconds - booked)
     shutil.rmtree(piloting.folder, ignore_errors=True)
     return found
 
@@ -116,17 +116,3 @@ def _stamp(workspace: Workspace, settings: Settings, plan: EffectPlan) -> str:
 
 def _load() -> float | None:
     return os.getloadavg()[0] if hasattr(os, "getloadavg") else None
-
-
-def _book(workspace: Workspace, run_id: str, part: str, seconds: float) -> None:
-    workspace.ledger.append(
-        CostRecord(
-            time=time.time(),
-            run=run_id,
-            stage="plan",
-            purpose="training",
-            unit="scene",
-            name=f"pilot: {part}",
-            seconds=seconds,
-        )
-    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,16 +13,15 @@ import numpy as np
 from dnrtrain.contract import View
 
 from ...core.cameras import scaled_to
-from ...core.console import Console
 from ...core.errors import UserError
 from ...core.scene_files import split_views
-from ...core.settings import Settings
 from ...core.workspace import Workspace
 from ...effects.plan import EffectPlan
 from ...effects.store import trace_config, variant_for
-from ...stages.base_images import bake_light, light_is_baked, renderer_inputs
+from ...stages.base_images import BaseRenderer, bake_light, base_renderer
 from ...stages.raytrace import view_seed
-from ...workers.processes import Retry, run_tasks
+from ...stages.stage import Run
+from ...workers.answers import answers, warn_of_retries
 from ...workers.view_tasks import worker_count
 from .records import BasePart, FramePart, LightPart, LightPoint, Traced, TracePart, TrainingPart
 
@@ -45,13 +44,12 @@ FOLDER = "plan"
 class Piloting:
     """One run of the pilot: the workspace with its settings, effect plan and views, and where pictures go."""
 
-    workspace: Workspace
-    settings: Settings
-    console: Console
-    run_id: str
+    run: Run
     plan: EffectPlan
 
     def __post_init__(self) -> None:
+        self.workspace, self.settings, self.console = self.run.workspace, self.run.settings, self.run.console
+        self.run_id = self.run.id
         self.folder = self.workspace.root / FOLDER / "pilot"
         self.train, self.held_out = _views(self.workspace)
 
@@ -93,19 +91,20 @@ class Piloting:
 
         None where there is no light to bake or it is on disk.
         """
-        common, environment, task, _ = renderer_inputs(self.workspace, self.settings, self.plan)
-        if task is None or light_is_baked(task):
+        renderer = base_renderer(self.workspace, self.settings, self.plan)
+        task = renderer.light
+        if task is None or renderer.light_is_baked:
             return None
         size, spp = task["size"], max(1, min(task["spp"], LIGHT_PATHS // task["size"] ** 2))
         started = time.monotonic()
         if kept := spp == task["spp"]:
-            result = bake_light(self.workspace, self.console, self.run_id, "raytrace", common, environment, task)
+            result = bake_light(replace(self.run, stage="raytrace"), renderer)
             assert result is not None  # it is not on disk
         else:
-            shared = {"bundle": common["bundle"], "variant": common["variant"]}
+            shared = {name: renderer.common[name] for name in ("bundle", "variant")}
             small = task | {"spp": spp, "output": str(self.folder / "light.npz")}
             ((_, result),) = self._run(
-                "pilot: baking light", "dnrpipe.raytrace.light_worker", shared, [small], 1, environment
+                "pilot: baking light", "dnrpipe.raytrace.light_worker", shared, [small], 1, renderer.environment
             )
         took = time.monotonic() - started
         bake = LightPoint(size=size, spp=spp, seconds=result["seconds"], cpu_seconds=result["cpu_seconds"])
@@ -113,9 +112,10 @@ class Piloting:
 
     def base(self) -> BasePart:
         """Base images of all views of the pilot."""
-        common, environment, task, _ = renderer_inputs(self.workspace, self.settings, self.plan)
-        if task is not None:
-            common |= {"light": str(self._light(task))}
+        renderer = base_renderer(self.workspace, self.settings, self.plan)
+        common, environment = renderer.common, renderer.environment
+        if renderer.light is not None:
+            common |= {"light": str(self._light(renderer))}
         tasks = [
             {
                 "view": view.model_dump(mode="json"),
@@ -166,17 +166,17 @@ class Piloting:
 
     def frames(self) -> FramePart:
         """The held-out views, by all renderers."""
-        _, environment, light, _ = renderer_inputs(self.workspace, self.settings, self.plan)
+        renderer = base_renderer(self.workspace, self.settings, self.plan)
         task = {
             "kind": "frames",
             "views": [view.model_dump(mode="json") for view in self.held_out],
             "folders": [str(folder) for folder in self._models()],
-            "light": str(self._light(light)) if light is not None else None,
+            "light": str(self._light(renderer)) if renderer.light is not None else None,
             "samples": list(RUNGS),
             "methods": list(METHODS),
         }
         ((_, result),) = self._run(
-            "pilot: frames", "dnrpipe.studies.planning.worker", self._common(), [task], 1, environment
+            "pilot: frames", "dnrpipe.studies.planning.worker", self._common(), [task], 1, renderer.environment
         )
         if lost := result.pop("unknown"):
             self.console.warn(f"pilot: {lost} pixels of the held-out views were not finite; they take no part")
@@ -199,23 +199,22 @@ class Piloting:
         environment: dict[str, str],
     ) -> list[tuple[dict[str, Any], dict[str, Any]]]:
         """(task, result) of each. Raises UserError where one failed twice."""
-        log = self.workspace.log("plan")
         found = []
         with self.console.bar(label, len(tasks)) as bar:
-            outcomes = run_tasks(
-                module, common, tasks, workers=workers, log=log, timeout=TIMEOUT, environment=environment
-            )
-            try:
-                for outcome in outcomes:
-                    if isinstance(outcome, Retry):
-                        self.console.warn(f"{label}: {outcome.reason}; trying once more")
-                    elif outcome.result is None:
-                        raise UserError(f"{label}: {outcome.error}; see {log}")
-                    else:
-                        found.append((outcome.task, outcome.result))
-                        bar.advance()
-            finally:
-                outcomes.close()  # type: ignore[attr-defined]
+            for outcome in answers(
+                module,
+                common,
+                tasks,
+                workers=workers,
+                log=self.run.log,
+                timeout=TIMEOUT,
+                retried=warn_of_retries(label, self.console),
+                environment=environment,
+            ):
+                if outcome.result is None:
+                    raise UserError(f"{label}: {outcome.error}; see {self.run.log}")
+                found.append((outcome.task, outcome.result))
+                bar.advance()
         return found
 
     def _task(self, view: View, name: str, spp: int, config: dict[str, Any]) -> dict[str, Any]:
@@ -248,9 +247,10 @@ class Piloting:
     def _base_file(self, kind: str, view: View) -> Path:
         return self.folder / f"base-{kind}-{view.name}.exr"
 
-    def _light(self, task: dict[str, Any]) -> Path:
+    def _light(self, renderer: BaseRenderer) -> Path:
         """The real light where it is on disk, else the pilot's."""
-        return Path(task["output"]) if light_is_baked(task) else self.folder / "light.npz"
+        assert renderer.light is not None
+        return Path(renderer.light["output"]) if renderer.light_is_baked else self.folder / "light.npz"
 
 
 def _raw_rmse(result: dict[str, Any]) -> float | None:
@@ -272,9 +272,7 @@ def _views(workspace: Workspace) -> tuple[list[View], list[View]]:
     views = splits["train"]
     rule = untrained("farthest")
     assert rule is not None
-    positions = np.stack([view.position for view in views])
-    directions = np.stack([-view.matrix[:3, 2] for view in views])
-    chosen = rule.choose(Candidates(positions, directions), min(VIEWS, len(views)), 0).views
+    chosen = rule.choose(Candidates.of_views(views), min(VIEWS, len(views)), 0).views
     others = [view for i, view in enumerate(views) if i not in set(chosen)]
     left = splits.get("test") or splits.get("val") or others or views
     step = max(1, len(left) // HELD_OUT)

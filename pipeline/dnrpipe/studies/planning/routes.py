@@ -103,11 +103,6 @@ def break_even(found: Sequence[Route]) -> int | None:
     return break_even_frames(neural.upfront, traced.frame, neural.frame)
 
 
-def best_rung(part: FramePart) -> FramePoint:
-    """The rung of the highest PSNR."""
-    return max(part.rival, key=lambda point: point.psnr)
-
-
 def _between(line: Sequence[tuple[str, float, float]], seconds: float) -> str:
     below = [name for name, at, _ in line if at <= seconds * (1 + 1e-9)]
     above = [name for name, at, _ in line if at > seconds * (1 + 1e-9)]

@@ -108,18 +108,18 @@ class Worker:
         between, cpu_between = np.maximum(0.0, np.median(gaps, axis=0)).tolist()
         record = read_record(folder)
         assert record is not None  # training has just finished
-        history = record["history"]
+        history = record.history
         later = history[1:] or history  # the first epoch warms up
-        steps = sum(entry["steps"] for entry in later)
-        seconds = sum(entry["seconds"] for entry in later) / steps
-        booked = sum(entry["seconds"] for entry in history)
+        steps = sum(entry.steps for entry in later)
+        seconds = sum(entry.seconds for entry in later) / steps
+        booked = sum(entry.seconds for entry in history)
         return {
             "seconds": seconds,
-            "cpu_seconds": sum(entry["cpu_seconds"] for entry in later) / steps,
+            "cpu_seconds": sum(entry.cpu_seconds for entry in later) / steps,
             "between": between,
             "cpu_between": cpu_between,
             "startup": max(0.0, took - booked - between * len(history)),
-            "steps": sum(entry["steps"] for entry in history),
+            "steps": sum(entry.steps for entry in history),
         }
 
     def _load(self, views: list[View], task: dict[str, Any]) -> ViewSet:

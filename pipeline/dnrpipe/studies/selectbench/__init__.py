@@ -4,6 +4,7 @@ pools      sets of candidates: a workspace per scene and pool
 rigs       cameras of the pools that are no spheres
 policies   what competes, as data
 choosing   one selection, in a worker process
+active/    rivals from the literature that train renderers of their own
 run        the resumable loop: selections, ray tracing of what was chosen, cells (those of `dnrpipe ablate`)
 results    results.json: all cells and what made them
 intervals  paired differences and their confidence

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import resource
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from dnrtrain.atomic import write_json
 
 from ...core.scene_files import split_views
 from ...core.workspace import Workspace
-from ..cells.cell import load_cell_views
 
 if TYPE_CHECKING:
-    from dnrtrain.contract import View
-    from dnrtrain.selector.protocol import Candidates, Choice
     from dnrtrain.selector.sightings import Sightings
 
 
@@ -26,8 +20,7 @@ class Worker:
     """Task {"key", "workspace", "policy", "budget", "seed", "output"} -> what its file holds, see ``__call__``.
 
     A pool's sightings are made once per process; what they took is part of every selection that looks at them, as if
-    it had made them itself. A task of a later round names the ``base`` of the model and the file of the round
-    ``before``, whose views are ray-traced by now.
+    it had made them itself.
     """
 
     def __init__(self, common: dict[str, Any]) -> None:
@@ -42,16 +35,9 @@ class Worker:
         policy = untrained(task["policy"])
         assert policy is not None  # a trained one is chosen by step 1
         sightings, spent = self._look(task["workspace"]) if policy.looks else (None, (0.0, 0.0))
-        candidates = Candidates(
-            np.stack([view.position for view in views]),
-            np.stack([-view.matrix[:3, 2] for view in views]),
-            sightings,
-        )
+        candidates = Candidates.of_views(views, sightings)
         wall, cpu = time.perf_counter(), time.process_time()
-        if "before" in task:
-            choice, spent = self._go_on(task, views, candidates)
-        else:
-            choice = policy.choose(candidates, task["budget"], task["seed"])
+        choice = policy.choose(candidates, task["budget"], task["seed"])
         made = {
             "key": task["key"],
             "views": [views[i].name for i in choice.views],
@@ -64,21 +50,6 @@ class Worker:
         }
         write_json(Path(task["output"]), made)
         return made
-
-    def _go_on(
-        self, task: dict[str, Any], views: list[View], candidates: Candidates
-    ) -> tuple[Choice, tuple[float, float]]:
-        """The choice of a later round, and the (wall, processor) seconds of the rounds before it."""
-        from dnrtrain.selector.protocol import Choice
-
-        from ...stages.rounds import go_on
-
-        before = json.loads(Path(task["before"]).read_text(encoding="utf-8"))
-        place = {view.name: index for index, view in enumerate(views)}
-        chosen = Choice([place[name] for name in before["views"]], before["gains"], before["why"], before["details"])
-        workspace = Workspace.open(Path(task["workspace"]))
-        traced = load_cell_views(workspace, "train", before["views"], raytraced=True, base=task["base"])
-        return go_on(candidates, chosen, traced, task["budget"]), (before["seconds"], before["cpu_seconds"])
 
     def _look(self, place: str) -> tuple[Sightings, tuple[float, float]]:
         """What the pool's candidates see, and the (wall, processor) seconds that looking took."""

@@ -13,7 +13,7 @@ from ...core.errors import UserError
 from ...core.settings import merge, parse_assignment, resolve
 from ...core.workspace import locked
 from ..cells.scenes import find_scenes
-from ..cells.worker_pool import check_amounts, make_crew
+from ..cells.worker_pool import check_amounts, make_pool
 from .plot import plot
 from .policies import choose_policies
 from .pools import choose_pools
@@ -96,7 +96,7 @@ def run_bench(
         "budgets": request.budgets,
         "spp": {"training": base.raytrace.spp, "test": base.raytrace.evaluation_spp},
     }
-    bench = Bench(request, console, make_crew(base, jobs, out / "logs" / "cells.log", console, single=True))
+    bench = Bench(request, console, make_pool(base, jobs, out / "logs" / "cells.log", console, single=True))
     with locked(out, "bench-select"):
         try:
             for _ in bench.run():
@@ -127,7 +127,7 @@ def choose_budgets(text: str, candidates: int) -> list[int]:
 def _write(bench: Bench, facts: dict[str, Any]) -> dict[str, Any]:
     """Results, report and curves of the cells that are there."""
     out = bench.request.out
-    results = gather(bench, {**facts, "device": bench.crew.device, "threads": bench.crew.threads})
+    results = gather(bench, {**facts, "device": bench.worker_pool.device, "threads": bench.worker_pool.threads})
     if results["cells"]:
         write_json(out / "results.json", results)
         write_text(out / "report.md", markdown(results))

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from .intervals import Difference, summarise
-from .policies import CONTENDERS, SIMPLE
+from .policies import SIMPLE
 from .pools import POOLS
 
 SPHERICAL = ("dome", "sphere")
@@ -25,7 +25,8 @@ class Figures:
         self.scenes = [name for name in results["scenes"] if name in present]
         self.pools = [name for name in POOLS if any(place[0] == name for place in self.cells)]
         self.budgets = sorted({place[1] for place in self.cells})
-        self.policies = [name for name in CONTENDERS if any(place[2] == name for place in self.cells)]
+        # In the order of the run: published results name policies that are no longer offered, too.
+        self.policies = list(dict.fromkeys(cell["policy"] for cell in results["cells"]))
         self.seeds = sorted({cell["seed"] for cell in results["cells"]})
 
     def values(self, pool: str, budget: int, policy: str, metric: str) -> dict[tuple[str, int], float]:

@@ -1,4 +1,4 @@
-"""What competes, as data: every policy of :mod:`dnrtrain.selector`, and the paper's with each of its rewards."""
+"""What competes, as data: the policies of `dnrpipe select`, the paper's with each reward, and active learning."""
 
 from __future__ import annotations
 
@@ -8,34 +8,35 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from ...core.errors import UserError
 from ...core.settings import Settings, merge
 
-LEARNED = "rl"
+LEARNED = "rl-paper"
 """The policy that the trainer's step 1 trains."""
+Kind = Literal["rule", "active", "step1"]
 
 
 @dataclass(frozen=True)
 class Contender:
     """One line of the tables.
 
-    policy: the trainer's name of it. changes: nested settings. rule: whether a line that needs no training; the best
-    of the simple ones is what others are compared with. rounds: 2 or more choose on after ray tracing a part.
+    policy: its name where it is computed. changes: nested settings. kind: rule, a policy of the trainer that needs no
+    training (the best of the simple ones is what others are compared with); active, one of `active.batches`; step1, an
+    agent that step 1 trains.
     """
 
     name: str
     what: str
     policy: str
-    rule: bool = True
-    rounds: int = 1
+    kind: Kind = "rule"
     changes: Mapping[str, Any] = field(default_factory=dict)
 
 
 def _paper(name: str, what: str, reward: str) -> Contender:
     what = f"the paper's RL selector, reward: {what}"
-    return Contender(name, what, LEARNED, rule=False, changes=_reward(reward))
+    return Contender(name, what, LEARNED, "step1", changes=_reward(reward))
 
 
 def _reward(name: str) -> dict[str, Any]:
@@ -47,13 +48,8 @@ _CONTENDERS = (
     Contender("farthest", "farthest-point sampling of camera poses", "farthest"),
     Contender("kmedoids", "k-medoids of camera poses", "kmedoids"),
     Contender("coverage", "greedy coverage: surface x view direction x resolution", "coverage"),
-    Contender("d-optimal", "greedy D-optimal design of the neural texture", "d-optimal"),
-    Contender("exchange", "k-medoids, then swaps that count what is seen, too", "exchange"),
-    Contender("auto-2", "coverage, traced, then exchange where that shows errors", "auto", rounds=2),
-    Contender("dqn", "learned on a surrogate of texture training, other scenes; never worse by it than rules", "dqn"),
-    Contender("fisher", "Fisher information of the coarse renderer, redundancy controlled", "fisher", rule=False),
-    Contender("ensemble", "active: where coarse renderers of the views so far disagree", "ensemble", rule=False),
-    Contender("variance", "active: where a coarse renderer of the views so far is least sure", "variance", rule=False),
+    Contender("ensemble", "active: where coarse renderers of the views so far disagree", "ensemble", "active"),
+    Contender("variance", "active: where a coarse renderer of the views so far is least sure", "variance", "active"),
     _paper("rl-paper", "-loss (the paper's)", "neg-loss"),
     _paper("rl-hard", "+loss", "pos-loss"),
     _paper("rl-decrease", "decrease of the error on probe views", "improvement"),
@@ -64,7 +60,7 @@ CONTENDERS: dict[str, Contender] = {contender.name: contender for contender in _
 SIMPLE = ("farthest", "kmedoids", "coverage")
 """The simple rules; the best of them in a pool is the rival."""
 GROUPS: dict[str, tuple[str, ...]] = {
-    "core": tuple(c.name for c in _CONTENDERS if c.rule and c.rounds == 1),
+    "core": tuple(c.name for c in _CONTENDERS if c.kind == "rule"),
     "simple": ("random", *SIMPLE),
     "auto": ("coverage",),  # what the default is
     "rewards": tuple(c.name for c in _CONTENDERS if c.policy == LEARNED),

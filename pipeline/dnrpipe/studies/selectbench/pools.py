@@ -18,6 +18,7 @@ from ...core.settings import Settings
 from ...core.workspace import Source, Workspace, file_sha256
 from ...stages.base_images import light_path
 from ...stages.prepare import scene_and_views
+from ...stages.stage import Run
 from ..cells.scenes import Scene, prepared
 from .rigs import inside, walk
 
@@ -131,7 +132,7 @@ def _converted(source: Path, out: Path, settings: Settings, console: Console) ->
     workspace = Workspace.create(out / "scenes" / f"{source.stem}.dnr", _source(source))
     plain = settings.model_copy(deep=True)
     plain.cameras.source, plain.cameras.source_sha256 = "dome", ""
-    scene_and_views(workspace, plain, Console(json_mode=console.json_mode, quiet=True), "bench-select")
+    scene_and_views(Run(workspace, plain, Console(json_mode=console.json_mode, quiet=True), id="bench-select"))
     return workspace
 
 

@@ -43,7 +43,7 @@ def _line(
     select_seconds: choosing, step 1 included where it chooses; view_seconds: tracing the views and their base images;
     train_seconds: step 2, and step 1 where it only gives the start; total_seconds: all of them.
     """
-    clock = "cpu_seconds" if bench.crew.device == "cpu" else "seconds"
+    clock = "cpu_seconds" if bench.worker_pool.device == "cpu" else "seconds"
     choice = json.loads(Path(task["choice"]).read_text(encoding="utf-8"))
     training = cell["training"]
     chooses = training["step1"] is not None and training["step1"]["key"] == choice["key"]

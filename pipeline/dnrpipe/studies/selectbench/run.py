@@ -3,7 +3,7 @@
 <out>/
   scenes/<scene>.dnr                 the scene converted, once
   scenes/<scene>-<pool>.dnr          its candidates and test views: passes; ray tracing as far as somebody chose them
-  selections/<scene>-<pool>/<key>.json   the views that a rule chose, why, and what that took
+  selections/<scene>-<pool>/<key>.json   the views that a rule, or active learning, chose, why, and what that took
   step1/<scene>-<pool>/<key>.json    the same of a trained policy, and coarse models (weights beside them)
   cells/<scene>-<pool>/<key>.json    one cell each; the key is a hash of all that decides it
   results.json  report.md  views.png  seconds.png
@@ -13,12 +13,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from dnrtrain.exr import read_metadata
-from dnrtrain.selector.names import ACTIVE_NAMES
 
 from ... import __version__
 from ...core.console import Console
@@ -26,18 +25,18 @@ from ...core.errors import UserError
 from ...core.settings import Settings
 from ...core.workspace import digest
 from ...effects.store import plan_of
-from ...stages.rounds import portions
 from ...stages.trainer import perceptual_weights
 from ..cells.cell import CELL_VERSION
 from ..cells.provenance import code_state
 from ..cells.scenes import base_file, make_bases, trace_references, trace_train
-from ..cells.worker_pool import Crew
-from .policies import Contender, rules_fingerprint, settings_of
+from ..cells.worker_pool import WorkerPool
+from .active.settings import ActiveSettings
+from .policies import Contender, Kind, rules_fingerprint, settings_of
 from .pools import Placed, Pool, place_pool, share_light
 
 CHOICE_VERSION = 1  # raise when what a selection's file holds changes
 SHARED_COARSE = "farthest"
-"""Step 1 without a selector trains the same for every rule, so that all share one coarse model."""
+"""Step 1 without a selector trains the same for every policy, so that all share one coarse model."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ class Bench:
 
     request: Request
     console: Console
-    crew: Crew
+    worker_pool: WorkerPool
     perceptual: bool = False
     pools: list[Pool] = field(default_factory=list)
     references: dict[str, list[str]] = field(default_factory=dict)
@@ -103,7 +102,7 @@ class Bench:
             yield seed
 
     def _seed(self, seed: int) -> None:
-        rules, trained, coarse = [], [], []
+        work: dict[Kind, list[dict[str, Any]]] = {"rule": [], "active": [], "step1": []}
         chosen: dict[Place, dict[str, Any]] = {}
         starts: dict[Place, dict[str, Any]] = {}
         for pool in self.pools:
@@ -111,25 +110,26 @@ class Bench:
                 for contender in self.request.policies:
                     place = Place(pool.scene, pool.name, budget, contender.name, seed)
                     settings = settings_of(contender, self._settings(pool), budget)
-                    if contender.rule:
-                        first = portions(budget, contender.rounds)[0]
-                        chosen[place] = self._choice(pool, contender, first, seed)
-                        rules.append(chosen[place])
+                    if contender.kind == "rule":
+                        chosen[place] = self._choice(pool, contender, budget, seed)
+                    elif contender.kind == "active":
+                        chosen[place] = self._active(pool, settings, contender.policy, seed)
                     else:
                         chosen[place] = self._step1(pool, settings, contender.policy, seed)
-                        trained.append(chosen[place])
-                    if settings.finetune.step2.start == "coarse":
-                        own = self._step1(pool, settings, SHARED_COARSE, seed) if contender.rule else chosen[place]
-                        starts[place] = own
-                        coarse.append(own)
+                    work[contender.kind].append(chosen[place])
+                    if settings.starts_coarse:
+                        own = contender.kind == "step1"
+                        starts[place] = chosen[place] if own else self._step1(pool, settings, SHARED_COARSE, seed)
         label = f", seed {seed}"
-        self.crew.work(f"selections{label}", "dnrpipe.studies.selectbench.choosing", _once(rules))
-        self._further_rounds(chosen, label)
-        self.crew.work(f"step 1{label}", "dnrpipe.studies.cells.cell", _once([*trained, *coarse]))
+        self.worker_pool.work(f"selections{label}", "dnrpipe.studies.selectbench.choosing", _once(work["rule"]))
+        self.worker_pool.work(
+            f"active selections{label}", "dnrpipe.studies.selectbench.active.worker", _once(work["active"])
+        )
+        self.worker_pool.work(f"step 1{label}", "dnrpipe.studies.cells.cell", _once([*work["step1"], *starts.values()]))
         for pool in self.pools:
             places = [place for place in chosen if (place.scene, place.pool) == (pool.scene, pool.name)]
             self._trace_and_plan(pool, {place: chosen[place] for place in places}, starts)
-        self.crew.work(
+        self.worker_pool.work(
             f"cells{label}",
             "dnrpipe.studies.cells.cell",
             _once([task for place, task in self.cells.items() if place.seed == seed]),
@@ -150,14 +150,34 @@ class Bench:
             "label": f"{pool.folder} {contender.name} {budget}",
         }
 
+    def _active(self, pool: Pool, settings: Settings, policy: str, seed: int) -> dict[str, Any]:
+        """The task of a selection by active learning."""
+        model, step1, budget = settings.model.coarse(), settings.select.step1, settings.select.budget
+        key = digest(
+            [
+                *(CHOICE_VERSION, CELL_VERSION, __version__, pool.data.inputs, model.model_dump(), step1.model_dump()),
+                *(asdict(ActiveSettings()), policy, budget, seed, self.worker_pool.device, self.worker_pool.threads),
+            ]
+        )
+        folder = self.request.out / "selections" / pool.folder / key
+        return {
+            "key": key,
+            "workspace": str(pool.data.workspace.root),
+            "settings": settings.model_dump(mode="json"),
+            "policy": policy,
+            "seed": seed,
+            "folder": str(folder),
+            "output": f"{folder}.json",
+            "label": f"{pool.folder} {policy} {budget}",
+        }
+
     def _step1(self, pool: Pool, settings: Settings, policy: str, seed: int) -> dict[str, Any]:
-        """The task of a step 1: a trained policy's selection, or the coarse model that all rules share."""
+        """The task of a step 1: a trained policy's selection, or the coarse model that all others share."""
         model, step1, budget = settings.model.coarse(), settings.select.step1, settings.select.budget
         key = digest(
             [
                 *(CELL_VERSION, __version__, pool.data.inputs, model.model_dump(), step1.model_dump()),
-                *(policy, budget, seed, self.crew.device, self.crew.threads),
-                *([settings.select.active.model_dump(), settings.starts_coarse] if policy in ACTIVE_NAMES else []),
+                *(policy, budget, seed, self.worker_pool.device, self.worker_pool.threads),
             ]
         )
         folder = self.request.out / "step1" / pool.folder / key
@@ -174,31 +194,6 @@ class Bench:
             "output": f"{folder}.json",
             "label": f"{pool.folder} step 1",
         }
-
-    def _further_rounds(self, chosen: dict[Place, dict[str, Any]], label: str) -> None:
-        """Policies of several rounds: trace what they chose so far, let them look at it and choose on."""
-        rounds = {contender.name: contender.rounds for contender in self.request.policies}
-        for number in range(2, max(rounds.values()) + 1):
-            due = []
-            for pool in self.pools:
-                here = [
-                    p for p in chosen if (p.scene, p.pool) == (pool.scene, pool.name) and rounds[p.policy] >= number
-                ]
-                views = {place: read_choice(chosen[place])["views"] for place in here}
-                if not here:
-                    continue
-                traced, bases = self._trace(pool, sorted({name for names in views.values() for name in names}))
-                for place in here:
-                    before, names = chosen[place], views[place]
-                    seen = [[traced[name], bases.get(f"train/{name}")] for name in names]
-                    budget = portions(place.budget, rounds[place.policy])[number - 1]
-                    key = digest([CHOICE_VERSION, before["key"], budget, seen])
-                    output = str(self.request.out / "selections" / pool.folder / f"{key}.json")
-                    base = self._settings(pool).model.base
-                    task = {"key": key, "budget": budget, "before": before["output"], "base": base, "output": output}
-                    chosen[place] = {**before, **task}
-                    due.append(chosen[place])
-            self.crew.work(f"selections, round {number}{label}", "dnrpipe.studies.selectbench.choosing", _once(due))
 
     def _trace(self, pool: Pool, names: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
         """Ray-trace candidates and render base images; -> fingerprints, see ``trace_train`` and ``make_bases``."""
@@ -237,13 +232,13 @@ class Bench:
     ) -> dict[str, Any]:
         """The cell's task (:class:`..ablation.cells.Worker`); its key is a hash of all that decides what comes out."""
         model, step2 = settings.model.model_dump(mode="json"), settings.finetune.step2.model_dump(mode="json")
-        crew, data = self.crew, pool.data
+        worker_pool, data = self.worker_pool, pool.data
         used = [f"train/{name}" for name in views] + [f"test/{name}" for name in data.test]
         shown = [CELL_VERSION, __version__, data.inputs, self.references[pool.folder], model]
         shown.append([bases[name] for name in used] if bases else None)
         train = [place.seed, [traced[name] for name in views], step2, coarse and coarse["key"], self.request.seconds]
-        key = digest([*shown, train, crew.device, crew.threads, self.perceptual])
-        pace = [*shown[:5], len(views), step2, crew.device, crew.threads]
+        key = digest([*shown, train, worker_pool.device, worker_pool.threads, self.perceptual])
+        pace = [*shown[:5], len(views), step2, worker_pool.device, worker_pool.threads]
         folder = self.request.out / "cells" / pool.folder
         return {
             "kind": "cell",
@@ -278,7 +273,7 @@ class Bench:
     def view_seconds(self, pool: Pool, names: Sequence[str]) -> float:
         """Seconds of ray tracing the views and their base images, by the files: processor time on a CPU."""
         kind, workspace = self._settings(pool).model.base, pool.data.workspace
-        clock = "cpu_seconds" if self.crew.device == "cpu" else "seconds"
+        clock = "cpu_seconds" if self.worker_pool.device == "cpu" else "seconds"
         files = [workspace.raytraced("train", name) for name in names]
         if kind not in ("none", "raster"):
             files += [base_file(workspace, kind, "train", name) for name in names]

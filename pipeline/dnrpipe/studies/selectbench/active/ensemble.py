@@ -18,11 +18,12 @@ from typing import ClassVar
 import numpy as np
 import torch
 
-from ..aggregator import Inside
-from ..dataset import ViewSet
-from ..model import DNR
-from ..settings import ActiveSettings
+from dnrtrain.aggregator import Inside
+from dnrtrain.dataset import ViewSet
+from dnrtrain.model import DNR
+
 from .pieces import Pieces, Sighted, cells_of, seen_cells
+from .settings import ActiveSettings
 
 
 class Disagreement:

@@ -3,68 +3,76 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Generator, Iterator
+import json
+import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-import synthetic
 import torch
 from torch import Tensor
 
-from conftest import Scene
-from dnrtrain.checkpoint import load_model, read_record
-from dnrtrain.contract import View
+from dnrpipe.core.settings import resolve
+from dnrpipe.core.workspace import Source, Workspace
+from dnrpipe.studies.selectbench.active import worker
+from dnrpipe.studies.selectbench.active.batches import KINDS, choose_actively, sizes
+from dnrpipe.studies.selectbench.active.ensemble import Disagreement, Spread
+from dnrpipe.studies.selectbench.active.pieces import COUNT, Pieces, cells_of, pieces_of, seen_cells
+from dnrpipe.studies.selectbench.active.settings import ActiveSettings
+from dnrpipe.studies.selectbench.active.variance import UNKNOWN, PredictedVariance, Reduction, features_of, train_head
+from dnrpipe.studies.selectbench.active.worker import Members
+from dnrtrain.checkpoint import read_record
+from dnrtrain.contract import View, write_cameras
 from dnrtrain.dataset import ViewSet, load_views
-from dnrtrain.events import EpochEnd, Event, Selected
+from dnrtrain.events import EpochEnd, Event
 from dnrtrain.model import DNR, Output, render_views
-from dnrtrain.selector.active import active_epochs, active_steps, choose_actively, sizes
-from dnrtrain.selector.ensemble import Disagreement, Spread
-from dnrtrain.selector.names import ACTIVE_NAMES
-from dnrtrain.selector.pieces import COUNT, Pieces, cells_of, pieces_of, seen_cells
-from dnrtrain.selector.protocol import Candidates, Choice
+from dnrtrain.records import ModelRecord
+from dnrtrain.selector.protocol import Choice
 from dnrtrain.selector.sightings import look_at, sightings_of
-from dnrtrain.selector.variance import UNKNOWN, PredictedVariance, Reduction, features_of, train_head
-from dnrtrain.settings import ActiveSettings, ModelSettings, Step1Settings
-from dnrtrain.step1 import MEMBERS, run_step1
+from dnrtrain.settings import ModelSettings, Step1Settings
+from dnrtrain.step1 import run_step1
+
+sys.path.insert(0, str(Path(__file__).parent / "trainer"))
+
+import synthetic
 
 MODEL = ModelSettings(texture_size=16, width=4, depth=1, aggregator="residual")
 STEP1 = Step1Settings(epochs=2, precision="float32")
 SHORT = ActiveSettings(members=2, rounds=2, epochs=2)
 
 
-def start(
-    views: ViewSet, folder: Path, policy: str, *, budget: int = 4, seed: int = 0, coarse: bool = False
-) -> Iterator[Event]:
-    return run_step1(
-        views, None, views.camera_positions, MODEL, STEP1, policy=policy, budget=budget, seed=seed, device="cpu",
-        checkpoints=folder, fingerprint="f", active=SHORT, coarse=coarse,
-    )  # fmt: skip
+def start(views: ViewSet, folder: Path, seed: int = 0) -> Members:
+    return Members(views, MODEL, STEP1, SHORT, seed, "cpu", folder, "f")
 
 
-def chosen(events: Iterator[Event]) -> Selected:
-    *_, last = events
-    assert isinstance(last, Selected)
-    return last
-
-
-def untrained(views: list[int], batch: int, member: int) -> Generator[Event, None, DNR]:
+def untrained(views: list[int], batch: int, member: int) -> DNR:
     """In place of training: a renderer of new weights, the same for one member whatever the views."""
-    yield from ()
     return DNR(MODEL, 10 * batch + member).eval()
 
 
 def chosen_from(views: ViewSet, policy: str, budget: int, settings: ActiveSettings = SHORT) -> Choice:
-    candidates = Candidates(views.camera_positions, views.camera_directions)
-    running = choose_actively(policy, views, candidates, budget, 0, settings, untrained)
-    with pytest.raises(StopIteration) as end:
-        next(running)
-    return end.value.value
+    return choose_actively(policy, views, budget, 0, settings, untrained)
 
 
 def load(folder: Path, views: list[View]) -> ViewSet:
     files, _ = synthetic.write_scene(folder, views)
     return load_views(files, None, synthetic.FRAME, cameras=views, folder=folder)
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def raster(tmp_path_factory: pytest.TempPathFactory) -> ViewSet:
+    """10 views on a dome."""
+    return load(tmp_path_factory.mktemp("scene"), synthetic.dome(10, 32))
 
 
 @pytest.fixture(scope="module")
@@ -88,76 +96,79 @@ def test_batches() -> None:
     assert (
         sizes(25, 2) == [9, 17, 25] and sizes(10, 3) == [4, 6, 8, 10] and sizes(2, 5) == [1, 2] and sizes(1, 2) == [1]
     )
-    assert active_epochs("ensemble", SHORT, 25) == 2 * 2 * 2 and active_epochs("variance", SHORT, 25) == 2 * 2
-    assert active_steps("ensemble", SHORT, 25) == (9 + 17) * 2 * 2 and active_steps("variance", SHORT, 1) == 0
 
 
-@pytest.mark.parametrize("policy", ACTIVE_NAMES)
-def test_selection_and_books(scene: Scene, tmp_path: Path, policy: str) -> None:
-    """Without training on all candidates: only the policy's own models, whose epochs are all booked."""
-    events = list(start(scene.raster, tmp_path / "step1", policy))
-    epochs = [event for event in events if isinstance(event, EpochEnd)]
-    count = active_epochs(policy, SHORT, 4)
-    assert [(e.epoch, e.epochs) for e in epochs] == [(n, count) for n in range(1, count + 1)]
-    assert sum(e.steps for e in epochs) == active_steps(policy, SHORT, 4)
-    last = events[-1]
-    assert isinstance(last, Selected) and last.policy == policy
-    assert len(set(last.views)) == len(last.gains) == len(last.why) == 4
-    assert last.gains[:2] == [0.0, 0.0] and min(last.gains[2:]) > 0 and last.seconds > 0
-    assert last.details["start"] == 2 and [b["trained_on"] for b in last.details["batches"]] == [2, 3]
-    assert last.why[0].startswith("k-medoids") and last.why[3].startswith("batch 2:")
-    assert 0 <= last.details["uncovered"] < 0.5 and "measure" in last.details
-    record = read_record(tmp_path / "step1")
-    assert record is not None and record["selected"] == last.views
-    assert [entry["epoch"] for entry in record["history"]] == list(range(1, count + 1))
-    assert record["choosing"] == {"seconds": last.seconds, "cpu_seconds": last.cpu_seconds}
-    assert sorted(path.name for path in (tmp_path / "step1").iterdir()) == ["model.json", "model.safetensors"]
-    assert list(start(scene.raster, tmp_path / "step1", policy)) == [last]  # a finished step answers at once
+@pytest.mark.parametrize(("policy", "models"), [("ensemble", 4), ("variance", 2)])
+def test_selection_and_books(raster: ViewSet, tmp_path: Path, policy: str, models: int) -> None:
+    """The policy's own models, and the choosing beside them, are all that it costs."""
+    members = start(raster, tmp_path)
+    choice, cost = members.choose(policy, 4)
+    assert len(set(choice.views)) == len(choice.gains) == len(choice.why) == 4
+    assert choice.gains[:2] == [0.0, 0.0] and min(choice.gains[2:]) > 0
+    assert choice.details["start"] == 2 and [b["trained_on"] for b in choice.details["batches"]] == [2, 3]
+    assert choice.why[0].startswith("k-medoids") and choice.why[3].startswith("batch 2:")
+    assert 0 <= choice.details["uncovered"] < 0.5 and "measure" in choice.details
+    epochs = [epoch for folder in members.folders for epoch in record_of(folder).history]
+    assert len(members.folders) == models and len(epochs) == models * SHORT.epochs
+    assert sum(epoch.steps for epoch in epochs) == (2 + 3) * models // 2 * SHORT.epochs
+    for name in ("seconds", "cpu_seconds"):
+        assert cost[name] > sum(getattr(epoch, name) for epoch in epochs) > 0
+    again, less = start(raster, tmp_path).choose(policy, 4)  # finished models answer at once
+    assert again == choice and less["seconds"] > sum(epoch.seconds for epoch in epochs)
 
 
-def test_where_step_2_starts_from_it_the_coarse_model_is_trained(scene: Scene, tmp_path: Path) -> None:
-    """The same views; the saved model is then that of any policy without an agent."""
-    with_it = list(start(scene.raster, tmp_path / "a", "variance", coarse=True))
-    without = chosen(start(scene.raster, tmp_path / "b", "variance"))
-    assert chosen(iter(with_it)) == without
-    assert len(with_it) == STEP1.epochs + active_epochs("variance", SHORT, 4) + 1
-    chosen(start(scene.raster, tmp_path / "c", "random"))
-    weights = [load_model(tmp_path / name).state_dict() for name in "abc"]
-    assert all(torch.equal(weights[0][name], weights[2][name]) for name in weights[0])
-    assert not all(torch.equal(weights[1][name], weights[2][name]) for name in weights[1])
+def record_of(folder: Path) -> ModelRecord:
+    record = read_record(folder)
+    assert record is not None
+    return record
 
 
-@pytest.mark.parametrize("policy", ACTIVE_NAMES)
-def test_an_interrupted_run_goes_on(scene: Scene, tmp_path: Path, policy: str) -> None:
+@pytest.mark.parametrize("policy", KINDS)
+def test_an_interrupted_run_goes_on(
+    raster: ViewSet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, policy: str
+) -> None:
     """Stopped within its second model: the same choice and history, and no epoch is trained twice."""
-    whole = chosen(start(scene.raster, tmp_path / "whole", policy))
-    stopped = start(scene.raster, tmp_path / "stopped", policy)
-    done = [next(stopped) for _ in range(3)]
-    assert all(isinstance(event, EpochEnd) for event in done)
-    stopped.close()  # type: ignore[attr-defined]
-    assert (tmp_path / "stopped" / MEMBERS).is_dir()
-    rest = list(start(scene.raster, tmp_path / "stopped", policy))
-    assert rest[-1] == whole
-    trained = [event.epoch for event in rest if isinstance(event, EpochEnd)]
-    assert trained == list(range(4, active_epochs(policy, SHORT, 4) + 1))
-    records = [read_record(tmp_path / name) for name in ("whole", "stopped")]
-    losses = [[(e["epoch"], e["losses"]) for e in record["history"]] for record in records if record]
-    assert losses[0] == losses[1]
+    whole = start(raster, tmp_path / "whole")
+    expected, _ = whole.choose(policy, 4)
+    trained: list[int] = []
+
+    def stop_after(count: int) -> None:
+        def run(*args: Any, **options: Any) -> Iterator[Event]:
+            for event in run_step1(*args, **options):
+                yield event
+                if isinstance(event, EpochEnd):
+                    trained.append(event.epoch)
+                    if len(trained) == count:
+                        raise KeyboardInterrupt
+
+        monkeypatch.setattr(worker, "run_step1", run)
+
+    stop_after(3)
+    with pytest.raises(KeyboardInterrupt):
+        start(raster, tmp_path / "stopped").choose(policy, 4)
+    assert trained == [1, 2, 1]
+    stop_after(0)
+    members = start(raster, tmp_path / "stopped")
+    found, _ = members.choose(policy, 4)
+    assert found == expected
+    assert len(trained) == len(members.folders) * SHORT.epochs
+    for mine, theirs in zip(members.folders, whole.folders, strict=True):
+        assert [e.losses for e in record_of(mine).history] == [e.losses for e in record_of(theirs).history]
 
 
-@pytest.mark.parametrize("policy", ACTIVE_NAMES)
+@pytest.mark.parametrize("policy", KINDS)
 def test_order_does_not_matter_and_the_seed_decides(pool: ViewSet, tmp_path: Path, policy: str) -> None:
     order = [int(i) for i in np.random.default_rng(3).permutation(len(pool))]
-    straight = chosen(start(pool, tmp_path / "a", policy, budget=5))
-    shuffled = chosen(start(pool.subset(order), tmp_path / "b", policy, budget=5))
-    twins = {"c0": pool.names[0], "c5": pool.names[5]}
-    assert [twins.get(n, n) for n in shuffled.views] == [twins.get(n, n) for n in straight.views]
+    straight, _ = start(pool, tmp_path / "a").choose(policy, 5)
+    shuffled, _ = start(pool.subset(order), tmp_path / "b").choose(policy, 5)
+    twins = {8: 0, 9: 5}
+    assert [twins.get(order[v], order[v]) for v in shuffled.views] == [twins.get(v, v) for v in straight.views]
     assert shuffled.gains == straight.gains
-    other = chosen(start(pool, tmp_path / "c", policy, budget=5, seed=1))
+    other, _ = start(pool, tmp_path / "c", seed=1).choose(policy, 5)
     assert other.gains != straight.gains and other.gains[:2] == straight.gains[:2]
 
 
-@pytest.mark.parametrize("policy", ACTIVE_NAMES)
+@pytest.mark.parametrize("policy", KINDS)
 def test_duplicates_and_empty_views_come_last(pool: ViewSet, policy: str) -> None:
     twins = {8: 0, 9: 5}
     for budget in (1, 3, 9, 12):
@@ -170,18 +181,46 @@ def test_duplicates_and_empty_views_come_last(pool: ViewSet, policy: str) -> Non
     assert "a duplicate: all else was chosen" in choice.why[8] and "sees nothing" in choice.why[11]
 
 
-@pytest.mark.parametrize("policy", ACTIVE_NAMES)
+@pytest.mark.parametrize("policy", KINDS)
 def test_a_pool_that_sees_nothing(pool: ViewSet, tmp_path: Path, policy: str) -> None:
     """The models train on empty pictures, then; the choice is any."""
     empty = pool.subset([10, 11])
-    assert sorted(chosen(start(empty, tmp_path, policy, budget=2)).views) == sorted(empty.names)
+    choice, _ = start(empty, tmp_path).choose(policy, 2)
+    assert sorted(choice.views) == [0, 1]
+
+
+@pytest.mark.slow
+def test_the_worker_writes_a_selection(tmp_path: Path) -> None:
+    """What `dnrpipe bench-select` asks for: a file of the names chosen and the cost; the models are gone."""
+    workspace = Workspace.create(tmp_path / "scene.dnr", Source(path=str(tmp_path / "scene.blend"), sha256="0"))
+    views = synthetic.dome(6, 24)
+    files, _ = synthetic.write_scene(tmp_path / "made", views)
+    for view, file in zip(views, files, strict=True):
+        target = workspace.passes("train", view.name)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        file.rename(target)
+    for split in ("train", "val", "test"):
+        write_cameras(workspace.cameras(split), views if split == "train" else [], split)
+    workspace.scene.mkdir(parents=True, exist_ok=True)
+    (workspace.scene / "frame.json").write_text(synthetic.FRAME.model_dump_json())
+    small = {"texture_size": 16, "width": 4, "depth": 1}
+    settings = resolve(None, {"model": small, "select": {"budget": 3}}, environment={})
+    task = {
+        "key": "k", "workspace": str(workspace.root), "settings": settings.model_dump(mode="json"),
+        "policy": "variance", "seed": 0, "folder": str(tmp_path / "models"), "output": str(tmp_path / "k.json"),
+    }  # fmt: skip
+    made = worker.Worker({"threads": 1, "device": "cpu"})(task)
+    assert json.loads((tmp_path / "k.json").read_text()) == made
+    assert len(set(made["views"])) == 3 and set(made["views"]) <= {view.name for view in views}
+    assert made["key"] == "k" and made["seconds"] > 0 and made["cpu_seconds"] > 0
+    assert not (tmp_path / "models").exists()
 
 
 # -- what is unsure ----------------------------------------------------------------------------------------
 
 
-def test_pieces_are_the_sightings_cells_by_direction(scene: Scene) -> None:
-    views = scene.raster.subset([0, 1])
+def test_pieces_are_the_sightings_cells_by_direction(raster: ViewSet) -> None:
+    views = raster.subset([0, 1])
     view = synthetic.dome(10, 32)[1]
     seen = look_at(synthetic.gbuffer(view), view)
     count = int(views.mask[1].sum())
@@ -206,17 +245,17 @@ class Painted(torch.nn.Module):
         return Output(torch.full_like(batch.normal, self.colour), torch.zeros_like(batch.normal))
 
 
-def test_disagreement_is_the_variance_and_unseen_surface_counts_as_one(scene: Scene) -> None:
+def test_disagreement_is_the_variance_and_unseen_surface_counts_as_one(raster: ViewSet) -> None:
     members: list = [Painted(value) for value in (0.2, 0.4, 0.9)]
-    doubt = Disagreement(members, scene.raster, [0], 0)
+    doubt = Disagreement(members, raster, [0], 0)
     assert doubt.unsure(0) == pytest.approx(np.var([0.2, 0.4, 0.9]), rel=1e-5)
     other = doubt.unsure(5)
-    new = ~seen_cells(scene.raster, [0])[cells_of(scene.raster, 5)]
+    new = ~seen_cells(raster, [0])[cells_of(raster, 5)]
     assert new.any() and not new.all()
     assert other == pytest.approx(np.var([0.2, 0.4, 0.9]) + new, rel=1e-5)
     facts = doubt.facts()
     assert facts["disagreement"] == pytest.approx(np.std([0.2, 0.4, 0.9]), rel=1e-5)
-    assert facts["unseen"] == pytest.approx(new.sum() / (len(new) + int(scene.raster.mask[0].sum())))
+    assert facts["unseen"] == pytest.approx(new.sum() / (len(new) + int(raster.mask[0].sum())))
 
 
 def piece(keys: list[int], pixels: float, unsure: float) -> Pieces:
@@ -259,32 +298,32 @@ def test_reduction_is_bayes_rule() -> None:
         assert gains[-1] < gain
 
 
-def test_the_head_learns_where_the_renderer_errs(scene: Scene) -> None:
+def test_the_head_learns_where_the_renderer_errs(raster: ViewSet) -> None:
     """Targets off by noise of 0.2 on the sphere and 0.02 on the disk: both are found, on a view not trained on."""
     dnr = DNR(MODEL, 0).eval()
     with torch.no_grad():  # texels that tell the halves of the atlas apart, as trained ones do
         for level in dnr.aggregator.texture_uv.levels:
             level[:, 0] = torch.where(torch.arange(level.shape[-1]) < level.shape[-1] // 2, -0.1, 0.1)
     generator = torch.Generator().manual_seed(0)
-    sphere = (scene.raster.uv[:, :1] < 0).float() * scene.raster.mask
+    sphere = (raster.uv[:, :1] < 0).float() * raster.mask
     deviation = 0.02 + 0.18 * sphere
-    colours = render_views(dnr, scene.raster)
+    colours = render_views(dnr, raster)
     noisy = colours + deviation * torch.randn(colours.shape, generator=generator)
-    views = dataclasses.replace(scene.raster, tensors=dataclasses.replace(scene.raster.tensors, target=noisy))
+    views = dataclasses.replace(raster, tensors=dataclasses.replace(raster.tensors, target=noisy))
     head = train_head(dnr, views.subset(list(range(1, 10))), 0)
     with torch.no_grad():
         found = head(features_of(dnr, views.batch([0]))[0]).exp().sqrt()
-    ball = sphere[0, 0][scene.raster.mask[0, 0] > 0] > 0
+    ball = sphere[0, 0][raster.mask[0, 0] > 0] > 0
     assert float(found[ball].median()) == pytest.approx(0.2, rel=0.25)
     assert float(found[~ball].median()) == pytest.approx(0.02, rel=0.25)
 
 
-def test_unseen_surface_has_the_variance_of_ignorance(scene: Scene) -> None:
-    doubt = PredictedVariance([DNR(MODEL, 0).eval()], scene.raster, [0], 0)
-    new = ~seen_cells(scene.raster, [0])[cells_of(scene.raster, 5)]
+def test_unseen_surface_has_the_variance_of_ignorance(raster: ViewSet) -> None:
+    doubt = PredictedVariance([DNR(MODEL, 0).eval()], raster, [0], 0)
+    new = ~seen_cells(raster, [0])[cells_of(raster, 5)]
     found = doubt.unsure(5)
     assert np.all(found[new] == UNKNOWN) and np.all(found[~new] != UNKNOWN)
-    assert torch.get_rng_state().equal(_after_nothing(lambda: train_head(DNR(MODEL, 0), scene.raster, 1)))
+    assert torch.get_rng_state().equal(_after_nothing(lambda: train_head(DNR(MODEL, 0), raster, 1)))
 
 
 def _after_nothing(work) -> Tensor:  # type: ignore[no-untyped-def]

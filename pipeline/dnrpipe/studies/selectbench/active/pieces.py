@@ -1,7 +1,7 @@
 """What is unsure in a view's pixels, summed up over pieces of surface seen from about one direction.
 
-A piece is a cell of the atlas (:mod:`.sightings`) from one of the bins of directions (:mod:`.demand`). Two pictures of
-one piece tell about the same: that is how policies that look at pixels keep from choosing alike views.
+A piece is a cell of the atlas (`dnrtrain.selector.sightings`) from one of the bins of directions. Two pictures of one
+piece tell about the same: that is how policies that look at pixels keep from choosing alike views.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..dataset import ViewSet
-from .demand import BINS, directions
-from .sightings import GRID
+from dnrtrain.dataset import ViewSet
+from dnrtrain.selector.geometry import BINS, direction_bins
+from dnrtrain.selector.sightings import GRID
 
 COUNT = GRID * GRID * BINS
 
@@ -46,7 +46,7 @@ def pieces_of(views: ViewSet, view: int, unsure: np.ndarray) -> Pieces:
     maps = views.batch([view])
     inside = maps.mask[0, 0].cpu().numpy() > 0.5
     toward = maps.view_dir[0].cpu().numpy()[:, inside]
-    bins = (directions() @ toward).argmax(axis=0)
+    bins = (direction_bins() @ toward).argmax(axis=0)
     keys, place = np.unique(cells_of(views, view) * BINS + bins, return_inverse=True)
     share = 1.0 / inside.size
     return Pieces(

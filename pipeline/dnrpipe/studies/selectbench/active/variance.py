@@ -24,14 +24,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ..aggregator import Inside
-from ..dataset import Batch, ViewSet
-from ..model import DNR, initialise
-from ..renderer import SLOPE
-from ..schedule import adam, guarded_step, learning_rate, require_target
-from ..settings import ActiveSettings
-from ..textures import spherical_harmonics
+from dnrtrain.aggregator import Inside
+from dnrtrain.dataset import Batch, ViewSet
+from dnrtrain.model import DNR, initialise
+from dnrtrain.renderer import SLOPE
+from dnrtrain.schedule import adam, guarded_step, learning_rate, require_target
+from dnrtrain.textures import spherical_harmonics
+
 from .pieces import COUNT, Pieces, Sighted, cells_of, seen_cells
+from .settings import ActiveSettings
 
 HIDDEN = 32
 STEPS = 400

@@ -7,27 +7,27 @@ the views so far, and all candidates are judged by them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from ..dataset import ViewSet
-from ..events import Event
-from ..model import DNR
-from ..settings import ActiveSettings
+from dnrtrain.dataset import ViewSet
+from dnrtrain.model import DNR
+from dnrtrain.selector.explain import explained
+from dnrtrain.selector.greedy import lazy_greedy
+from dnrtrain.selector.kmedoids import KMedoidsPolicy
+from dnrtrain.selector.pool import canonical_order, complete_useful
+from dnrtrain.selector.protocol import Candidates, Choice
+from dnrtrain.selector.sightings import sightings_of
+
 from .ensemble import Disagreement, Spread
-from .explain import explained
-from .greedy import lazy_greedy
-from .kmedoids import KMedoidsPolicy
 from .pieces import Pieces, pieces_of
-from .pool import canonical_order, complete_useful
-from .protocol import Candidates, Choice
-from .sightings import sightings_of
+from .settings import ActiveSettings
 from .variance import PredictedVariance, Reduction
 
-Train = Callable[[list[int], int, int], Generator[Event, None, DNR]]
-"""train(views, round, member): a new coarse renderer, trained on these candidates."""
+Train = Callable[[list[int], int, int], DNR]
+"""train(views, batch, member): a new coarse renderer, trained on these candidates."""
 
 
 KINDS: dict[str, type[Disagreement] | type[PredictedVariance]] = {
@@ -43,33 +43,28 @@ def sizes(budget: int, rounds: int) -> list[int]:
     return sorted({start, *(start + -(-(budget - start) * done // rounds) for done in range(1, rounds + 1))})
 
 
-def active_epochs(policy: str, settings: ActiveSettings, budget: int) -> int:
-    """Epochs of all models together."""
-    return (len(sizes(budget, settings.rounds)) - 1) * KINDS[policy].models(settings) * settings.epochs
-
-
-def active_steps(policy: str, settings: ActiveSettings, budget: int) -> int:
-    """Training steps of all models together: one for each view chosen so far, in each epoch."""
-    return sum(sizes(budget, settings.rounds)[:-1]) * KINDS[policy].models(settings) * settings.epochs
-
-
 def choose_actively(
     policy: str,
     views: ViewSet,
-    candidates: Candidates,
     budget: int,
     seed: int,
     settings: ActiveSettings,
     train: Train,
-) -> Generator[Event, None, Choice]:
-    """The choice of ``budget`` views; yields what training tells. Without sightings they are made from ``views``.
+) -> Choice:
+    """Choose ``budget`` of the views. Gains of the first third are 0: k-medoids counts in another measure.
 
-    Gains of the first third are 0: k-medoids counts in another measure.
+    Args:
+        policy: a key of KINDS.
+        views: all candidates, targets = rasterised images.
+        budget: number of views to choose.
+        seed: of the variance head.
+        settings: how many renderers, in how many batches.
+        train: makes a renderer.
     """
     kind, count = KINDS[policy], KINDS[policy].models(settings)
-    sightings = candidates.sightings or sightings_of(views)
+    sightings = sightings_of(views)
     # Their places in ``views`` travel with the candidates: the pool's rules put them in another order.
-    known = Candidates(candidates.positions, candidates.directions, sightings, np.arange(len(candidates)))
+    known = Candidates(views.camera_positions, views.camera_directions, sightings, np.arange(len(views)))
     order = canonical_order(known)  # sums over all views are the same to the last bit whatever order they came in
     start, *wanted = sizes(budget, settings.rounds)
     first = KMedoidsPolicy().choose(known, start, seed)
@@ -77,9 +72,7 @@ def choose_actively(
     batches: list[dict[str, Any]] = []
     left = first.details
     for number, size in enumerate(wanted, start=1):
-        models = []
-        for member in range(count):
-            models.append((yield from train(chosen, number, member)))
+        models = [train(chosen, number, member) for member in range(count)]
         doubt = kind(models, views, chosen, seed + number)
         table = [pieces_of(views, view, doubt.unsure(view)) for view in range(len(views))]
         more = complete_useful(known, chosen, size, _by(kind.batch([table[i] for i in order]), table))

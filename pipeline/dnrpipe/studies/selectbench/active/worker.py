@@ -1,0 +1,120 @@
+"""One selection by active learning, in a worker process: train, choose, write one JSON file."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dnrtrain.atomic import write_json
+from dnrtrain.checkpoint import load_model
+from dnrtrain.dataset import ViewSet
+from dnrtrain.events import Diverged, EpochEnd
+from dnrtrain.model import DNR
+from dnrtrain.selector.protocol import Choice
+from dnrtrain.settings import ModelSettings, Step1Settings
+from dnrtrain.step1 import run_step1
+
+from ....core.settings import Settings
+from ....core.workspace import Workspace
+from ...cells.cell import load_cell_views, training_cost
+from .batches import choose_actively
+from .settings import ActiveSettings
+
+CLOCKS = ("seconds", "cpu_seconds")
+
+
+class Worker:
+    """Task {"key", "workspace", "settings", "policy", "seed", "folder", "output"} -> what its file holds."""
+
+    def __init__(self, common: dict[str, Any]) -> None:
+        import torch
+
+        if common["threads"]:
+            torch.set_num_threads(common["threads"])
+        self.device = common["device"]
+
+    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
+        """{"views": names in order, "gains", "why", "details", "seconds", "cpu_seconds"}."""
+        settings = Settings.model_validate(task["settings"])
+        workspace = Workspace.open(Path(task["workspace"]))
+        views = load_cell_views(workspace, "train", None, raytraced=False, base="none")
+        members = Members(
+            views, settings.model, settings.select.step1, ActiveSettings(), task["seed"], self.device,
+            Path(task["folder"]), task["key"],
+        )  # fmt: skip
+        choice, cost = members.choose(task["policy"], settings.select.budget)
+        made = {
+            "key": task["key"],
+            "views": [views.names[i] for i in choice.views],
+            "gains": choice.gains,
+            "why": choice.why,
+            "details": choice.details,
+            **cost,
+        }
+        write_json(Path(task["output"]), made)
+        shutil.rmtree(members.folder, ignore_errors=True)
+        return made
+
+
+class Members:
+    """Coarse renderers that a policy trains for itself: runs of step 1 without an agent, each in a folder of its own.
+
+    Args:
+        views: all candidates, targets = rasterised images.
+        model: the renderer's settings; its ``coarse()`` part is trained.
+        step1: learning rates and precision; epochs are those of ``settings``.
+        settings: how many renderers, in how many batches.
+        seed: of all weights and orders.
+        device: torch's.
+        folder: of the runs. An interrupted one is continued.
+        fingerprint: of the caller's inputs.
+    """
+
+    def __init__(
+        self,
+        views: ViewSet,
+        model: ModelSettings,
+        step1: Step1Settings,
+        settings: ActiveSettings,
+        seed: int,
+        device: str,
+        folder: Path,
+        fingerprint: str,
+    ) -> None:
+        self.views, self.model, self.settings, self.seed = views.to(device), model, settings, seed
+        self.device, self.folder, self.fingerprint = device, folder, fingerprint
+        self.step1 = step1.model_copy(update={"epochs": settings.epochs, "validation_views": 0})
+        self.folders: list[Path] = []
+        self.trained = dict.fromkeys(CLOCKS, 0.0)
+        """What the epochs of this process took."""
+
+    def choose(self, policy: str, budget: int) -> tuple[Choice, dict[str, float]]:
+        """The choice, and its wall and process seconds, those of interrupted runs included."""
+        clocks = (time.monotonic, time.process_time)
+        started = [clock() for clock in clocks]
+        choice = choose_actively(policy, self.views, budget, self.seed, self.settings, self.train)
+        cost = {}
+        for name, clock, start in zip(CLOCKS, clocks, started, strict=True):
+            looking = max(0.0, clock() - start - self.trained[name])
+            cost[name] = looking + sum(training_cost(folder)[name] for folder in self.folders)
+        return choice, cost
+
+    def train(self, views: list[int], batch: int, member: int) -> DNR:
+        """A renderer trained on some candidates."""
+        some, folder = self.views.subset(views), self.folder / f"{batch}-{member}"
+        seed = int(np.random.SeedSequence([self.seed, batch, member]).generate_state(1)[0])
+        events = run_step1(
+            some, None, self.model, self.step1,
+            policy="random", budget=len(some), seed=seed, device=self.device, checkpoints=folder,
+            fingerprint=self.fingerprint,
+        )  # fmt: skip
+        for event in events:
+            if isinstance(event, EpochEnd | Diverged):
+                for name in CLOCKS:
+                    self.trained[name] += getattr(event, name)
+        self.folders.append(folder)
+        return load_model(folder, self.device)
