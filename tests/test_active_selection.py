@@ -30,7 +30,7 @@ from dnrtrain.events import EpochEnd, Event
 from dnrtrain.model import DNR, Output, render_views
 from dnrtrain.records import ModelRecord
 from dnrtrain.selector.protocol import Choice
-from dnrtrain.selector.sightings import look_at, sightings_of
+from dnrtrain.selector.visibility import look_at, visibility_of
 from dnrtrain.settings import ModelSettings, Step1Settings
 from dnrtrain.step1 import run_step1
 
@@ -219,7 +219,7 @@ def test_the_worker_writes_a_selection(tmp_path: Path) -> None:
 # -- what is unsure ----------------------------------------------------------------------------------------
 
 
-def test_pieces_are_the_sightings_cells_by_direction(raster: ViewSet) -> None:
+def test_pieces_are_the_visible_cells_by_direction(raster: ViewSet) -> None:
     views = raster.subset([0, 1])
     view = synthetic.dome(10, 32)[1]
     seen = look_at(synthetic.gbuffer(view), view)
@@ -227,10 +227,10 @@ def test_pieces_are_the_sightings_cells_by_direction(raster: ViewSet) -> None:
     found = pieces_of(views, 1, np.full(count, 2.0))
     assert found.pixels.sum() == pytest.approx(seen.seen) and found.unsure == pytest.approx(2 * found.pixels)
     assert np.unique(found.keys // 32).tolist() == np.unique(cells_of(views, 1)).tolist()
-    table = sightings_of(views)
+    table = visibility_of(views)
     assert table.cells[table.of(1)].tolist() == seen.cells.tolist() == np.unique(cells_of(views, 1)).tolist()
     assert np.allclose(table.pixels[table.of(1)], seen.pixels)
-    assert np.allclose(table.toward[table.of(1)], seen.toward, atol=1e-5)
+    assert np.allclose(table.view_directions[table.of(1)], seen.view_directions, atol=1e-5)
     assert seen_cells(views, [1]).sum() == len(seen.cells) and not seen_cells(views, []).any()
 
 

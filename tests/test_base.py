@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from dnrpipe.blender.bundle.ply import weld, write_ply
-from dnrpipe.raytrace.base import CENTRES, MEANS, BaseRenderer
+from dnrpipe.raytrace.base_renderer import CENTRES, MEANS, BaseRenderer
+from dnrpipe.raytrace.base_worker import Worker
 from dnrpipe.raytrace.engine import Engine
 from dnrpipe.raytrace.lightmap import LightBaker
 from dnrpipe.raytrace.lobes import diffuse_context
@@ -17,6 +18,7 @@ from dnrpipe.raytrace.sensors import sensor_dict
 from dnrpipe.raytrace.surface_maps import SurfaceMapper
 from dnrpipe.raytrace.texels import grouped_meshes
 from dnrtrain.contract import BASE_CHANNELS, View
+from dnrtrain.exr import read_exr
 
 mi = pytest.importorskip("mitsuba")
 SIZE = 48
@@ -135,12 +137,12 @@ def test_samples_that_are_not_finite_are_counted(
 
 def test_large_pictures_in_bands_have_the_same_bits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Memory is bounded by launches of few rows; the last band is smaller than the others."""
-    from dnrpipe.raytrace import base
+    from dnrpipe.raytrace import base_renderer
 
     scene = poisoned_room(tmp_path, "")
     light = np.ones((2, 2, 16, 16, 3), np.float32)
     whole = BaseRenderer(mi, scene, light, 2).frame(camera())
-    monkeypatch.setattr(base, "MAX_RAYS", 2 * SIZE * 13)
+    monkeypatch.setattr(base_renderer, "MAX_RAYS", 2 * SIZE * 13)
     renderer = BaseRenderer(mi, scene, light, 2)
     launches: list[int] = []
     kernel = renderer.kernel
@@ -335,6 +337,33 @@ def test_frames_repeat_bit_for_bit_and_views_share_one_kernel(tmp_path: Path) ->
     assert all(np.array_equal(first[name], again[name]) for name in first)
     assert not np.array_equal(first["base.R"], other["base.R"])
     assert renderer.kernel.n_recordings == recorded <= 2
+
+
+@pytest.mark.parametrize("kind", ["direct", "path"])
+def test_base_images_of_few_samples_are_path_traced_and_denoised(
+    tmp_path: Path, mitsuba_variant: str, kind: str
+) -> None:
+    (tmp_path / "scene.xml").write_text(
+        '<scene version="3.0.0"><emitter type="constant"/><shape type="sphere"><bsdf type="diffuse"/></shape></scene>'
+    )
+    common = {"bundle": str(tmp_path / "scene.xml"), "variant": mitsuba_variant, "kind": kind, "samples": 2}
+    worker = Worker(common | {"integrator": "path", "max_depth": 2, "spp": 16, "seed": 0})
+    task = {"view": camera().model_dump(mode="json"), "output": str(tmp_path / "v.exr"), "fingerprint": "f"}
+    answer = worker(task)
+    channels, header = read_exr(tmp_path / "v.exr")
+    assert (answer["kind"], answer["masked"]) == (header["kind"], header["masked"]) == (kind, 0)
+    inside = channels["base.A"] > 0.99  # under an even sky, the ball is as bright as it reflects
+    assert channels["base.G"][inside].mean() == pytest.approx(0.5, rel=0.03)
+    assert channels["base.G"][inside].std() < 0.04
+    with pytest.raises(ValueError, match="fingerprint"):
+        worker({name: task[name] for name in ("view", "output")})
+
+
+def test_scenes_without_emitters_are_dark(tmp_path: Path) -> None:
+    metal = {"type": "roughconductor", "alpha": 0.2}
+    scene = corner_room(tmp_path, {"type": "diffuse"}, metal, {"type": "sphere", "radius": 0.1})
+    channels = rendered(scene, np.zeros((2, 2, 8, 8, 3), np.float32), camera())
+    assert channels["base.G"].max() == 0 and channels["mask"].max() == 1
 
 
 def test_lobes_of_the_principled_plugin_add_up() -> None:

@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as arrays
 from dnrpipe.core.cameras import make_cameras
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import CameraSettings
-from dnrpipe.raytrace.denoise import denoise, denoise_lightmap, filled, prefiltered
+from dnrpipe.raytrace.denoise import denoise, filled
 from dnrpipe.raytrace.variants import choose_variant
 from dnrpipe.workers.processes import TaskResult, run_tasks
 from dnrtrain.exr import read_exr
@@ -104,15 +104,6 @@ def test_one_thread_gives_the_same_bits_and_more_differ_by_rounding(renders: tup
     assert np.allclose(alone, denoise(noisy, threads=2), rtol=1e-3, atol=1e-5)
 
 
-def test_noise_in_auxiliary_images_is_taken_out() -> None:
-    rng = np.random.default_rng(1)
-    albedo, normal = _flat((64, 80), (0.2, 0.5, 0.7)), _flat((64, 80), (0.6, 0.0, 0.8))
-    noisy = [np.clip(image + rng.normal(0, 0.15, image.shape), -1, 1) for image in (albedo, normal)]
-    found = prefiltered(np.clip(noisy[0], 0, 1), noisy[1])
-    for image, before, truth in zip(found, noisy, (albedo, normal), strict=True):
-        assert _rmse(image, truth) < 0.3 * _rmse(before, truth)
-
-
 def test_nonsense_is_refused_with_the_place() -> None:
     good = np.ones((8, 9, 3), np.float32)
     for value in (np.nan, np.inf):
@@ -144,14 +135,12 @@ def test_a_lightmap_loses_noise_and_its_charts_keep_their_rims() -> None:
     valid = np.zeros((96, 96), bool)
     valid[8:40, 8:88] = valid[56:88, 20:60] = True
     light = np.where(valid[..., None], 2.0 * rng.gamma(2.0, 0.5, (96, 96, 3)), 0.0)
-    result = denoise_lightmap(light, valid)
+    result = denoise(filled(light, valid))
     assert _rmse(result[valid][None], np.full((1, 1, 3), 2.0)) < 0.2 * _rmse(
         light[valid][None], np.full((1, 1, 3), 2.0)
     )
     rim = valid & ~(np.roll(valid, 2, 0) & np.roll(valid, -2, 0) & np.roll(valid, 2, 1) & np.roll(valid, -2, 1))
     assert result[rim].mean() == pytest.approx(2.0, rel=0.05)
-    with pytest.raises(ValueError, match="valid: has shape"):
-        denoise_lightmap(light, valid[:5])
 
 
 SIDES = st.integers(1, 9)

@@ -80,7 +80,7 @@ def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any
         }
 
     def compare(a: dict[str, Any], b: dict[str, Any], views: list[dict[str, Any]] = entries) -> dict[str, Any]:
-        return {"kind": "compare", "with": a, "without": b, "views": views, "spp": SPP}
+        return {"kind": "compare", "with_effect": a, "without_effect": b, "views": views, "spp": SPP}
 
     tasks = {
         "volpath": compare(config("matt", "volpath"), config("matt")),
@@ -102,7 +102,9 @@ def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any
     pilot = {"kind": "depth", "views": entries, "spp": 16, "tolerance": 0.005, "pixel_tolerance": 0.02}
     tasks["pilot-convex"] = {**pilot, "config": config("convex")}
     tasks["pilot-shell"] = {**pilot, "config": config("shell")}
-    configs = [task[key] for task in tasks.values() for key in ("with", "without", "config") if key in task]
+    configs = [
+        task[key] for task in tasks.values() for key in ("with_effect", "without_effect", "config") if key in task
+    ]
     named = [{**task, "name": name} for name, task in tasks.items()]
     outcomes = run_tasks(
         "dnrpipe.raytrace.pilot",

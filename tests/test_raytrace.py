@@ -66,7 +66,7 @@ def test_mitsuba_looks_where_the_view_says() -> None:
     code = """
 import json, sys, numpy as np
 from dnrtrain.contract import View
-from dnrpipe.raytrace.tracer import sensor_dict
+from dnrpipe.raytrace.sensors import sensor_dict
 import mitsuba as mi
 mi.set_variant("scalar_rgb")
 view = View.model_validate(json.loads(sys.argv[1]))

@@ -114,7 +114,7 @@ def test_pilot_pictures_that_are_not_finite_are_counted(
     worker.engines, worker.masked = {"v": Poisoned()}, 7
     view = {"name": "v", "width": 5, "height": 4, "fl_x": 5, "fl_y": 5, "cx": 2, "cy": 2, "c2w": np.eye(4).tolist()}
     config = {"bundle": "b", "variant": "v", "integrator": "path", "max_depth": 4}
-    task = {"kind": "compare", "with": config, "without": config, "views": [{"view": view}], "spp": 1}
+    task = {"kind": "compare", "with_effect": config, "without_effect": config, "views": [{"view": view}], "spp": 1}
     answer = worker(task)
     assert answer["masked"] == 6  # one pixel of two warm-up frames and two halves of two configurations
     assert answer["error"]["mean"] == 0

@@ -45,7 +45,9 @@ def bench(scene: Path, folder: Path, spp: int) -> dict[str, Any]:
     everything = {**config, **EVERYTHING}
     views = pilot_views(workspace, settings, plan)
     pairs = [everything, {**everything, "passes": False}]
-    tasks = [{"kind": "compare", "with": pair, "without": config, "views": views, "spp": spp} for pair in pairs]
+    tasks = [
+        {"kind": "compare", "with_effect": pair, "without_effect": config, "views": views, "spp": spp} for pair in pairs
+    ]
     answer, lean = run_pilots(tasks, choice, console, scene.stem, run.log)
     return {
         "scene": scene.stem,

@@ -27,7 +27,7 @@ from pathlib import Path
 import mitsuba as mi
 mi.set_variant(sys.argv[1])
 from dnrpipe.blender.geometry.frozen import load_geometry
-from dnrpipe.raytrace.tracer import sensor_dict
+from dnrpipe.raytrace.sensors import sensor_dict
 from dnrtrain.contract import View
 workspace, out = Path(sys.argv[2]), Path(sys.argv[3])
 scene = {"type": "scene"}

@@ -132,7 +132,6 @@ def test_what_is_not_a_picture(server: Server) -> None:
 
 def test_large_views_are_not_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Training goes by squares of them; the whole of one would want several times the memory."""
-    from dnrpipe.stages.previews import LivePicture
 
     from dnrpipe.core.console import Console
     from dnrpipe.core.settings import resolve

@@ -17,7 +17,7 @@ from dnrtrain.selector.medoids import Facilities, build, swap
 from dnrtrain.selector.names import NAMES, TRAINED_NAMES, UNTRAINED_NAMES
 from dnrtrain.selector.policies import UNTRAINED, untrained
 from dnrtrain.selector.protocol import Candidates
-from dnrtrain.selector.sightings import Sighting, collect, look_at
+from dnrtrain.selector.visibility import ViewVisibility, collect, look_at
 
 SIDE, GRID = 16, 8
 DETERMINISTIC = ("auto", "coverage", "kmedoids")
@@ -116,10 +116,10 @@ def test_pools_that_see_nothing_or_are_all_the_same(name: str) -> None:
     assert len(set(UNTRAINED[name].choose(empty, 3, 0).views)) == 3
 
 
-def test_without_sightings(pool: Candidates) -> None:
+def test_without_surface_visibility(pool: Candidates) -> None:
     poses = Candidates(pool.positions, pool.directions)
     assert len(set(UNTRAINED["kmedoids"].choose(poses, 4, 0).views)) == 4
-    with pytest.raises(ContractError, match="'coverage' needs the candidates' sightings"):
+    with pytest.raises(ContractError, match="'coverage' needs the surface visibility"):
         UNTRAINED["coverage"].choose(poses, 4, 0)
 
 
@@ -177,16 +177,16 @@ def test_lazy_greedy_is_greedy(seed: int, budget: int) -> None:
         known |= sets[element]
 
 
-def sighting(cells: list[int], toward: tuple[float, float, float], picture: int) -> Sighting:
+def seen(cells: list[int], view_directions: tuple[float, float, float], picture: int) -> ViewVisibility:
     share = np.full(len(cells), 0.5 / len(cells), np.float32)
-    towards = np.tile(np.array(toward, np.float32), (len(cells), 1))
-    return Sighting(np.array(cells, np.int32), share, towards, 0.5, picture)
+    towards = np.tile(np.array(view_directions, np.float32), (len(cells), 1))
+    return ViewVisibility(np.array(cells, np.int32), share, towards, 0.5, picture)
 
 
 def test_what_is_seen_counts_where_poses_say_nothing() -> None:
     """Four cameras around a block at corners of a square: three look at its front, one at its back."""
-    looks = [sighting([1, 2, 3], (1, 0, 0), 1), sighting([1, 2, 3], (1, 0, 0.01), 2),
-             sighting([1, 2, 3], (1, 0.01, 0), 3), sighting([4, 5, 6], (-1, 0, 0), 4)]  # fmt: skip
+    looks = [seen([1, 2, 3], (1, 0, 0), 1), seen([1, 2, 3], (1, 0, 0.01), 2),
+             seen([1, 2, 3], (1, 0.01, 0), 3), seen([4, 5, 6], (-1, 0, 0), 4)]  # fmt: skip
     corners = np.array([[1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]], float)
     candidates = Candidates(corners, np.tile([0.0, 0.0, -1.0], (4, 1)), collect(looks, GRID))
     choice = UNTRAINED["coverage"].choose(candidates, 2, 0)
@@ -195,7 +195,7 @@ def test_what_is_seen_counts_where_poses_say_nothing() -> None:
 
 
 def test_coverage_prefers_new_sides_to_more_of_the_same() -> None:
-    looks = [sighting([1, 2], (1, 0, 0), 1), sighting([1, 2], (0.999, 0.0447, 0), 2), sighting([1, 2], (-1, 0, 0), 3)]
+    looks = [seen([1, 2], (1, 0, 0), 1), seen([1, 2], (0.999, 0.0447, 0), 2), seen([1, 2], (-1, 0, 0), 3)]
     places = np.array([[1, 0, 0], [1, 0.1, 0], [-1, 0, 0]], float)
     candidates = Candidates(places, -places, collect(looks, GRID))
     choice = UNTRAINED["coverage"].choose(candidates, 3, 0)

@@ -6,10 +6,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+import reference
 import torch
 
 from conftest import Scene
-from dnrtrain import reference
 from dnrtrain.aggregator import Inside
 from dnrtrain.model import DNR, compose
 from dnrtrain.settings import ModelSettings

@@ -211,11 +211,11 @@ def choose(folder: Path, count: int) -> None:
     """All rules that need no training choose 25 views."""
     from dnrtrain.selector.policies import untrained
     from dnrtrain.selector.protocol import Candidates
-    from dnrtrain.selector.sightings import read_sightings
+    from dnrtrain.selector.visibility import read_visibility
 
     views = cameras_of(count)
     files = [folder / "candidates" / f"{view.name}.exr" for view in views]
-    candidates = Candidates.of_views(views, read_sightings(files, views))
+    candidates = Candidates.of_views(views, read_visibility(files, views))
     for policy in ("coverage", "kmedoids", "farthest", "random"):
         rule = untrained(policy)
         assert rule is not None

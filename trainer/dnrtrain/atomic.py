@@ -16,7 +16,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     The temporary name keeps the suffix (writers choose their format by it) and holds the process id,
     so that two processes never write the same temporary file. Data and directory entry are fsynced:
-    after a power cut a reader sees the old file or the new one, never a torn one.
+    after a power cut a reader sees the old file or the new one, never a truncated one.
 
     Raises:
         OSError: the folder cannot be written (read-only, disk full).

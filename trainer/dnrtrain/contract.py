@@ -41,7 +41,7 @@ import zipfile
 import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
@@ -80,7 +80,6 @@ BASE_CHANNELS = (
     "chain.weight",
 )
 SPLITS = ("train", "val", "test")
-Split = Literal["train", "val", "test", "novel"]
 
 
 NPZ_ERRORS = (
@@ -102,7 +101,7 @@ class ContractError(ValueError):
 class DamagedFile(ContractError):
     """A file that a stage wrote does not read, or not as it was written. ``path`` is the file.
 
-    The pipeline makes such a file again (`stages.pipeline.run_stage`); the message is for those who read it alone.
+    The pipeline makes such a file again. The message is for programs that only read it.
     """
 
     def __init__(self, path: Path | str, reason: str) -> None:
@@ -195,7 +194,7 @@ def write_cameras(path: Path, views: Sequence[View], split: str) -> None:
 
 
 def read_cameras(path: Path) -> list[View]:
-    """Read a ``transforms`` file that :func:`write_cameras` wrote; it may hold no view.
+    """Read a ``transforms`` file that `write_cameras` wrote; it may hold no view.
 
     Raises ContractError when it is missing, DamagedFile when it does not read.
     """
@@ -243,7 +242,7 @@ def parse_transforms(
 
 
 def unique_names(views: Sequence[View]) -> list[View]:
-    """Views that share a name are told apart by a number: ``a``, ``a-2``, ``a-3``. Files are named by it."""
+    """Add a number to names that occur more than once: ``a``, ``a-2``, ``a-3``. Files are named after views."""
     taken: set[str] = set()
     result = []
     for view in views:
@@ -257,9 +256,9 @@ def unique_names(views: Sequence[View]) -> list[View]:
 
 
 def file_name(text: str) -> str:
-    """``text`` as a view's name: letters, digits, dot, dash and underscore of ASCII, 80 at most; others become "_".
+    """``text`` as a view's name: at most 80 ASCII letters, digits, dots, dashes, underscores; others become "_".
 
-    So does a dot at the start: names are those of files, and such files are hidden.
+    A dot at the start becomes "_", too: a file of that name would be hidden.
     """
     return re.sub(r"^\.|[^A-Za-z0-9_.-]", "_", text)[:80] or "_"
 

@@ -1,7 +1,7 @@
 """From the network's outputs and the base image to the picture.
 
 Notation
-    f        log space (see :func:`to_log`) or display space
+    f        log space (see `to_log`) or display space
     K        per-pixel kernels, k×k weights each, that sum to 1; they start close to the identity
     a, m     added and multiplied correction, 3 channels each; they start at 0
 
@@ -40,7 +40,7 @@ def to_log(radiance: Tensor) -> Tensor:
 
 
 def from_log(value: Tensor) -> Tensor:
-    """Inverse of :func:`to_log`; below 0 (darker than black) it goes on continuously, above LOG_CEILING it is flat."""
+    """Inverse of `to_log`; below 0 (darker than black) it goes on continuously, above LOG_CEILING it is flat."""
     return torch.expm1(value.clamp_max(LOG_CEILING) * math.log1p(LOG_SCALE)) / LOG_SCALE
 
 

@@ -31,7 +31,7 @@ class Batch:
     view_dir  [N, 3, H, W] world-space unit vector from the surface towards the camera
     target    [N, 3, H, W] display RGB over white, or None
 
-    Only where a base image was loaded, else None; the base file's channels (see :mod:`dnrtrain.contract`):
+    Only where a base image was loaded, else None; the base file's channels (see `dnrtrain.contract`):
 
     base          [N, 3, H, W] linear Rec.709 radiance, straight (un-premultiplied)
     diffuse       [N, 3, H, W] its diffuse part, straight
@@ -241,7 +241,7 @@ def view_in_memory(
 ) -> ViewSet:
     """One view for inference, from the channels that its pass file (and base file) would hold, float32 [H, W].
 
-    display: of ``frame``; shared between calls. base: as of :func:`load_views`; with a rendered kind ``channels`` hold
+    display: of ``frame``; shared between calls. base: as of `load_views`; with a rendered kind ``channels`` hold
     the base image, too. Raises ContractError: channels missing, of another size than the camera, not finite.
     """
     source = Path(f"view {camera.name}")
@@ -261,7 +261,7 @@ def view_in_memory(
 
 
 def _input_maps(path: Path, channels: dict[str, np.ndarray], frame: SceneFrame, camera: View) -> dict[str, Tensor]:
-    """The maps of :class:`Batch` that every view has, [C, H, W]."""
+    """The maps of `Batch` that every view has, [C, H, W]."""
     inputs = _stack(path, channels, INPUT_CHANNELS)
     mask = (inputs[6:7] > 0.5).float()
     depth = ((inputs[0:1] - frame.near) / (frame.far - frame.near)).clamp(0.0, 1.0)
@@ -276,7 +276,7 @@ def _input_maps(path: Path, channels: dict[str, np.ndarray], frame: SceneFrame, 
 
 
 def _read_base(path: Path, size: tuple[int, int], camera: View) -> dict[str, Tensor]:
-    """A base file's maps by their name in :class:`Batch`."""
+    """A base file's maps by their name in `Batch`."""
     from .exr import read_exr
 
     channels, _ = read_exr(path)

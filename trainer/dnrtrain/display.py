@@ -16,6 +16,7 @@ from torch import Tensor
 
 from .contract import NPZ_ERRORS, DamagedFile, SceneFrame
 from .precision import at_least_float32
+from .srgb import LINEAR_END
 
 MAX_LUT_BYTES = 64 << 20
 ALPHA_FLOOR = 1e-6
@@ -27,8 +28,8 @@ def srgb_oetf(linear: Tensor) -> Tensor:
     """Linear Rec.709 -> sRGB code values in [0, 1]; negatives become 0, values above 1 become 1."""
     x = linear.clamp(0.0, 1.0)
     # The power's argument is kept above the linear segment: its slope at 0 is infinite.
-    curve = (x.clamp_min(0.0031308) ** (1 / 2.4)).mul_(1.055).sub_(0.055)
-    return torch.where(x <= 0.0031308, 12.92 * x, curve)
+    curve = (x.clamp_min(LINEAR_END) ** (1 / 2.4)).mul_(1.055).sub_(0.055)
+    return torch.where(x <= LINEAR_END, 12.92 * x, curve)
 
 
 class DisplayTransform:

@@ -33,8 +33,7 @@ class EpochEnd:
 class Selected:
     """Step 1 is done: names of the chosen views, in order, and what the policy says of itself.
 
-    gains, why: per view, see :class:`dnrtrain.selector.protocol.Choice`; empty where a run from before they were kept
-    is found again.
+    gains, why: per view, see `dnrtrain.selector.protocol.Choice`.
     seconds, cpu_seconds: wall and process time of choosing, beside that of the epochs; 0 where a finished run is found
     again.
     """
@@ -50,9 +49,9 @@ class Selected:
 
 @dataclass(frozen=True)
 class Diverged:
-    """An epoch whose weights blew up: training goes on from the state before it, at a lower rate (``text`` says so).
+    """An epoch diverged. Training goes on from the state before it, at a lower rate; ``text`` says so.
 
-    Its time is lost but was spent: seconds, cpu_seconds, steps and device are as in :class:`EpochEnd`.
+    The epoch's time was spent all the same: seconds, cpu_seconds, steps and device are as in `EpochEnd`.
     """
 
     stage: str
@@ -73,10 +72,10 @@ class Note:
 
 @dataclass(frozen=True)
 class Previewed:
-    """A view as the model renders it that training would leave if it ended now; it is looked at, nothing else.
+    """A view rendered by the model that training would leave if it ended now. It is for people to look at.
 
     image: display RGB over white, float32 [H, W, 3] in [0, 1]. psnr: in dB against the view's target, None without one.
-    seconds: wall time of rendering; device: as in :class:`EpochEnd`.
+    seconds: wall time of rendering; device: as in `EpochEnd`.
     """
 
     stage: str

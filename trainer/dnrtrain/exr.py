@@ -126,5 +126,5 @@ def read_metadata(path: Path) -> dict[str, Any] | None:
     try:
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
             return _metadata(file.header())
-    except Exception:  # torn or foreign: the caller makes the file again
+    except Exception:  # truncated or foreign: the caller makes the file again
         return None

@@ -10,7 +10,7 @@ from .settings import ModelSettings
 
 
 def guide_channels(settings: ModelSettings) -> int:
-    """Channels of :func:`guide_maps`."""
+    """Channels of `guide_maps`."""
     shown = 0 if settings.base == "none" else 3
     if not settings.guides:
         return shown

@@ -38,7 +38,7 @@ class DNR(nn.Module):
     background and silhouettes are anti-aliased by geometry. Measured (analytic scene, 25 views, 128², 400
     steps, L1): 27.6 dB with it, 26.0 dB without (inside the mask 24.3 and 23.9).
 
-    With a base image the network corrects it (see :mod:`dnrtrain.correction`). Its last layer starts at zero:
+    With a base image the network corrects it (see `dnrtrain.correction`). Its last layer starts at zero:
     training starts at the base image itself.
 
     Args:

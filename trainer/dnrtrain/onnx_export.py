@@ -1,10 +1,10 @@
 """A trained renderer as one ONNX file: network, neural textures and display transform, no torch needed to run it.
 
-The graph computes what :class:`.model.DNR` computes, in float32, at any height and width, one view at a time. Texture
+The graph computes what `model.DNR` computes, in float32, at any height and width, one view at a time. Texture
 look-ups run over the whole picture instead of over the pixels inside the mask, since a graph with as many points as
 the mask has pixels would have no fixed shapes; what lies outside is multiplied by zero.
 
-Inputs are the channels of the EXR files (see :mod:`.contract`), float32 [1, C, H, W], those only that the model uses:
+Inputs are the channels of the EXR files (see `contract`), float32 [1, C, H, W], those only that the model uses:
 
     uv         [1, 2] atlas coordinates U, V in [0, 1), V up; 0 where mask is 0
     mask       [1, 1] 1 where the ray through the pixel's centre hits a surface
@@ -145,7 +145,7 @@ def graph_inputs(channels: Mapping[str, np.ndarray], view_dir: np.ndarray, names
 
 
 class Graph(nn.Module):
-    """The model over its whole picture, with the inputs of :func:`input_names`."""
+    """The model over its whole picture, with the inputs of `input_names`."""
 
     def __init__(self, model: DNR, frame: SceneFrame, folder: Path) -> None:
         super().__init__()
@@ -177,7 +177,7 @@ class Graph(nn.Module):
         return (shown,) if radiance is None else (shown, radiance)
 
     def batch(self, maps: dict[str, Tensor]) -> Batch:
-        """The inputs as :func:`.dataset.load_views` makes them of the same channels."""
+        """The inputs as `dataset.load_views` makes them of the same channels."""
         mask = (maps["mask"] > 0.5).float()
         zero = torch.zeros_like(mask)
         parts: dict[str, Tensor] = {}
@@ -204,7 +204,7 @@ class Graph(nn.Module):
         )
 
     def _texture(self, batch: Batch) -> Tensor:
-        """What the renderer sees of T (:meth:`.aggregator.Aggregator.forward`)."""
+        """What the renderer sees of T (`aggregator.Aggregator.forward`)."""
         part = self.model.aggregator
         if part.strategy == "early":
             features = [batch.depth.expand(-1, 3, -1, -1)] if "depth" in part.modalities else []

@@ -1,7 +1,7 @@
 """VGG16 and AlexNet feature extractors: the perceptual loss L_p and LPIPS v0.1.
 
 Both networks are the convolutions of torchvision's ImageNet classifiers (Simonyan and Zisserman 2015;
-Krizhevsky 2014), defined here: torchvision is no dependency. Weights come from :mod:`dnrtrain.weights`.
+Krizhevsky 2014), defined here: torchvision is no dependency. Weights come from `dnrtrain.weights`.
 """
 
 from __future__ import annotations
@@ -197,5 +197,5 @@ def _unit(feature: Tensor) -> Tensor:
 
 
 def build_lpips(weights: Mapping[str, Mapping[str, Tensor]]) -> dict[str, Lpips]:
-    """LPIPS with both networks from what :func:`dnrtrain.weights.load_weights` returns."""
+    """LPIPS with both networks from what `dnrtrain.weights.load_weights` returns."""
     return {"alex": Lpips("alex", weights["alex"]), "vgg": Lpips("vgg", weights["vgg"])}

@@ -1,7 +1,6 @@
 """One view, rendered now and then while step 2 trains: for people to look at, never for a decision.
 
-Training with and without it ends in the same weights, bit for bit: it draws no random numbers, and the weights and the
-mode of the network are put back.
+It changes no bit of the trained weights: it draws no random numbers, and it restores the network's weights and mode.
 """
 
 from __future__ import annotations

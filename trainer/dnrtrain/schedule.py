@@ -52,7 +52,7 @@ def learning_rate(step: int, steps: int, start: float, end: float) -> float:
 def adam(modules: list[nn.Module], rate: float, device: str, texture_rate_scale: float = 1.0) -> torch.optim.Adam:
     """Adam (0.9, 0.999). Fused: on dense textures it is an order of magnitude faster than the loop.
 
-    Each parameter group carries ``scale``: what :func:`guarded_step` multiplies its rate by. Texels are seen
+    Each parameter group carries ``scale``: what `guarded_step` multiplies its rate by. Texels are seen
     by few pixels of few views, so they may want a larger rate than the networks (DNR uses ten times it).
     """
     textures = [t for module in modules for t in module.modules() if isinstance(t, TexturePyramid)]

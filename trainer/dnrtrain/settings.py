@@ -1,4 +1,4 @@
-"""Settings of the trainer, one model per part. Presets set them in :mod:`dnrpipe.core.settings`."""
+"""Settings of the trainer, one model per part. The presets are the pipeline's."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class ModelSettings(Strict):
         return self
 
     def coarse(self) -> ModelSettings:
-        """The model of step 1, which sees rasterised images only: no base image and nothing that comes with it."""
+        """The model of step 1. It sees rasterised images only, so it has no base image and no part that needs one."""
         fresh = ModelSettings()
         parts = ("base", "guides", "chain", "filter", "output")
         return self.model_copy(update={name: getattr(fresh, name) for name in parts})

@@ -46,7 +46,7 @@ class TexturePyramid(nn.Module):
     def forward(self, points: Tensor) -> Tensor:
         """Coordinates [P, 2] in [-1, 1] (1-D textures read x only, y = 0) -> features [P, C].
 
-        In evaluation mode and without gradients the levels are merged into one texture (see :meth:`merged`): the same
+        In evaluation mode and without gradients the levels are merged into one texture (see `merged`): the same
         sum, up to rounding.
         """
         if self.training or torch.is_grad_enabled() or not self.mergeable:

@@ -27,6 +27,7 @@ class TrainingRun:
         val: validation views with targets, or None.
         run: fingerprint of the run; only a checkpoint of the same run is continued.
         folder: where checkpoints and the model go.
+        device: torch's.
     """
 
     number: ClassVar[int]

@@ -1,4 +1,4 @@
-"""The paper's agent while step 1 trains: it walks from view to view, learns what each step was worth, and chooses."""
+"""The paper's agent in step 1: it takes views one after the other, learns what each was worth, and at last chooses."""
 
 from __future__ import annotations
 
@@ -25,7 +25,17 @@ PROBES = 4
 
 
 class Walker:
-    """Q-network, its slow copy, their optimiser, the scale of rewards; ``dnr`` is the renderer that it trains with."""
+    """The agent: Q-network, its slow copy, their optimiser, the scale of rewards.
+
+    Args:
+        dnr: the renderer that trains with it.
+        views: all candidates.
+        candidates: their cameras.
+        settings: of step 1.
+        budget: views of an episode.
+        seed: of weights and dice.
+        device: torch's.
+    """
 
     def __init__(
         self,
@@ -57,10 +67,14 @@ class Walker:
         rate: Callable[[], float],
         book: EpochBook,
     ) -> None:
-        """Select ``budget`` views one after the other, training the DNR and the agent on the way.
+        """Select ``budget`` views one after the other; each trains the DNR and the agent.
 
-        train_view: one DNR step on a view -> (its loss before the step, T of the view). rate: the learning rate of the
-        step that was last taken.
+        Args:
+            epoch: zero-based.
+            episode: zero-based, of the epoch.
+            train_view: one DNR step on a view -> (its loss before the step, T of the view).
+            rate: learning rate of the last step.
+            book: takes the agent's terms.
         """
         s, agent = self.settings, self.agent
         random = step_random(self.seed, STEP1, epoch, episode)

@@ -1,10 +1,9 @@
-"""The base-image worker: renders the images that the network corrects (see :mod:`.base`) into EXR files."""
+"""The base-image worker: renders the images that the network corrects (see `base_renderer`) into EXR files."""
 
 from __future__ import annotations
 
 import resource
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,12 +12,13 @@ from dnrpipe.core.errors import UserError
 from dnrtrain.contract import View
 from dnrtrain.exr import write_exr
 
-from .base import BaseRenderer
+from .base_renderer import BaseRenderer
 from .denoise import denoise
 from .engine import Engine
 from .finite import masked
 from .frames import Frames
 from .light_worker import read_light
+from .tasks import BakedCommon, BaseAnswer, BaseTask, SampledCommon
 from .units import scaled_view
 
 COLOUR = ("base.R", "base.G", "base.B", "base.A")
@@ -27,61 +27,60 @@ MIRROR = 0.02
 
 
 class Worker:
-    """Renders base images.
-
-    common: {"bundle", "variant", "kind", "samples"}; kind baked: also "light" (its file) and "denoise"; kinds direct
-    and path: also "integrator", "max_depth", "spp", "seed": path-traced samples, denoised, take the colour's place.
-    task: {"view": View as JSON, "output", "fingerprint"}
-    """
+    """Renders base images. common: a `BakedCommon` or a `SampledCommon`, task: a `BaseTask`."""
 
     def __init__(self, common: dict[str, Any]) -> None:
-        self.common = common
-        self.bundle = Path(common["bundle"])
-        self.engine = Engine(common["variant"], 0, [self.bundle])
+        kind = BakedCommon if common["kind"] == "baked" else SampledCommon
+        self.common = kind.model_validate(common)
+        self.bundle = self.common.bundle
+        self.engine = Engine(self.common.variant, 0, [self.bundle])
         if not self.engine.compiled:
             raise UserError("base images need a jit variant of Mitsuba (LLVM or CUDA; see `dnrpipe doctor`)")
-        baked = common["kind"] == "baked"
-        light = read_light(Path(common["light"])) if baked else np.zeros((2, 2, 2, 3), np.float32)
+        dark = np.zeros((2, 2, 2, 2, 3), np.float32)
+        light = read_light(self.common.light) if isinstance(self.common, BakedCommon) else dark
         scene = self.engine.scenes[str(self.bundle)]
-        self.renderer = BaseRenderer(self.engine.mi, scene, light, int(common["samples"]))
+        self.renderer = BaseRenderer(self.engine.mi, scene, light, self.common.samples)
         self.silhouettes: dict[tuple[int, int], Frames] = {}
         self.warm = False
         self.repaired = self.masked = 0  # pixels of the view at hand: samples left out, set to zero
 
-    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
-        view = View.model_validate(task["view"])
+    def __call__(self, task: dict[str, Any]) -> BaseAnswer:
+        return self._render(BaseTask.model_validate(task))
+
+    def _render(self, task: BaseTask) -> BaseAnswer:
+        view = task.view
         if not self.warm:
             self.channels(view)  # compiles the kernel, which is no cost of a frame
             self.warm = True
         self.repaired = self.masked = 0
         started, cpu = time.monotonic(), time.process_time()
         channels = self.channels(view)
-        numbers = {
+        answer: BaseAnswer = {
             "seconds": time.monotonic() - started,
             "cpu_seconds": time.process_time() - cpu,
             "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-            "kind": self.common["kind"],
-            "samples": self.common["samples"],
+            "kind": self.common.kind,
+            "samples": self.common.samples,
             "repaired": self.repaired,
             "masked": self.masked,
         }
-        write_exr(
-            Path(task["output"]),
-            channels,
-            {**numbers, "fingerprint": task["fingerprint"], "view": view.model_dump(mode="json")},
-        )
-        return numbers
+        header = {**answer, "fingerprint": task.fingerprint, "view": view.model_dump(mode="json")}
+        write_exr(task.output, channels, header)
+        return answer
 
     def channels(self, view: View, renderer: BaseRenderer | None = None) -> dict[str, np.ndarray]:
-        """Base image and G-buffer of a view in scene units, float32 [H, W] each. renderer: one of other samples."""
+        """Base image and G-buffer of a view in scene units: linear Rec.709, float32 [H, W] each.
+
+        renderer: one with another number of samples.
+        """
         renderer = renderer or self.renderer
         channels = renderer.frame(scaled_view(view, self.engine.unit_scale))
         self.repaired, self.masked = self.repaired + renderer.repaired, self.masked + renderer.masked
         channels["depth.Z"] = channels["depth.Z"] / self.engine.unit_scale
         channels["coverage"] = self._frames(view).coverage(view, channels["mask"] > 0.5)
-        if self.common["kind"] != "baked":
-            return channels | self._traced(view, channels)
-        return channels | denoised(channels) if self.common["denoise"] else channels
+        if isinstance(self.common, SampledCommon):
+            return channels | self._traced(self.common, view, channels)
+        return channels | denoised(channels) if self.common.denoise else channels
 
     def _frames(self, view: View) -> Frames:
         """Finer silhouettes than the base image's few rays give, for views of one size."""
@@ -90,12 +89,11 @@ class Worker:
             self.silhouettes[size] = Frames(self.engine, self.bundle, "path", 2, size)
         return self.silhouettes[size]
 
-    def _traced(self, view: View, channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    def _traced(self, common: SampledCommon, view: View, channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """A few path-traced samples, denoised, as the colour."""
-        common = self.common
-        integrator, _ = self.engine.integrator(self.bundle, common["integrator"], int(common["max_depth"]))
+        integrator, _ = self.engine.integrator(self.bundle, common.integrator, common.max_depth)
         sensor = self.engine.sensor(view)
-        picture, _ = self.engine.frame(self.bundle, integrator, sensor, view, int(common["spp"]), int(common["seed"]))
+        picture, _ = self.engine.frame(self.bundle, integrator, sensor, view, common.spp, common.seed)
         picture, lost = masked(picture.astype(np.float32))
         self.masked += lost
         found = channels | {name: picture[..., i] for i, name in enumerate(COLOUR)}

@@ -1,4 +1,4 @@
-"""Open Image Denoise on the CPU: noisy path-traced images and lightmaps in, smooth ones out.
+"""Open Image Denoise on the CPU: noisy path-traced images in, smooth ones out.
 
 Notation
     image     linear Rec.709 radiance (HDR), any scale; premultiplied where it has alpha
@@ -21,7 +21,6 @@ import numpy as np
 from dnrpipe.core.errors import UserError
 
 Quality = Literal["high", "balanced", "fast"]
-QUALITIES: tuple[Quality, ...] = ("high", "balanced", "fast")
 
 
 def denoise(
@@ -38,8 +37,8 @@ def denoise(
     Args:
         image: [H, W, 3] or [H, W, 4]; alpha comes back as it is. Radiance below 0 becomes 0.
         albedo, normal: [H, W, 3]; the normal only together with the albedo.
-        clean: the auxiliary images have no noise of their own (primary rays through many points of the pixel, or
-            :func:`prefiltered`): they are then followed more closely.
+        clean: the auxiliary images have no noise of their own (primary rays through many points of the pixel): the
+            result then follows them more closely.
         quality: of the network; ``high`` takes the larger one where clean auxiliary images are given (2.4x the time),
             ``fast`` a smaller one (half the time).
         threads: 0: as many as Dr.Jit uses in this process.
@@ -56,32 +55,8 @@ def denoise(
     if "normal" in images and "albedo" not in images:
         raise ValueError("normal: needs the albedo beside it; the denoiser has no network for a normal alone")
     result = noisy.copy()
-    result[..., :3] = _filtered(images, "RT", threads, quality, hdr=True, clean_aux=clean and len(images) > 1)
+    result[..., :3] = _filtered(images, threads, quality, clean_aux=clean and len(images) > 1)
     return result
-
-
-def prefiltered(
-    albedo: np.ndarray, normal: np.ndarray, *, quality: Quality = "high", threads: int = 0
-) -> tuple[np.ndarray, np.ndarray]:
-    """Noisy auxiliary images [H, W, 3], each denoised by itself, to be handed over as clean. Raises as `denoise`."""
-    rows = {"albedo": albedo, "normal": normal}
-    both = [_filtered({k: _checked(k, rows[k], (3,), albedo.shape)}, "RT", threads, quality) for k in rows]
-    return both[0], both[1]
-
-
-def denoise_lightmap(light: np.ndarray, valid: np.ndarray | None = None, *, threads: int = 0) -> np.ndarray:
-    """A lightmap [H, W, 3] (irradiance or radiance per texel, HDR) without its noise, float32.
-
-    valid: bool [H, W], the texels that were traced; the rest is made up from those near it before the filter sees it
-    (a black gutter would darken the rims of charts) and comes back so filled. None: all of them.
-    Raises as :func:`denoise`.
-    """
-    noisy = _checked("light", light, (3,))
-    if valid is not None:
-        if valid.shape != noisy.shape[:2]:
-            raise ValueError(f"valid: has shape {valid.shape}, expected {noisy.shape[:2]}")
-        noisy = filled(noisy, valid)
-    return _filtered({"color": noisy}, "RTLightmap", threads, "high")
 
 
 def filled(light: np.ndarray, valid: np.ndarray) -> np.ndarray:
@@ -148,15 +123,15 @@ def _device(threads: int) -> Any:
 
 
 @lru_cache(maxsize=16)
-def _filter(kind: str, threads: int, shape: tuple[int, int], names: tuple[str, ...], options: tuple[Any, ...]) -> Any:
+def _filter(threads: int, shape: tuple[int, int], names: tuple[str, ...], quality: Any, clean_aux: bool) -> Any:
     """Filters are kept: a new one reads and arranges its weights, which takes longer than an image."""
-    filter_ = _device(threads).new_filter(kind)
-    for name, value in options:
-        setattr(filter_, name, value)
+    del shape, names  # each combination has a filter of its own
+    filter_ = _device(threads).new_filter("RT")
+    filter_.quality, filter_.hdr, filter_.clean_aux = quality, True, clean_aux
     return filter_
 
 
-def _filtered(images: dict[str, np.ndarray], kind: str, threads: int, quality: Quality, **options: bool) -> np.ndarray:
+def _filtered(images: dict[str, np.ndarray], threads: int, quality: Quality, clean_aux: bool) -> np.ndarray:
     """Run one filter. images: contiguous or strided float32 [H, W, 3] by OIDN's names."""
     _device(threads)  # says what is missing before the import below fails
     import mitsuba_oidn as oidn
@@ -165,8 +140,7 @@ def _filtered(images: dict[str, np.ndarray], kind: str, threads: int, quality: Q
     if quality not in levels:
         raise ValueError(f"quality: is {quality!r}, expected one of {', '.join(levels)}")
     shape = next(iter(images.values())).shape[:2]
-    settings = (("quality", levels[quality]), *options.items())
-    filter_ = _filter(kind, threads, shape, tuple(images), settings)
+    filter_ = _filter(threads, shape, tuple(images), levels[quality], clean_aux)
     # The filter keeps what it was last bound to, hence copies of its own and never the caller's memory.
     bound = {name: np.ascontiguousarray(image) for name, image in images.items()}
     result = np.empty((*shape, 3), dtype=np.float32)

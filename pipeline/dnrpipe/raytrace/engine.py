@@ -30,10 +30,15 @@ PASSES = "albedo:albedo,depth:depth,position:position,normal:sh_normal,geometric
 class Engine:
     """Renders views of bundles under one variant.
 
-    Plugins are loaded one after the other: in parallel, Mitsuba 3.9 has failed now and then at a sensor (bad_alloc, or
-    basic_string::_M_create), took no less time, and would wait for ever on an empty pool. With ``threads`` 1 sums over
-    samples are in a fixed order, so the same seed gives the same bits; views run side by side in several workers
-    instead. 0: all cores. The bundles are variants of one scene, in the same units.
+    Args:
+        variant: of Mitsuba.
+        threads: with 1, sums over samples have a fixed order, so that the same seed gives the same bits; views run side
+            by side in several workers instead. 0: all cores.
+        bundles: ``scene.xml`` files, variants of one scene in the same units.
+
+    Plugins load one after the other: in parallel, Mitsuba 3.9 now and then fails at a sensor (bad_alloc, or
+    basic_string::_M_create), takes no less time, and would wait for ever on an empty pool.
+    Raises UserError: the scalar variant cannot render a bundle.
     """
 
     def __init__(self, variant: str, threads: int, bundles: Sequence[Path]) -> None:
@@ -59,9 +64,14 @@ class Engine:
         self._integrators: dict[tuple[str, str, int, bool], tuple[Any, str]] = {}
 
     def integrator(self, bundle: Path, kind: str, max_depth: int, passes: bool = False) -> tuple[Any, str]:
-        """(integrator, its name for the file's metadata); see :func:`.visibility.camera_integrator`.
+        """(integrator, its name for the file's header).
 
-        passes: also compute Mitsuba's auxiliary channels, which cost time and are thrown away (for comparison).
+        Args:
+            bundle: one of the engine's.
+            kind, max_depth: see `visibility.camera_integrator`.
+            passes: also compute Mitsuba's auxiliary channels, which cost time and are thrown away (for comparison).
+
+        Raises UserError: the variant cannot leave caustics out.
         """
         if kind == "path-without-caustics" and not self.compiled:
             raise UserError("leaving caustics out needs a jit variant of Mitsuba (LLVM or CUDA); see `dnrpipe doctor`")
@@ -84,8 +94,10 @@ class Engine:
             return self.mi.render(scene, **options)
 
     def auxiliary(self, bundle: Path, view: View, spp: int) -> tuple[np.ndarray, np.ndarray, int]:
-        """(albedo, shading normal in world space), [H, W, 3] each, for the denoiser: see :mod:`.auxiliary`; and how
-        many pixels of them were not finite and are 0."""
+        """(albedo, shading normal in world space, number of pixels that were not finite and are 0); for the denoiser.
+
+        The images, float32 [H, W, 3] each, are those of the module `auxiliary`.
+        """
         scene = self.scenes[str(bundle)]
         if self.compiled:
             integrator = auxiliary_integrator(self.mi, scene)
@@ -107,7 +119,16 @@ class Engine:
     def frame(
         self, bundle: Path, integrator: Any, sensor: Any, view: View, spp: int, seed: int
     ) -> tuple[np.ndarray, int]:
-        """(mean RGBA [H, W, 4] float64, samples taken), in launches that fit in memory."""
+        """(mean RGBA, float64 [H, W, 4], linear Rec.709, premultiplied; samples taken), in launches that fit in memory.
+
+        Args:
+            bundle: one of the engine's.
+            integrator: of `integrator`.
+            sensor: of `sensor`, for the same view.
+            view: in scene units.
+            spp: samples per pixel.
+            seed: its lower 20 bits count.
+        """
         chunk = max(1, min(spp, MAX_WAVEFRONT // (view.width * view.height)))
         total = np.zeros((view.height, view.width, 4), dtype=np.float64)
         done = launch = 0

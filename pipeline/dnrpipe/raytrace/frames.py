@@ -1,7 +1,7 @@
-"""Frames in a hurry: path tracing at a few samples and auxiliary images, by kernels that are traced once and kept.
+"""Frames one after the other: path tracing at a few samples and auxiliary images, by kernels that are recorded once.
 
 Python that describes a frame to Dr.Jit (our integrators and BSDFs) takes ten times longer than the kernel of a frame at
-one sample per pixel. :class:`.recorded.Recorded` keeps it. What differs between frames goes in as opaque numbers:
+one sample per pixel. `recorded.Recorded` keeps the kernel. What differs between frames goes in as opaque numbers:
 camera, seed, samples; a Mitsuba sensor per view would be recorded anew each time, so rays are made here.
 
 Notation
@@ -35,7 +35,7 @@ WARM_FRAMES = 3
 
 @dataclass(frozen=True)
 class Auxiliary:
-    """Auxiliary images as :mod:`.auxiliary` defines them; float32, means over primary rays.
+    """Auxiliary images as `auxiliary` defines them; float32, means over primary rays.
 
     albedo    [H, W, 3] diffuse reflectance, behind mirrors and glass, too
     normal    [H, W, 3] world-space shading normal
@@ -51,7 +51,7 @@ class Frames:
     """Frames of one bundle, of one size. Views are pinhole cameras in scene units.
 
     Args:
-        integrator, max_depth: as of :meth:`.engine.Engine.integrator`.
+        integrator, max_depth: as of `engine.Engine.integrator`.
         size: (width, height) in pixels of all views.
 
     Raises UserError under a scalar variant, which has no kernels to keep.
@@ -84,9 +84,9 @@ class Frames:
         return Auxiliary(image[..., :3], image[..., 3:6], image[..., 6])
 
     def gbuffer(self, view: View, rays: int = 16) -> dict[str, np.ndarray]:
-        """The view's G-buffer without the object numbers: channels of :mod:`dnrtrain.contract`, float32 [H, W].
+        """The view's G-buffer without the object numbers: channels of `dnrtrain.contract`, float32 [H, W].
 
-        coverage: as of :meth:`coverage`. The rest is of the ray through the pixel's centre.
+        coverage: as of `coverage`. The rest is of the ray through the pixel's centre.
         """
         if self._centre is None:
             self._centre = self._warmed(self._centre_kernel(), view, 1)
@@ -130,7 +130,7 @@ class Frames:
         return result
 
     def _cover_everywhere(self, view: View, rays: int) -> np.ndarray:
-        """:meth:`coverage` where surfaces let light through; large pictures in launches of some of the cells."""
+        """`coverage` where surfaces let light through; large pictures in launches of some of the cells."""
         import drjit as dr
 
         each = rays

@@ -1,4 +1,4 @@
-"""Camera rays whose camera is data, and what they show first: parts of the kernels of :mod:`.frames`."""
+"""Camera rays whose camera is data, and what they show first: parts of the kernels of `frames`."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def seen_first(mi: Any, scene: Any) -> Any:
             return null & (sampler.next_1d(active) < share)
 
         def onwards(hit: Any, direction: Any, sampler: Any, active: Any) -> tuple[Any, ...]:
-            _, following = visible(scene, hit.spawn_ray(direction), active)
-            hit = dr.select(active, following, hit)
+            _, next_hit = visible(scene, hit.spawn_ray(direction), active)
+            hit = dr.select(active, next_hit, hit)
             return hit, direction, sampler, passes(hit, sampler, active)
 
         state = (hit, mi.Vector3f(ray.d), sampler, passes(hit, sampler, mi.Bool(True)))

@@ -23,7 +23,13 @@ LAUNCH_BITS = 14
 
 
 class GroupedSensor:
-    """A view as Mitsuba sensor that renders several groups at once; call :meth:`render`."""
+    """A view as Mitsuba sensor that renders several groups at once.
+
+    Args:
+        engine, bundle: the scene.
+        view: in scene units.
+        lens: see `sensors.sensor_dict`.
+    """
 
     def __init__(self, engine: Engine, bundle: Path, view: View, lens: dict[str, float] | None) -> None:
         self.engine, self.scene = engine, engine.scenes[str(bundle)]
@@ -45,9 +51,13 @@ class GroupedSensor:
         self.sensor = mi.load_dict(sensor)
 
     def render(self, integrator: Any, samples: int, seed: int, first: int) -> tuple[np.ndarray, int]:
-        """(means of the groups [G, H, W, 4] float64, launches) of ``samples`` per pixel in each group.
+        """(means of the groups, float64 [G, H, W, 4], linear Rec.709, premultiplied; number of kernel launches).
 
-        seed: of the view, 18 bits; first: launches of this view before.
+        Args:
+            integrator: a Mitsuba integrator.
+            samples: per pixel, in each group.
+            seed: of the view, 18 bits.
+            first: number of launches of this view so far.
         """
         result = np.zeros((GROUPS, self.height, self.width, 4))
         launches = 0

@@ -9,10 +9,10 @@ Notation
     S        the light that comes from surfaces, not from emitters, in the mean over what a rough glossy lobe sees, for
              cosine-weighted directions of view: W sr^-1 m^-2
 
-At a view, B is E times the reflectance of that very point (:mod:`.base`), so that the map holds light alone, which is
+At a view, B is E times the reflectance of that very point (see `base_renderer`): the map holds light alone, which is
 smooth, and textures stay as sharp as they are. In the same way S is multiplied by what the lobe reflects at that view:
-a lobe so wide sees about the same from everywhere. Direct light is sampled at the emitters; the rest of the path is the
-plan's own integrator, from the first bounce on, with all its effects.
+a lobe so wide sees about the same from everywhere. Direct light is sampled at the emitters; the plan's own integrator
+follows the rest of the path, from the first bounce on, with all its effects.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 
 from .denoise import denoise, filled
 from .frames_rays import lets_through
-from .lobes import bsdfs_of, diffuse_context, ignores_context, is_among, is_rough, other_context, reflectance
+from .lobes import bsdfs_of, diffuse_context, ignores_context, is_among, is_rough, reflectance, specular_context
 from .texels import AtlasSurface
 
 MAX_SAMPLES = 4_000_000
@@ -38,11 +38,16 @@ MAX_LAYERS = 16
 
 
 class LightBaker:
-    """Bakes E of one scene.
+    """Bakes E and S of one scene.
 
-    integrator: continues paths from their first bounce on; emitters that it meets first must be hidden. None: direct
-    light alone. groups: see :class:`.texels.AtlasSurface`. ``lost``: samples of the last bake that were not finite;
-    each is left out of its texel's mean.
+    Args:
+        mi: the mitsuba module, a jit variant set.
+        scene: the scene.
+        integrator: continues paths from their first bounce on; emitters that it meets first must be hidden. None:
+            direct light alone.
+        groups: see `texels.AtlasSurface`.
+
+    ``lost`` counts the samples of the last bake that were not finite; each is left out of its texel's mean.
     """
 
     def __init__(self, mi: Any, scene: Any, integrator: Any, groups: Sequence[tuple[Path, np.ndarray]] = ()) -> None:
@@ -51,14 +56,14 @@ class LightBaker:
         self.lift = float(LIFT * scene.bbox().bounding_sphere().radius)
         self.passing = lets_through(mi, scene)
         bsdfs = bsdfs_of(scene)
-        self.whole = [b for b in bsdfs if ignores_context(b)]
+        self.unsplit = [b for b in bsdfs if ignores_context(b)]
         self.glossy = any(mi.has_flag(b.flags(), mi.BSDFFlags.Glossy) for b in bsdfs)
         inner = [shape.interior_medium() for shape in scene.shapes() if shape.is_medium_transition()]
         self.media = list({id(medium): medium for medium in inner if medium is not None}.values())
         self.lost = 0
 
     def bake(self, size: int, spp: int, seed: int) -> np.ndarray:
-        """E and S of the front and of the back, float32 [2, 2, size, size, 3], row 0 at V = 0; denoised, gaps filled.
+        """E and S of the front and of the back, float32 [2, 2, size, size, 3], row 0 at V = 0; no noise, no gaps.
 
         The denoiser is shown where in space each texel lies and where it faces, so that charts that are neighbours in
         the atlas alone stay apart. The back is traced where it can be seen: of surfaces with a rim.
@@ -88,7 +93,7 @@ class LightBaker:
     def _sums(
         self, sample: Any, texels: np.ndarray, size: int, spp: int, seed: int, side: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Numerator and denominator, [T, 3] each, of :meth:`_traced`; books what was lost."""
+        """Numerator and denominator, [T, 3] each, of `_traced`; counts what was lost."""
         sums = self._traced(sample, texels, size, spp, seed, side)
         self.lost += round(float(sums[:, 6].sum(dtype=np.float64)))
         return sums[:, :3], sums[:, 3:6]
@@ -117,7 +122,7 @@ class LightBaker:
         return denoise(images[0], images[1], images[2], threads=1)
 
     def _traced(self, sample: Any, texels: np.ndarray, size: int, spp: int, seed: int, side: int) -> np.ndarray:
-        """[T, channels]: what ``sample`` (:meth:`_light` or :meth:`_gloss`) gives, summed over ``spp`` samples."""
+        """[T, channels]: what ``sample`` (`_light` or `_gloss`) gives, summed over ``spp`` samples."""
         chunk = max(1, MAX_SAMPLES // spp)
         parts = [
             self._part(sample, texels[start : start + chunk], size, spp, seed * 4096 + number, side)
@@ -148,7 +153,7 @@ class LightBaker:
         return texels, np.array(position).T, np.array(normal).T, np.array(self.surface.thin(place))
 
     def _part(self, sample: Any, texels: np.ndarray, size: int, spp: int, seed: int, side: int) -> np.ndarray:
-        """As :meth:`_traced`, of texels that fit in memory."""
+        """As `_traced`, of texels that fit in memory."""
         import drjit as dr
 
         mi = self.mi
@@ -179,8 +184,8 @@ class LightBaker:
 
         mi = self.mi
         si, found = self._surface(sampler, uv, side)
-        bsdf, context = si.bsdf(), other_context(mi)
-        found &= ~is_among(mi, bsdf, self.whole) & is_rough(mi, bsdf, context, si, found)
+        bsdf, context = si.bsdf(), specular_context(mi)
+        found &= ~is_among(mi, bsdf, self.unsplit) & is_rough(mi, bsdf, context, si, found)
         seen = mi.warp.square_to_cosine_hemisphere(sampler.next_2d())
         seen.z = dr.select(si.wi.z < 0, -seen.z, seen.z)
         si.wi = seen

@@ -23,18 +23,23 @@ def ignores_context(bsdf: Any) -> bool:
     return IGNORE_CONTEXT in str(bsdf)
 
 
+def context_of(mi: Any, *flags: Any) -> Any:
+    """Context of the lobes that have any of the flags."""
+    context = mi.BSDFContext()
+    context.type_mask = 0
+    for flag in flags:
+        context.type_mask |= int(flag)
+    return context
+
+
 def diffuse_context(mi: Any) -> Any:
     """Context of the diffuse lobes alone."""
-    context = mi.BSDFContext()
-    context.type_mask = mi.BSDFFlags.Diffuse
-    return context
+    return context_of(mi, mi.BSDFFlags.Diffuse)
 
 
-def other_context(mi: Any) -> Any:
+def specular_context(mi: Any) -> Any:
     """Context of the lobes that mirror and refract, sharp or rough."""
-    context = mi.BSDFContext()
-    context.type_mask = int(mi.BSDFFlags.Glossy) | int(mi.BSDFFlags.Delta)
-    return context
+    return context_of(mi, mi.BSDFFlags.Glossy, mi.BSDFFlags.Delta)
 
 
 def is_rough(mi: Any, bsdf: Any, context: Any, si: Any, active: Any) -> Any:

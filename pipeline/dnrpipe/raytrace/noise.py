@@ -1,7 +1,7 @@
 """How noisy a path-traced picture is, from the picture's own samples, and how sure that is. numpy only.
 
 Notation
-    f        linear RGBA -> sRGB over white (:func:`dnrpipe.raytrace.statistics.display`): where noise is measured
+    f        linear RGBA -> sRGB over white (`statistics.display`): where noise is measured
     X_k      means of G disjoint groups of samples, equally many in each, independent of each other; M their mean
     M_-k     the mean of all groups but the k-th
     v        jackknife estimate of Var f(M) at a pixel: (G-1)/G sum_k (f(M_-k) - mean_j f(M_-j))²
@@ -28,6 +28,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dnrpipe.raytrace.statistics import display
+from dnrtrain import srgb
 
 GROUPS = 8
 
@@ -58,7 +59,7 @@ def group_noise(groups: np.ndarray) -> Noise:
 
 
 def half_noise(half_a: np.ndarray, half_b: np.ndarray) -> Noise:
-    """Noise of the mean of two independent, equally noisy halves [H, W, 4]; see :func:`group_noise`, which is better.
+    """Noise of the mean of two independent, equally noisy halves [H, W, 4]; see `group_noise`, which is better.
 
     E[((A-B)/2)²] = Var[(A+B)/2], first order through the display curve. The standard error is an upper bound: from
     the second moment of the pixels' estimates, as nothing tells it from their variance.
@@ -80,7 +81,7 @@ def denoised_error(denoised: np.ndarray, others: np.ndarray) -> tuple[float, flo
     alpha = denoised[..., 3:]
     straight = np.where(alpha > 0, denoised[..., :3] / np.maximum(alpha, 1e-6), 2.0)
     curved = 1.055 / 2.4 * np.maximum(straight, 1e-6) ** (1 / 2.4 - 1)
-    slope = np.where(straight <= 0.0031308, 12.92, np.where(straight < 1, curved, 0.0))
+    slope = np.where(straight <= srgb.LINEAR_END, 12.92, np.where(straight < 1, curved, 0.0))
     delta = (denoised - others)[..., :3] * slope
     count = len(others)
     products = (delta.sum(axis=0) ** 2 - (delta**2).sum(axis=0)) / (count * (count - 1))

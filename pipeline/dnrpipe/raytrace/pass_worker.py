@@ -1,19 +1,17 @@
-"""The ray-tracing worker for targets: adds passes of samples to a view, and writes its EXR when told to.
+"""The ray-tracing worker for targets: adds passes of samples to a view, and writes its EXR when asked to.
 
-What has been traced lies in a file of its own (:mod:`.samples`), so that any worker can go on with any view, also
-after a crash or with another target. The decisions are :mod:`dnrpipe.raytrace.sample_schedule`'s.
+What has been traced lies in a file of its own (see `samples`), so that any worker can go on with any view, also
+after a crash or with another target. The decisions are `sample_schedule`'s.
 """
 
 from __future__ import annotations
 
 import resource
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dnrtrain.contract import View
 from dnrtrain.exr import write_exr
 
 from .engine import Engine
@@ -21,38 +19,33 @@ from .grouped import GroupedSensor
 from .noise import GROUPS, group_noise
 from .pictures import finished, repair
 from .samples import Samples, read_samples
+from .tasks import NoiseFigures, PassAnswer, PassTask, TracedView, TracerCommon, WriteAnswer, WriteTask
 
 
 class Worker:
-    """Loads the bundle once.
-
-    common: as of :class:`.tracer.Worker`. task: as there, without "spp", and with
-        "samples", "samples_fingerprint": path and fingerprint of what is traced so far
-        "add": samples per pixel to add, a multiple of GROUPS; 0: write "output"
-        "goal": what was asked for and what ended it, for the file's metadata
-    """
+    """Loads the bundle once. common: a `TracerCommon`; task: a `PassTask`, or a `WriteTask` where "add" is 0."""
 
     def __init__(self, common: dict[str, Any]) -> None:
-        self.bundle = Path(common["bundle"])
-        self.engine = Engine(common["variant"], int(common["threads"]), [self.bundle])
+        settings = TracerCommon.model_validate(common)
+        self.bundle = settings.bundle
+        self.engine = Engine(settings.variant, settings.threads, [self.bundle])
         self.started = False
 
-    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
-        view = View.model_validate(task["view"])
-        samples = read_samples(Path(task["samples"]), task["samples_fingerprint"], view.height, view.width)
-        return self._add(task, view, samples) if task["add"] else self._write(task, view, samples)
+    def __call__(self, task: dict[str, Any]) -> PassAnswer | WriteAnswer:
+        return self._add(PassTask.model_validate(task)) if task["add"] else self._write(WriteTask.model_validate(task))
 
-    def _add(self, task: dict[str, Any], view: View, samples: Samples) -> dict[str, Any]:
-        """One pass. Returns the view's figures; "started": whether kernels were compiled in it."""
+    def _add(self, task: PassTask) -> PassAnswer:
+        """One pass. Returns the view's figures."""
         first, self.started = not self.started, True
+        samples = _samples(task)
         started, cpu = time.monotonic(), time.process_time()
         integrator, _ = self._integrator(task)
-        sensor = GroupedSensor(self.engine, self.bundle, view, task.get("lens"))
+        sensor = GroupedSensor(self.engine, self.bundle, task.view, task.lens)
         facts = samples.facts
-        each = max(1, int(task["add"]) // GROUPS)
+        each = max(1, task.add // GROUPS)
 
         def render(_attempt: int = 0, _group: int = 0) -> np.ndarray:
-            means, launches = sensor.render(integrator, each, int(task["seed"]), facts.launches)
+            means, launches = sensor.render(integrator, each, task.seed, facts.launches)
             facts.launches += launches
             return means
 
@@ -65,64 +58,69 @@ class Worker:
         seconds = time.monotonic() - started
         facts.seconds += seconds
         facts.cpu_seconds += time.process_time() - cpu
-        samples.save(Path(task["samples"]))
-        answer = {
+        samples.save(task.samples)
+        answer: PassAnswer = {
             "spp": facts.spp,
-            "noise": facts.noise,
-            "error": facts.error,
+            "noise": noise.relative,
+            "error": noise.error,
             "seconds": seconds,
             "started": first,
         }
-        if task.get("rehearse"):  # how long writing will take, for a time that is to be kept
+        if task.rehearse:  # how long writing will take, for a time that is to be kept
             began = time.monotonic()
-            self._pictures(task, view, samples)
+            self._pictures(task, samples)
             answer["finish_seconds"] = time.monotonic() - began
         return answer
 
-    def _write(self, task: dict[str, Any], view: View, samples: Samples) -> dict[str, Any]:
-        """The view's EXR. Seconds are those since the ledger last heard of the view."""
-        if not samples.facts.spp:
-            raise RuntimeError(f"{task['samples']}: gone or damaged; run the same command to trace it again")
-        started, cpu = time.monotonic(), time.process_time()
-        channels, noise = self._pictures(task, view, samples)
-        _, name = self._integrator(task)
+    def _write(self, task: WriteTask) -> WriteAnswer:
+        """The view's EXR."""
+        samples = _samples(task)
         facts = samples.facts
+        if not facts.spp:
+            raise RuntimeError(f"{task.samples}: gone or damaged; run the same command to trace it again")
+        started, cpu = time.monotonic(), time.process_time()
+        channels, noise = self._pictures(task, samples)
+        _, name = self._integrator(task)
         facts.seconds += time.monotonic() - started
         facts.cpu_seconds += time.process_time() - cpu
-        numbers = {
+        answer: WriteAnswer = {
             "spp": facts.spp,
-            "max_depth": int(task["max_depth"]),
-            "seed": int(task["seed"]),
-            "integrator": name + ("+lens" if task.get("lens") else ""),
+            "max_depth": task.max_depth,
+            "seed": task.seed,
+            "integrator": name + ("+lens" if task.lens else ""),
             "variant": self.engine.variant,
             "load_seconds": self.engine.load_seconds,
             "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
             **noise,
             "repaired": facts.repaired,
             "masked": facts.masked,
-            "denoised": bool(task.get("denoise")),
+            "denoised": task.denoise,
             "passes": facts.passes,
-            **task["goal"],
+            "noise_target": task.goal.noise_target,
+            "time_target": task.goal.time_target,
+            "max_spp": task.goal.max_spp,
+            "ended_by": task.goal.ended_by,
+            "seconds": facts.seconds,
+            "cpu_seconds": facts.cpu_seconds,
         }
-        header = {"seconds": facts.seconds, "cpu_seconds": facts.cpu_seconds, "fingerprint": task["fingerprint"]}
-        write_exr(Path(task["output"]), channels, {**numbers, **header, "view": view.model_dump(mode="json")})
-        new = {
-            "seconds": facts.seconds - facts.booked_seconds,
-            "cpu_seconds": facts.cpu_seconds - facts.booked_cpu_seconds,
-        }
-        earlier: dict[str, float] = {}
+        header = {**answer, "fingerprint": task.fingerprint, "view": task.view.model_dump(mode="json")}
+        write_exr(task.output, channels, header)
         if facts.booked_seconds:  # the ledger has them in an earlier record
-            earlier = {"earlier_seconds": facts.booked_seconds, "earlier_cpu_seconds": facts.booked_cpu_seconds}
+            answer["seconds"] -= facts.booked_seconds
+            answer["cpu_seconds"] -= facts.booked_cpu_seconds
+            answer["earlier_seconds"] = facts.booked_seconds
+            answer["earlier_cpu_seconds"] = facts.booked_cpu_seconds
         facts.booked_seconds, facts.booked_cpu_seconds = facts.seconds, facts.cpu_seconds
-        samples.save(Path(task["samples"]))
-        return {**numbers, **new, **earlier}
+        samples.save(task.samples)
+        return answer
 
-    def _pictures(
-        self, task: dict[str, Any], view: View, samples: Samples
-    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        noise, smooth = group_noise(samples.groups), bool(task.get("denoise"))
-        image, halves = samples.mean, samples.halves
-        return finished(self.engine, self.bundle, view, image, halves, noise, smooth, samples.groups)
+    def _pictures(self, task: PassTask | WriteTask, samples: Samples) -> tuple[dict[str, np.ndarray], NoiseFigures]:
+        noise, image, halves = group_noise(samples.groups), samples.mean, samples.halves
+        return finished(self.engine, self.bundle, task.view, image, halves, noise, task.denoise, samples.groups)
 
-    def _integrator(self, task: dict[str, Any]) -> tuple[Any, str]:
-        return self.engine.integrator(self.bundle, task.get("integrator", "path"), int(task["max_depth"]))
+    def _integrator(self, task: TracedView) -> tuple[Any, str]:
+        return self.engine.integrator(self.bundle, task.integrator, task.max_depth)
+
+
+def _samples(task: PassTask | WriteTask) -> Samples:
+    return read_samples(task.samples, task.samples_fingerprint, task.view.height, task.view.width)

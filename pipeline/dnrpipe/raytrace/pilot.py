@@ -8,85 +8,68 @@ from typing import Any
 
 import numpy as np
 
-from dnrpipe.raytrace.statistics import (
-    REFERENCE_DEPTH,
-    DepthStep,
-    cost,
-    difference,
-    display,
-    enough,
-    remaining,
-    significance,
-)
-from dnrtrain.contract import View
-
 from .engine import Engine
 from .finite import masked
+from .statistics import REFERENCE_DEPTH, DepthStep, cost, difference, display, enough, remaining, significance
+from .tasks import CompareAnswer, CompareTask, DepthAnswer, DepthTask, PilotCommon, PilotConfig, PilotView
 
 DEPTHS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48)
 MAX_DOUBLINGS = 2
 
 
 class Worker:
-    """Answers pilot tasks.
-
-    common: {"configs": all configurations of the tasks to come}
-    task "depth": {"config", "views", "spp", "tolerance", "pixel_tolerance"} -> :meth:`path_depth`
-    task "compare": {"with", "without": configs, "views", "spp"} -> :meth:`compare`
-    config: {"bundle": scene.xml, "integrator", "max_depth", "variant", "lenses", "passes"}
-    view: {"view": View as JSON, "lens"}
-    Answers also hold ``masked``: pixels of all pictures that were not finite, and count as black.
-    """
+    """Answers pilot tasks. common: a `PilotCommon`; task: a `DepthTask` or a `CompareTask`, as its "kind" says."""
 
     def __init__(self, common: dict[str, Any]) -> None:
         bundles: dict[str, list[Path]] = {}
-        for config in common["configs"]:
-            bundles.setdefault(config["variant"], []).append(Path(config["bundle"]))
+        for config in PilotCommon.model_validate(common).configs:
+            bundles.setdefault(config.variant, []).append(config.bundle)
         # One thread would stop the loader of a second variant.
         threads = 1 if len(bundles) == 1 else 0
         self.masked = 0  # pixels of the task at hand that were not finite
         self.engines = {name: Engine(name, threads, list(dict.fromkeys(paths))) for name, paths in bundles.items()}
 
-    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
+    def __call__(self, task: dict[str, Any]) -> DepthAnswer | CompareAnswer:
         self.masked = 0
-        answer = self.path_depth(task) if task["kind"] == "depth" else self.compare(task)
-        return answer | {"masked": self.masked}
+        if task["kind"] == "depth":
+            return self.path_depth(DepthTask.model_validate(task))
+        return self.compare(CompareTask.model_validate(task))
 
-    def path_depth(self, task: dict[str, Any]) -> dict[str, Any]:
+    def path_depth(self, task: DepthTask) -> DepthAnswer:
         """Smallest depth within the tolerances, by bisection; more samples where noise is what decides.
 
-        Path tracing is done by ``dnr_path``, which Mitsuba's ``path`` equals but for a kernel to compile per depth.
+        ``dnr_path`` traces paths: Mitsuba's ``path`` gives the same, but compiles a kernel per depth.
 
-        Returns {"max_depth", "spp", "steps", "seconds", "cpu_seconds"}; REFERENCE_DEPTH where none suffices.
+        Returns REFERENCE_DEPTH where no depth suffices.
         """
         started, cpu = time.monotonic(), time.process_time()
-        if task["config"]["integrator"] == "path" and self.engines[task["config"]["variant"]].compiled:
-            task = {**task, "config": {**task["config"], "integrator": "path-of-any-depth"}}
-        spp, tolerances = int(task["spp"]), (float(task["tolerance"]), float(task["pixel_tolerance"]))
-        chosen, steps, noisy = self._bisect(task, spp, tolerances)
+        if task.config.integrator == "path" and self.engines[task.config.variant].compiled:
+            config = task.config.model_copy(update={"integrator": "path-of-any-depth"})
+            task = task.model_copy(update={"config": config})
+        spp = task.spp
+        chosen, steps, noisy = self._bisect(task, spp)
         for _ in range(MAX_DOUBLINGS):
             if not noisy:
                 break
             spp *= 2
-            chosen, steps, noisy = self._bisect(task, spp, tolerances)
+            chosen, steps, noisy = self._bisect(task, spp)
         return {
             "max_depth": chosen,
             "spp": spp,
             "steps": [step.model_dump() for step in sorted(steps, key=lambda step: step.depth)],
             "seconds": time.monotonic() - started,
             "cpu_seconds": time.process_time() - cpu,
+            "masked": self.masked,
         }
 
-    def _bisect(
-        self, task: dict[str, Any], spp: int, tolerances: tuple[float, float]
-    ) -> tuple[int, list[DepthStep], bool]:
+    def _bisect(self, task: DepthTask, spp: int) -> tuple[int, list[DepthStep], bool]:
         """(depth, steps looked at, whether the next smaller depth failed by its noise alone)."""
-        deep = self._pictures({**task["config"], "max_depth": REFERENCE_DEPTH}, task["views"], spp)
+        deep = self._pictures(task.config, REFERENCE_DEPTH, task.views, spp)
         found: dict[int, DepthStep] = {}
 
         def step(depth: int) -> DepthStep:
             if depth not in found:
-                shallow = self._pictures({**task["config"], "max_depth": depth}, task["views"], spp)
+                shallow = self._pictures(task.config, depth, task.views, spp)
                 found[depth] = remaining(depth, (deep - shallow)[..., :3], deep[..., :3], deep[..., 3])
             return found[depth]
 
@@ -94,35 +77,35 @@ class Worker:
         step(DEPTHS[0])  # what direct light alone would miss is part of the report
         while high - low > 1:
             middle = (low + high) // 2
-            if enough(step(DEPTHS[middle]), *tolerances):
+            if enough(step(DEPTHS[middle]), task.tolerance, task.pixel_tolerance):
                 high = middle
             else:
                 low = middle
-        noisy = (
-            low >= 0
-            and found[DEPTHS[low]].mean <= tolerances[0] < found[DEPTHS[low]].mean + found[DEPTHS[low]].mean_error
-        )
+        failed = found[DEPTHS[low]] if low >= 0 else None
+        noisy = failed is not None and failed.mean <= task.tolerance < failed.mean + failed.mean_error
         if high == len(DEPTHS):
             found[REFERENCE_DEPTH] = DepthStep(depth=REFERENCE_DEPTH, mean=0.0, mean_error=0.0, pixel=0.0)
             return REFERENCE_DEPTH, list(found.values()), noisy
         return DEPTHS[high], list(found.values()), noisy
 
-    def compare(self, task: dict[str, Any]) -> dict[str, Any]:
+    def compare(self, task: CompareTask) -> CompareAnswer:
         """What the first configuration costs over the second, and by how much their pictures differ.
 
         Same seeds for both; one after the other, view by view, after a first frame that compiles the kernels.
         """
         started = time.monotonic()
-        configs, views, spp = (task["with"], task["without"]), task["views"], int(task["spp"])
+        configs, views = (task.with_effect, task.without_effect), task.views
         for config in configs:
-            self._picture(config, views[0], 1, 0)
+            self._picture(config, config.max_depth, views[0], 1, 0)
         pictures: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
         seconds: tuple[list[float], list[float]] = ([], [])
         for index, entry in enumerate(views):
             for half in range(2):
                 for which, config in enumerate(configs):
                     cpu = time.process_time()
-                    pictures[which].append(display(self._picture(config, entry, spp, 2 * index + half)))
+                    pictures[which].append(
+                        display(self._picture(config, config.max_depth, entry, task.spp, 2 * index + half))
+                    )
                     seconds[which].append(time.process_time() - cpu)
         shape = (len(views), 2, *pictures[0][0].shape)
         both = [np.array(rows).reshape(shape) for rows in pictures]
@@ -137,25 +120,24 @@ class Worker:
             "seconds_with": float(np.sum(seconds[0])),
             "seconds_without": float(np.sum(seconds[1])),
             "seconds": time.monotonic() - started,
+            "masked": self.masked,
         }
 
-    def _pictures(self, config: dict[str, Any], views: list[dict[str, Any]], spp: int) -> np.ndarray:
+    def _pictures(self, config: PilotConfig, depth: int, views: list[PilotView], spp: int) -> np.ndarray:
         """[V, 2, H, W, 4]: two halves of each view; the seeds depend on view and half only."""
         rows = [
-            [self._picture(config, entry, spp, 2 * index + half) for half in range(2)]
+            [self._picture(config, depth, entry, spp, 2 * index + half) for half in range(2)]
             for index, entry in enumerate(views)
         ]
         return np.array(rows)
 
-    def _picture(self, config: dict[str, Any], entry: dict[str, Any], spp: int, seed: int) -> np.ndarray:
-        engine = self.engines[config["variant"]]
+    def _picture(self, config: PilotConfig, depth: int, entry: PilotView, spp: int, seed: int) -> np.ndarray:
+        """[H, W, 4] linear Rec.709, premultiplied."""
+        engine = self.engines[config.variant]
         engine.mi.set_variant(engine.variant)
-        bundle, view = Path(config["bundle"]), View.model_validate(entry["view"])
-        integrator, _ = engine.integrator(
-            bundle, config["integrator"], int(config["max_depth"]), bool(config.get("passes", False))
-        )
-        sensor = engine.sensor(view, entry.get("lens") if config.get("lenses", True) else None)
-        picture, _ = engine.frame(bundle, integrator, sensor, view, spp, seed)
+        integrator, _ = engine.integrator(config.bundle, config.integrator, depth, config.passes)
+        sensor = engine.sensor(entry.view, entry.lens if config.lenses else None)
+        picture, _ = engine.frame(config.bundle, integrator, sensor, entry.view, spp, seed)
         picture, lost = masked(picture)
         self.masked += lost
         return picture

@@ -1,8 +1,8 @@
 """What passes over a view have added up to so far: kept between passes, runs and targets.
 
 One uncompressed .npz per view: ``groups``, float32 [G, H, W, 4], the mean of each group of samples (linear Rec.709,
-premultiplied), and ``facts``, JSON. 128 bytes a pixel with G = 8. May be deleted at any time: what is then wanted is
-traced again from the start.
+premultiplied), and ``facts``, JSON. 128 bytes a pixel with G = 8. Files may be deleted at any time; the views are then
+traced from the start.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Facts:
     """fingerprint: hash of all that decides the samples (scene, view, integrator, seed), not how many there are.
 
     spp: in all groups together. launches: kernels launched so far, from which the next one's seed is counted.
-    noise, error: see :class:`.noise.Noise`; of all samples. seconds, cpu_seconds: spent on them; booked_*: the part
+    noise, error: see `noise.Noise`; of all samples. seconds, cpu_seconds: spent on them; booked_*: the part
     that the ledger knows. repaired, masked: non-finite pixels traced again, and set to zero.
     """
 
@@ -80,7 +80,7 @@ def read_facts(path: Path, fingerprint: str) -> Facts:
 
 
 def read_samples(path: Path, fingerprint: str, height: int, width: int) -> Samples:
-    """What is on disk, or no samples yet: see :func:`read_facts`."""
+    """What is on disk, or no samples yet: see `read_facts`."""
     facts, groups = _read(path, fingerprint, pixels=True)
     if groups is None or groups.shape != (GROUPS, height, width, 4) or not np.isfinite(groups).all():
         return Samples(np.zeros((GROUPS, height, width, 4)), Facts(fingerprint))

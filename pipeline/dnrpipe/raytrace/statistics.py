@@ -14,6 +14,7 @@ import math
 
 import numpy as np
 
+from dnrtrain import srgb
 from dnrtrain.settings import Strict
 
 BLOCK = 4
@@ -34,7 +35,7 @@ class Measured(Strict):
 
 
 class DepthStep(Strict):
-    """What paths cut at ``depth`` leave out, as shares of the mean radiance (see :mod:`.statistics`)."""
+    """What paths cut at ``depth`` leave out, as shares of the mean radiance (see `statistics`)."""
 
     depth: int
     mean: float
@@ -88,7 +89,7 @@ def difference(with_effect: np.ndarray, without: np.ndarray) -> Measured:
 def significance(with_effect: np.ndarray, without: np.ndarray) -> float:
     """How surely two renders differ: sum of d1 d2 over its standard error where only noise differs.
 
-    Same arguments as :func:`difference`; d1, d2: differences of the two halves at a pixel, mean of the channels.
+    Same arguments as `difference`; d1, d2: differences of the two halves at a pixel, mean of the channels.
     With independent noise of variance s² the product has variance s⁴; d1 - d2 is free of the signal and has a fourth
     moment of 12 s⁴ (Gaussian; more with heavy tails, which errs on the safe side). Standard normal without effect.
     """
@@ -108,9 +109,7 @@ def display(rgba: np.ndarray) -> np.ndarray:
     """Premultiplied linear RGBA [..., 4] -> sRGB over white [..., 3] in [0, 1]."""
     alpha = np.clip(rgba[..., 3:], 0.0, 1.0)
     straight = np.where(alpha > 0, rgba[..., :3] / np.maximum(alpha, 1e-6), 0.0)
-    linear = np.clip(straight, 0.0, 1.0)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    return encoded * alpha + 1.0 - alpha
+    return srgb.encode(np.clip(straight, 0.0, 1.0)) * alpha + 1.0 - alpha
 
 
 def _half_width(values: np.ndarray) -> float:

@@ -1,12 +1,11 @@
 """What the scene's surfaces are, over the atlas: diffuse reflectance, emission, opacity, geometric normal.
 
 A worker (see `dnrpipe.workers.processes`). Together with the light map this is all that a rasteriser needs to show
-the scene's diffuse light: radiance = albedo · light + emission (:mod:`.base` says the same of rays).
+the scene's diffuse light: radiance = albedo · light + emission (`base_renderer` says the same of rays).
 """
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,33 +18,33 @@ from .engine import Engine
 from .frames_rays import lets_through
 from .lightmap import LightBaker
 from .lobes import diffuse_context, reflectance
+from .tasks import BundleCommon, SurfaceAnswer, SurfaceTask
 from .texels import grouped_meshes
 
 
 class Worker:
-    """Evaluates surfaces.
+    """Evaluates surfaces. common: a `BundleCommon`, task: a `SurfaceTask`.
 
-    common: {"bundle", "variant"}
-    task: {"output", "size", "samples", "seed"}; the file is an ``npz``, row 0 at V = 0, gaps between charts filled:
-    ``albedo`` and ``emission`` float32 [2, n, n, 3] (front, back), ``opacity`` [n, n], ``normal`` [n, n, 3] (the
-    triangles', world space), ``thin`` bool: whether any surface's back can be seen. ``lost`` of the answer: samples
-    that were not finite; each is left out of its texel's mean.
+    The file is an ``npz``, row 0 at V = 0, gaps between charts filled: ``albedo`` and ``emission`` float32
+    [2, n, n, 3] (front, back; linear Rec.709), ``opacity`` [n, n], ``normal`` [n, n, 3] (the triangles', world space),
+    ``thin`` bool: whether any surface's back can be seen. Samples that are not finite are left out of their texel's
+    mean.
     """
 
     def __init__(self, common: dict[str, Any]) -> None:
-        self.bundle = Path(common["bundle"])
-        self.engine = Engine(common["variant"], 0, [self.bundle])
+        settings = BundleCommon.model_validate(common)
+        self.bundle = settings.bundle
+        self.engine = Engine(settings.variant, 0, [self.bundle])
         if not self.engine.compiled:
             raise UserError("surface maps need a jit variant of Mitsuba (LLVM or CUDA; see `dnrpipe doctor`)")
 
-    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
-        scene = self.engine.scenes[str(self.bundle)]
-        size, samples = int(task["size"]), int(task["samples"])
-        mapper = SurfaceMapper(self.engine.mi, scene, grouped_meshes(self.bundle))
-        maps = mapper.maps(size, samples, int(task["seed"]))
-        with atomic_path(task["output"]) as temporary, temporary.open("wb") as file:
+    def __call__(self, task: dict[str, Any]) -> SurfaceAnswer:
+        asked = SurfaceTask.model_validate(task)
+        mapper = SurfaceMapper(self.engine.mi, self.engine.scenes[str(self.bundle)], grouped_meshes(self.bundle))
+        maps = mapper.maps(asked.size, asked.samples, asked.seed)
+        with atomic_path(asked.output) as temporary, temporary.open("wb") as file:
             np.savez(file, **maps)  # pyright: ignore[reportArgumentType]
-        return {"texels": size * size, "lost": mapper.lost}
+        return {"texels": asked.size**2, "lost": mapper.lost}
 
 
 class SurfaceMapper(LightBaker):
@@ -56,7 +55,7 @@ class SurfaceMapper(LightBaker):
         self.holes = lets_through(mi, scene)
 
     def maps(self, size: int, samples: int, seed: int) -> dict[str, np.ndarray]:
-        """See :class:`Worker`. samples: points per texel."""
+        """The maps that `Worker` writes. samples: points per texel."""
         self.lost = 0
         found = {
             "albedo": np.zeros((2, size, size, 3), np.float32),

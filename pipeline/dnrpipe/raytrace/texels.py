@@ -26,7 +26,7 @@ class AtlasSurface:
     """
 
     def __init__(self, mi: Any, scene: Any, groups: Sequence[tuple[Path, np.ndarray]] = ()) -> None:
-        """groups: meshes that stand in the scene as instances, each with a place (:func:`grouped_meshes`)."""
+        """groups: the meshes that instances repeat, each with the matrix of its place (`grouped_meshes`)."""
         meshes = [(shape, np.eye(4)) for shape in scene.shapes() if shape.is_mesh()]
         meshes += [(mi.load_dict({"type": "ply", "filename": str(path)}), matrix) for path, matrix in groups]
         corners, places, open_ = [], [], []

@@ -3,50 +3,44 @@
 Notation
     A, B     two independent half renders of a view, each spp/2 samples per pixel: they cost nothing extra, as their
              mean is the image
-    noise    estimated relative RMSE of (A+B)/2 in display space (:func:`.noise.half_noise`); of denoised views, A and
+    noise    estimated relative RMSE of (A+B)/2 in display space (`noise.half_noise`); of denoised views, A and
              B are denoised first: the noise that is left, not the denoiser's own error. raw_noise: before the denoiser
 
-This is tracing with so many samples per pixel; to a noise level or within a time it is :mod:`.pass_worker` that traces.
+This traces a number of samples per pixel; `pass_worker` traces to a noise level or within a time.
 """
 
 from __future__ import annotations
 
 import resource
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dnrtrain.contract import View
 from dnrtrain.exr import write_exr
 
 from .engine import Engine
 from .noise import half_noise
 from .pictures import finished, repair
-from .sensors import sensor_dict
+from .tasks import TraceAnswer, TracerCommon, TraceTask
 
 
 class Worker:
-    """Loads the bundle once; each call traces one view.
-
-    common: {"bundle": path of scene.xml, "variant": str, "threads": int}
-    task: {"view": View as JSON, "output": path, "spp", "max_depth", "seed", "fingerprint"}, and optionally
-    "integrator" (direct, path, volpath; default path), "lens" (see :func:`.sensors.sensor_dict`) and "denoise":
-    R G B are then denoised, and what was traced is in the channels ``raw.R``, ``raw.G``, ``raw.B``.
-    """
+    """Loads the bundle once; each call traces one view. common: a `TracerCommon`, task: a `TraceTask`."""
 
     def __init__(self, common: dict[str, Any]) -> None:
-        self.bundle = Path(common["bundle"])
-        self.engine = Engine(common["variant"], int(common["threads"]), [self.bundle])
+        settings = TracerCommon.model_validate(common)
+        self.bundle = settings.bundle
+        self.engine = Engine(settings.variant, settings.threads, [self.bundle])
 
-    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
-        view = View.model_validate(task["view"])
-        spp, seed, depth = int(task["spp"]), int(task["seed"]), int(task["max_depth"])
+    def __call__(self, task: dict[str, Any]) -> TraceAnswer:
+        return self._trace(TraceTask.model_validate(task))
+
+    def _trace(self, task: TraceTask) -> TraceAnswer:
+        view, spp, seed = task.view, task.spp, task.seed
         started, cpu = time.monotonic(), time.process_time()
-        lens = task.get("lens")
-        sensor = self.engine.sensor(view, lens)
-        integrator, name = self.engine.integrator(self.bundle, task.get("integrator", "path"), depth)
+        sensor = self.engine.sensor(view, task.lens)
+        integrator, name = self.engine.integrator(self.bundle, task.integrator, task.max_depth)
 
         def render(samples: int, number: int) -> tuple[np.ndarray, int]:
             return self.engine.frame(self.bundle, integrator, sensor, view, samples, number)
@@ -62,28 +56,22 @@ class Worker:
         image = (half_a * done_a + half_b * done_b) / total
         halves = (half_a, half_b) if done_b else None
         raw = half_noise(half_a, half_b) if done_b else None
-        channels, left = finished(self.engine, self.bundle, view, image, halves, raw, bool(task.get("denoise")))
-        numbers = {
+        channels, noise = finished(self.engine, self.bundle, view, image, halves, raw, task.denoise)
+        answer: TraceAnswer = {
             "spp": total,
-            "max_depth": depth,
+            "max_depth": task.max_depth,
             "seed": seed,
-            "integrator": name + ("+lens" if lens else ""),
+            "integrator": name + ("+lens" if task.lens else ""),
             "variant": self.engine.variant,
             "seconds": time.monotonic() - started,
             "cpu_seconds": time.process_time() - cpu,
             "load_seconds": self.engine.load_seconds,
             "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-            **left,
+            **noise,
             "repaired": repaired,
             "masked": masked,
-            "denoised": bool(task.get("denoise")),
+            "denoised": task.denoise,
         }
-        write_exr(
-            Path(task["output"]),
-            channels,
-            {**numbers, "fingerprint": task["fingerprint"], "view": view.model_dump(mode="json")},
-        )
-        return numbers
-
-
-__all__ = ["Worker", "sensor_dict"]
+        header = {**answer, "fingerprint": task.fingerprint, "view": view.model_dump(mode="json")}
+        write_exr(task.output, channels, header)
+        return answer

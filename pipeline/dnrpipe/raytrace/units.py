@@ -1,4 +1,4 @@
-"""Cameras in a bundle's own units (see :mod:`dnrpipe.blender.bundle.units`)."""
+"""Cameras in a bundle's own units (see `dnrpipe.blender.bundle.units`)."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ OWN: dict[str, dict[str, Any]] = {
     "path-without-caustics": {"type": "dnr_path", "caustics": False},
     "path-of-any-depth": {"type": "dnr_path"},
 }
-"""Integrators of :mod:`.paths`."""
+"""Integrators of `paths`."""
 
 
 def glowing_shapes(scene: Any) -> list[Any]:

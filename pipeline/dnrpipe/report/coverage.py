@@ -9,7 +9,7 @@ import numpy as np
 
 from dnrtrain.contract import ContractError, View
 from dnrtrain.selector.explain import NOT_SEEN, nearest_cosines
-from dnrtrain.selector.sightings import Sightings, read_sightings
+from dnrtrain.selector.visibility import SurfaceVisibility, read_visibility
 
 from .data import CoverageMaps, Picture
 from .pictures import encode
@@ -35,12 +35,12 @@ def coverage_maps(root: Path, candidates: Sequence[View], chosen: Sequence[str])
     step = max(1, -(-len(others) // LOOKED_AT))
     views = [*picked, *list(others.values())[::step]]
     try:
-        sightings = read_sightings([root / "passes" / "train" / f"{view.name}.exr" for view in views], views)
+        visibility = read_visibility([root / "passes" / "train" / f"{view.name}.exr" for view in views], views)
     except ContractError:
         return None
-    if not len(sightings.cells):
+    if not len(visibility.cells):
         return None
-    seen, angle, uncovered = _cells(sightings, len(chosen))
+    seen, angle, uncovered = _cells(visibility, len(chosen))
     there = seen >= 0
     counted = angle[there & (seen > 0)]
     return CoverageMaps(
@@ -55,26 +55,26 @@ def coverage_maps(root: Path, candidates: Sequence[View], chosen: Sequence[str])
     )
 
 
-def _cells(sightings: Sightings, chosen: int) -> tuple[np.ndarray, np.ndarray, float]:
+def _cells(visibility: SurfaceVisibility, chosen: int) -> tuple[np.ndarray, np.ndarray, float]:
     """The first ``chosen`` views are the chosen ones.
 
     Returns (chosen views that see each cell, −1 where nobody does, [G, G]; mean angle in degrees, by pixels, from the
-    views' direction to the nearest chosen sighting [G, G]; share of all pixels whose cell no chosen view sees).
+    views' direction to the nearest chosen view direction [G, G]; share of all pixels whose cell no chosen view sees).
     """
-    grid = sightings.grid
+    grid = visibility.grid
     size = grid * grid
     number = np.full(size, -1, np.int64)
-    number[sightings.cells] = 0
-    of_chosen = sightings.cells[: sightings.start[chosen]]
+    number[visibility.cells] = 0
+    of_chosen = visibility.cells[: visibility.start[chosen]]
     number += np.bincount(of_chosen, minlength=size)
-    nearest = np.full(len(sightings.cells), NOT_SEEN, np.float32)
-    for nearest in nearest_cosines(sightings, range(chosen)):  # noqa: B007 - the last one counts
+    nearest = np.full(len(visibility.cells), NOT_SEEN, np.float32)
+    for nearest in nearest_cosines(visibility, range(chosen)):  # noqa: B007 - the last one counts
         pass
     served = nearest > NOT_SEEN
-    pixels = sightings.pixels.astype(np.float64)
+    pixels = visibility.pixels.astype(np.float64)
     degrees = np.degrees(np.arccos(np.clip(nearest, -1.0, 1.0)))
-    sums = np.bincount(sightings.cells[served], (degrees * pixels)[served], size)
-    weights = np.bincount(sightings.cells[served], pixels[served], size)
+    sums = np.bincount(visibility.cells[served], (degrees * pixels)[served], size)
+    weights = np.bincount(visibility.cells[served], pixels[served], size)
     angle = sums / np.maximum(weights, 1e-12)
     return number.reshape(grid, grid), angle.reshape(grid, grid), float(1.0 - pixels[served].sum() / pixels.sum())
 

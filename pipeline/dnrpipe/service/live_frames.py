@@ -23,7 +23,7 @@ from PIL import Image
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.images import flip_error
 from dnrpipe.core.settings import Settings
-from dnrpipe.raytrace.base import BaseRenderer
+from dnrpipe.raytrace.base_renderer import BaseRenderer
 from dnrpipe.raytrace.base_worker import Worker as BaseWorker
 from dnrpipe.raytrace.engine import Engine
 from dnrpipe.raytrace.finite import masked, masked_channels

@@ -87,7 +87,7 @@ def run_pilots(
     results: list[dict[str, Any]] = []
     with console.bar(label, len(tasks)) as bar:
         for task in tasks:
-            common = {"configs": [task[key] for key in ("config", "with", "without") if key in task]}
+            common = {"configs": [task[key] for key in ("config", "with_effect", "without_effect") if key in task]}
             result = only_answer(
                 label,
                 "dnrpipe.raytrace.pilot",

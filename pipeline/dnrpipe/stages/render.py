@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from dnrtrain import srgb
 from dnrtrain.atomic import atomic_path, write_json
 from dnrtrain.contract import View, write_cameras
 
@@ -129,8 +130,7 @@ def write_frame_exr(path: Path, picture: np.ndarray, radiance: Any, data: Any, v
         straight = np.where(
             alpha[..., None] > 0, (picture - (1 - alpha[..., None])) / np.maximum(alpha[..., None], 1e-3), 0
         )
-        straight = np.clip(straight, 0, 1)
-        linear = np.where(straight <= 0.04045, straight / 12.92, ((straight + 0.055) / 1.055) ** 2.4)
+        linear = srgb.decode(np.clip(straight, 0, 1))
     rgba = np.concatenate([linear * alpha[..., None], alpha[..., None]], axis=-1)
     write_exr(path, {c: rgba[..., i] for i, c in enumerate("RGBA")}, {"view": view.model_dump(mode="json")})
 

@@ -23,7 +23,7 @@ from .trainer import epochs_done, follow, load, torch_device
 
 if TYPE_CHECKING:
     from dnrtrain.selector.protocol import Choice, Policy
-    from dnrtrain.selector.sightings import Sightings
+    from dnrtrain.selector.visibility import SurfaceVisibility
 
 
 def select_views(run: Run) -> Outcome:
@@ -83,7 +83,7 @@ def _choose_by(rule: Policy, run: Run, views: list[View]) -> Choice:
     """The rule's choice; what it took is booked."""
     select = run.settings.select
     clock, cpu = time.monotonic(), time.process_time()
-    candidates = Candidates.of_views(views, look(run.workspace, run.console, views) if rule.looks else None)
+    candidates = Candidates.of_views(views, look(run.workspace, run.console, views) if rule.needs_visibility else None)
     with run.console.bar(f"choosing by {select.policy}", len(views) * rule.effort) as bar:
         tick = functools.partial(_advance, bar)
         choice = rule.choose(candidates, select.budget, select.seed, tick)
@@ -134,9 +134,9 @@ def _train_and_choose(run: Run, views: list[View]) -> Selected:
     return chosen
 
 
-def look(workspace: Workspace, console: Console, views: list[View]) -> Sightings:
+def look(workspace: Workspace, console: Console, views: list[View]) -> SurfaceVisibility:
     """What the candidates see, from their pass files."""
-    from dnrtrain.selector.sightings import read_sightings
+    from dnrtrain.selector.visibility import read_visibility
 
     with console.bar("what candidates see", len(views)) as bar:
-        return read_sightings([workspace.passes("train", view.name) for view in views], views, tick=bar.advance)
+        return read_visibility([workspace.passes("train", view.name) for view in views], views, tick=bar.advance)

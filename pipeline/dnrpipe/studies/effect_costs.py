@@ -96,7 +96,13 @@ def measure_plan(session: Session, run: Run, plan: EffectPlan) -> EffectPlan:
             continue
         pair = (base, config) if effect.on else (config, base)
         views = pilot_views(workspace, settings, plan if plan.on("depth-of-field") else other)
-        task = {"kind": "compare", "with": pair[0], "without": pair[1], "views": views, "spp": MEASURE_SPP}
+        task = {
+            "kind": "compare",
+            "with_effect": pair[0],
+            "without_effect": pair[1],
+            "views": views,
+            "spp": MEASURE_SPP,
+        }
         rows.append((effect.name, task))
     log = workspace.log("effects")
     results = run_pilots([task for _, task in rows], choice, console, "measuring effects", log)

@@ -93,7 +93,7 @@ class RewardScale:
 def reward_of(kind: Reward, relative: float, probe_before: float | None, probe_after: float | None) -> float:
     """Reward of taking a view into training.
 
-    neg-loss     −L_DNRc on that view (the paper's choice), as :class:`RewardScale` measures it
+    neg-loss     −L_DNRc on that view (the paper's choice), as `RewardScale` measures it
     pos-loss     the negative of that (the paper's comparison: hard views first)
     improvement, improvement-own, improvement-all
                  relative decrease by this step of the raster loss on a fixed set of probe views, on the view itself,

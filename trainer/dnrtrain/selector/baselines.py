@@ -13,7 +13,7 @@ from .protocol import Candidates, Choice, Tick, check_budget
 class RandomPolicy:
     """Uniform without replacement."""
 
-    looks: ClassVar[bool] = False
+    needs_visibility: ClassVar[bool] = False
     effort: ClassVar[int] = 0
 
     def choose(self, candidates: Candidates, budget: int, seed: int, tick: Tick | None = None) -> Choice:
@@ -26,10 +26,10 @@ class FarthestPolicy:
     """Farthest-point sampling on camera position and viewing direction (Gonzalez 1985).
 
     The first view is random by seed; each next one maximises the distance to its nearest chosen view in the
-    space of :func:`.geometry.camera_features` (the lowest index wins ties).
+    space of `geometry.camera_features` (the lowest index wins ties).
     """
 
-    looks: ClassVar[bool] = False
+    needs_visibility: ClassVar[bool] = False
     effort: ClassVar[int] = 0
 
     def choose(self, candidates: Candidates, budget: int, seed: int, tick: Tick | None = None) -> Choice:

@@ -12,10 +12,10 @@ from .geometry import BINS, direction_bins
 from .greedy import lazy_greedy
 from .pool import choose_useful
 from .protocol import Candidates, Choice, Tick
-from .sightings import Sightings
+from .visibility import SurfaceVisibility
 
 SHARPNESS = 8.0
-"""A sighting counts for its three nearest bins of directions by exp(SHARPNESS · cosine): 40° off counts 0.15."""
+"""A cell seen from a direction counts for its three nearest bins by exp(SHARPNESS · cosine): 40° off counts 0.15."""
 NEIGHBOURS = 3
 
 
@@ -23,11 +23,11 @@ class CoveragePolicy:
     """Greedy maximisation of Σ_k sqrt(all_k · chosen_k) / Σ_k all_k.
 
     k runs over cell × bin of directions; all_k and chosen_k are the pixels that all candidates and the chosen views
-    have there, so resolution counts, and a second sighting from the same side adds 0.41 of the first. 1 is reached with
+    have there, so resolution counts, and a second view of the same side adds 0.41 of the first. 1 is reached with
     all candidates. A concave function of a sum is submodular (Lin & Bilmes 2011).
     """
 
-    looks: ClassVar[bool] = True
+    needs_visibility: ClassVar[bool] = True
     effort: ClassVar[int] = 6
 
     def choose(self, candidates: Candidates, budget: int, seed: int, tick: Tick | None = None) -> Choice:
@@ -35,42 +35,44 @@ class CoveragePolicy:
 
 
 def _choose(candidates: Candidates, budget: int, tick: Tick | None) -> Choice:
-    sightings = candidates.sightings
-    if sightings is None:
-        raise ContractError("policy 'coverage' needs the candidates' sightings (selector.sightings.read_sightings)")
-    keys, amounts = _spread_over_bins(sightings)
-    size = sightings.grid**2 * BINS
-    wanted = np.bincount(keys.ravel(), amounts.ravel(), size)
+    visibility = candidates.visibility
+    if visibility is None:
+        raise ContractError(
+            "policy 'coverage' needs the surface visibility of the candidates (see selector.visibility)"
+        )
+    bins, weights = _spread_over_bins(visibility)
+    size = visibility.grid**2 * BINS
+    targets = np.bincount(bins.ravel(), weights.ravel(), size)
     chosen = np.zeros(size)
-    scale = 1.0 / wanted.sum()
+    scale = 1.0 / targets.sum()
 
     def gain(view: int) -> float:
-        part = sightings.of(view)
-        key, amount = keys[part], amounts[part]
-        have = chosen[key]
-        return float((np.sqrt(wanted[key]) * (np.sqrt(have + amount) - np.sqrt(have))).sum()) * scale
+        part = visibility.of(view)
+        places, weight = bins[part], weights[part]
+        have = chosen[places]
+        return float((np.sqrt(targets[places]) * (np.sqrt(have + weight) - np.sqrt(have))).sum()) * scale
 
     def take(view: int) -> None:
-        part = sightings.of(view)
-        np.add.at(chosen, keys[part].ravel(), amounts[part].ravel())
+        part = visibility.of(view)
+        np.add.at(chosen, bins[part].ravel(), weights[part].ravel())
 
     views, gains = lazy_greedy(len(candidates), budget, gain, take, tick)
-    why, facts = explained(sightings, views, [f"adds {gain:.2%} coverage" for gain in gains])
+    why, facts = explained(visibility, views, [f"adds {gain:.2%} coverage" for gain in gains])
     measure = "share of coverage: surface × direction of view × pixels, square root of repeated sightings"
     return Choice(views, gains, why, {"measure": measure, "coverage": float(sum(gains)), **facts})
 
 
-def _spread_over_bins(sightings: Sightings) -> tuple[np.ndarray, np.ndarray]:
-    """Sightings -> (cell · BINS + bin int32 [E, 3], pixels float32 [E, 3]), over the nearest bins."""
+def _spread_over_bins(visibility: SurfaceVisibility) -> tuple[np.ndarray, np.ndarray]:
+    """-> (cell · BINS + bin, int32 [E, 3]; coverage weights in pixels, float32 [E, 3]) of the nearest bins."""
     axes = direction_bins().T
-    keys = np.empty((len(sightings.cells), NEIGHBOURS), np.int32)
-    amounts = np.empty((len(sightings.cells), NEIGHBOURS), np.float32)
-    for view in range(len(sightings)):
-        part = sightings.of(view)
-        cosine = sightings.toward[part] @ axes
+    bins = np.empty((len(visibility.cells), NEIGHBOURS), np.int32)
+    weights = np.empty((len(visibility.cells), NEIGHBOURS), np.float32)
+    for view in range(len(visibility)):
+        part = visibility.of(view)
+        cosine = visibility.view_directions[part] @ axes
         nearest = np.argpartition(-cosine, NEIGHBOURS, axis=1)[:, :NEIGHBOURS]
         share = np.exp(SHARPNESS * np.take_along_axis(cosine, nearest, axis=1))
         share /= share.sum(axis=1, keepdims=True)
-        keys[part] = sightings.cells[part, None] * BINS + nearest
-        amounts[part] = share * sightings.pixels[part, None]
-    return keys, amounts
+        bins[part] = visibility.cells[part, None] * BINS + nearest
+        weights[part] = share * visibility.pixels[part, None]
+    return bins, weights

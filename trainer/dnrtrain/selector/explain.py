@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .sightings import Sightings
+from .visibility import SurfaceVisibility
 
 NOT_SEEN = -2.0
 """In place of a cosine."""
@@ -25,12 +25,12 @@ class Coverage:
     angles: list[float]
 
 
-def coverage_of(sightings: Sightings, views: Sequence[int]) -> Coverage:
+def coverage_of(visibility: SurfaceVisibility, views: Sequence[int]) -> Coverage:
     """Follow a selection view by view. Everything counts as covered where no candidate sees anything."""
-    weights = sightings.pixels.astype(np.float64)
+    weights = visibility.pixels.astype(np.float64)
     total = weights.sum()
     uncovered, angles = [], []
-    for nearest in nearest_cosines(sightings, views):
+    for nearest in nearest_cosines(visibility, views):
         covered = nearest > NOT_SEEN
         share = weights[covered]
         angle = np.degrees(np.arccos(np.clip(nearest[covered], -1.0, 1.0)))
@@ -39,20 +39,20 @@ def coverage_of(sightings: Sightings, views: Sequence[int]) -> Coverage:
     return Coverage([max(0.0, value) for value in uncovered], angles)
 
 
-def nearest_cosines(sightings: Sightings, views: Sequence[int]) -> Iterator[np.ndarray]:
-    """After each view: per sighting the cosine to the nearest chosen sighting of its cell, float32 [E].
+def nearest_cosines(visibility: SurfaceVisibility, views: Sequence[int]) -> Iterator[np.ndarray]:
+    """After each view: per entry the cosine to the nearest chosen view direction of its cell, float32 [E].
 
     NOT_SEEN where no chosen view sees the cell. The array is the same one each time, changed.
     """
-    cells, toward = sightings.cells, sightings.toward
+    cells, view_directions = visibility.cells, visibility.view_directions
     nearest = np.full(len(cells), NOT_SEEN, np.float32)
     for view in views:
-        part = sightings.of(view)
-        known = np.zeros(sightings.grid**2, bool)
-        direction = np.zeros((sightings.grid**2, 3), np.float32)
+        part = visibility.of(view)
+        known = np.zeros(visibility.grid**2, bool)
+        direction = np.zeros((visibility.grid**2, 3), np.float32)
         known[cells[part]] = True
-        direction[cells[part]] = toward[part]
-        cosine = np.einsum("ek,ek->e", direction[cells], toward)
+        direction[cells[part]] = view_directions[part]
+        cosine = np.einsum("ek,ek->e", direction[cells], view_directions)
         np.maximum(nearest, np.where(known[cells], cosine, NOT_SEEN), out=nearest)
         yield nearest
 
@@ -73,11 +73,11 @@ def sentences(coverage: Coverage) -> list[str]:
     return found
 
 
-def explained(sightings: Sightings | None, views: Sequence[int], why: Sequence[str]) -> tuple[list[str], dict]:
-    """``why`` with what each view brought, and for the details what remains; as they are without sightings."""
-    if sightings is None:
+def explained(visibility: SurfaceVisibility | None, views: Sequence[int], why: Sequence[str]) -> tuple[list[str], dict]:
+    """``why`` with what each view added, and what stays uncovered, for the details. Without visibility: ``why``, {}."""
+    if visibility is None:
         return list(why), {}
-    coverage = coverage_of(sightings, views)
+    coverage = coverage_of(visibility, views)
     texts = [f"{reason}; {text}" if reason else text for reason, text in zip(why, sentences(coverage), strict=True)]
     facts = {
         "uncovered": coverage.uncovered[-1],

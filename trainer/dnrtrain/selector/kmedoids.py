@@ -16,10 +16,10 @@ from .protocol import Candidates, Choice, Tick
 class KMedoidsPolicy:
     """Minimises the mean distance from a candidate to its nearest chosen view (PAM, with FasterPAM's swaps).
 
-    Distances are those of :func:`.geometry.camera_features`. The seed changes nothing.
+    Distances are those of `geometry.camera_features`. The seed changes nothing.
     """
 
-    looks: ClassVar[bool] = True
+    needs_visibility: ClassVar[bool] = True
     effort: ClassVar[int] = 8
 
     def choose(self, candidates: Candidates, budget: int, seed: int, tick: Tick | None = None) -> Choice:
@@ -49,6 +49,6 @@ def _choose(candidates: Candidates, budget: int, tick: Tick | None) -> Choice:
     owner = problem.rows(np.array(views)).argmin(axis=0)
     near = np.bincount(owner, minlength=len(views))
     why = [f"stands for {n} candidates around it" if n > 1 else "stands for itself" for n in near]
-    why, facts = explained(candidates.sightings, views, why)
+    why, facts = explained(candidates.visibility, views, why)
     measure = "decrease of the mean distance of a candidate to its nearest chosen view (position and direction)"
     return Choice(views, gains, why, {"measure": measure, "mean_distance": problem.cost(views), **facts})

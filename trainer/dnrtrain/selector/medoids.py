@@ -47,7 +47,11 @@ def build(
 ) -> tuple[list[int], list[float]]:
     """Greedy selection in order, and by how much each view lowered the cost (BUILD of PAM, Kaufman & Rousseeuw 1990).
 
-    among: the views to choose from (default all).
+    Args:
+        problem: what is covered by what, at which distance.
+        budget: how many views are chosen.
+        among: the views to choose from; None: all.
+        tick: told of every view weighed.
     """
     views = np.arange(problem.count) if among is None else np.asarray(among)
     near = problem.nothing.copy()

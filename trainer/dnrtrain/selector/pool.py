@@ -11,11 +11,11 @@ from .protocol import Candidates, Choice, check_budget
 
 
 def choose_useful(candidates: Candidates, budget: int, choose: Callable[[Candidates, int], Choice]) -> Choice:
-    """Run ``choose`` on the candidates that are worth a choice; fill up with the others if the budget asks for more.
+    """Run ``choose`` on the useful candidates; take the others only if the budget asks for more.
 
-    ``choose`` gets the candidates in an order that depends on poses and pictures only, never on theirs in the file:
-    so a permutation of the candidates does not change the chosen set. Duplicates (the same picture; without
-    sightings the same pose) come once. Views that see nothing come last.
+    The order in which ``choose`` gets the candidates depends on poses and pictures only, so a permutation of the
+    candidates does not change the chosen set. Duplicates (the same picture; without visibility the same pose) come
+    once. Views that see nothing come last.
     """
     return complete_useful(candidates, (), budget, lambda some, _, count: choose(some, count))
 
@@ -26,9 +26,13 @@ def complete_useful(
     budget: int,
     choose: Callable[[Candidates, list[int], int], Choice],
 ) -> Choice:
-    """The views that complete ``kept`` to ``budget``, as :func:`choose_useful` chooses; a kept view's duplicates wait.
+    """The views that complete ``kept`` to ``budget``, chosen as in `choose_useful`; duplicates of kept views come last.
 
-    ``choose(some, kept, count)`` answers with ``count`` further views of ``some``.
+    Args:
+        candidates: all views.
+        kept: views that are chosen already.
+        budget: views wanted in all.
+        choose: ``choose(some, kept, count)`` answers with ``count`` further views of ``some``.
     """
     check_budget(budget, len(candidates))
     order = canonical_order(candidates)
@@ -36,7 +40,7 @@ def complete_useful(
     place = np.argsort(order)
     old = np.zeros(len(order), bool)
     old[place[np.asarray(kept, np.int64)]] = True
-    sees = np.ones(len(order), bool) if ranked.sightings is None else ranked.sightings.seen > 0
+    sees = np.ones(len(order), bool) if ranked.visibility is None else ranked.visibility.seen > 0
     first = _first_of_its_kind(ranked, old)
     useful = np.flatnonzero(sees & first)
     chosen = Choice([], [], [])
@@ -59,16 +63,16 @@ def complete_useful(
 def canonical_order(candidates: Candidates) -> np.ndarray:
     """Indices sorted by position, direction and picture; by index only where all of these are equal."""
     keys = [*candidates.positions.T, *candidates.directions.T]
-    if candidates.sightings is not None:
-        keys.append(candidates.sightings.pictures)
+    if candidates.visibility is not None:
+        keys.append(candidates.visibility.pictures)
     return np.lexsort(keys[::-1])
 
 
 def _first_of_its_kind(candidates: Candidates, old: np.ndarray) -> np.ndarray:
     """Whether each view is the first of its duplicates, bool [N]; ``old`` [N] ones are before all others."""
     first = np.zeros(len(candidates), bool)
-    if candidates.sightings is not None:
-        kinds = candidates.sightings.pictures[:, None]
+    if candidates.visibility is not None:
+        kinds = candidates.visibility.pictures[:, None]
     else:
         kinds = np.concatenate([candidates.positions, candidates.directions], axis=1)
     order = np.argsort(~old, kind="stable")

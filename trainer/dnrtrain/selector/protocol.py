@@ -11,7 +11,7 @@ import numpy as np
 from ..contract import ContractError, View
 
 if TYPE_CHECKING:
-    from .sightings import Sightings
+    from .visibility import SurfaceVisibility
 
 
 Tick = Callable[[int], object]
@@ -23,13 +23,13 @@ class Candidates:
     """N views to choose from.
 
     positions, directions: camera centres and unit viewing directions in world space, float64 [N, 3] each.
-    sightings: what each of them sees of the surface, or None where nobody looked.
-    facts: what a trained model says of each, [N, ...], for the policies that ask one; else None.
+    visibility: what each of them sees of the surface, or None where nobody looked.
+    facts: what a policy knows of each beside that, [N, ...], or None.
     """
 
     positions: np.ndarray
     directions: np.ndarray
-    sightings: Sightings | None = None
+    visibility: SurfaceVisibility | None = None
     facts: np.ndarray | None = None
 
     def __post_init__(self) -> None:
@@ -39,24 +39,26 @@ class Candidates:
                 f"camera positions of shape {np.shape(self.positions)} and directions of shape"
                 f" {np.shape(self.directions)}: must be [N, 3] both"
             )
-        if self.sightings is not None and len(self.sightings) != count:
-            raise ContractError(f"{count} cameras but sightings of {len(self.sightings)} views: must agree")
+        if self.visibility is not None and len(self.visibility) != count:
+            raise ContractError(
+                f"{count} cameras but the surface visibility of {len(self.visibility)} views: must agree"
+            )
 
     @staticmethod
-    def of_views(views: Sequence[View], sightings: Sightings | None = None) -> Candidates:
+    def of_views(views: Sequence[View], visibility: SurfaceVisibility | None = None) -> Candidates:
         """The cameras of ``views`` as candidates."""
         positions = np.stack([view.position for view in views])
         directions = np.stack([-view.matrix[:3, 2] for view in views])  # a camera looks along its -Z
-        return Candidates(positions, directions, sightings)
+        return Candidates(positions, directions, visibility)
 
     def __len__(self) -> int:
         return len(self.positions)
 
     def take(self, order: np.ndarray) -> Candidates:
         """The candidates at ``order``, in that order."""
-        sightings = None if self.sightings is None else self.sightings.take(order)
+        visibility = None if self.visibility is None else self.visibility.take(order)
         facts = None if self.facts is None else self.facts[order]
-        return Candidates(self.positions[order], self.directions[order], sightings, facts)
+        return Candidates(self.positions[order], self.directions[order], visibility, facts)
 
 
 @dataclass(frozen=True)
@@ -76,17 +78,17 @@ class Choice:
 class Policy(Protocol):
     """A policy that needs no training.
 
-    looks: whether it uses :attr:`Candidates.sightings`.
+    needs_visibility: whether it uses `Candidates.visibility`.
     effort: how often it weighs each candidate, roughly; for progress bars. 0: it is done at once.
     """
 
-    looks: ClassVar[bool]
+    needs_visibility: ClassVar[bool]
     effort: ClassVar[int]
 
     def choose(self, candidates: Candidates, budget: int, seed: int, tick: Tick | None = None) -> Choice:
         """Choose ``budget`` distinct candidates.
 
-        Raises ContractError: not 1 <= budget <= N, or it cannot do without sightings and there are none.
+        Raises ContractError: not 1 <= budget <= N, or it cannot do without visibility and there is none.
         """
         ...
 

@@ -43,7 +43,7 @@ class QNetwork(nn.Module):
         return F.adaptive_avg_pool2d(texture.detach().float(), side).contiguous()
 
     def forward(self, selected: Tensor, observation: Tensor) -> Tensor:
-        """selected: bool [N] (at least one); observation from :meth:`encode` -> values [N]."""
+        """selected: bool [N] (at least one); observation from `encode` -> values [N]."""
         weights = selected.float() / selected.sum()
         x = observation
         for layer in self.observe:

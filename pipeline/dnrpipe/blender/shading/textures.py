@@ -15,6 +15,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from dnrtrain.srgb import decode, encode
+
 from ..bundle import xmltree
 from ..findings import Findings
 from .image_files import HALF_MAX, write_colour_exr, write_png
@@ -128,14 +130,13 @@ def scale(value: Value, factor: np.ndarray | float) -> Value:
 
 
 def srgb_to_linear(x: np.ndarray) -> np.ndarray:
-    """IEC 61966-2-1 decoding."""
-    return np.where(x <= 0.04045, x / 12.92, ((np.maximum(x, 0) + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    """sRGB code values -> linear light, float32."""
+    return decode(x).astype(np.float32)
 
 
 def linear_to_srgb(x: np.ndarray) -> np.ndarray:
-    """IEC 61966-2-1 encoding."""
-    curve = 1.055 * np.maximum(x, 0.0031308) ** (1 / 2.4) - 0.055
-    return np.where(x <= 0.0031308, 12.92 * x, curve).astype(np.float32)
+    """Linear light -> sRGB code values, float32."""
+    return encode(x).astype(np.float32)
 
 
 def _decode_table(srgb: bool) -> np.ndarray:

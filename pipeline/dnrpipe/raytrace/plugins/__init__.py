@@ -1,6 +1,6 @@
 """Mitsuba plugins for what Blender has and Mitsuba has not: small Python textures and BSDFs.
 
-The bundle names them in ``scene.xml`` (types ``dnr_*``), so whoever loads a bundle calls :func:`register` after
+The bundle names them in ``scene.xml`` (types ``dnr_*``), so whoever loads a bundle calls `register` after
 ``mi.set_variant`` and before ``mi.load_file``. In jit variants Dr.Jit compiles them into the render kernel (no
 cost to speak of); ``scalar_rgb`` interprets them, some hundred times slower, so the exporters use them only where
 a material needs one. One family per file; every class is made for the variant at hand, since its bases are.

@@ -55,7 +55,7 @@ def tables(eta: float) -> tuple[np.ndarray, np.ndarray]:
 def interface_table(eta: float) -> np.ndarray:
     """Albedo of both lobes of a rough dielectric together, seen from the side where the relative index is ``eta``.
 
-    float32 [ROUGHNESSES, COSINES], laid out as :func:`tables`. The masking terms of the two directions are
+    float32 [ROUGHNESSES, COSINES], laid out as `tables`. The masking terms of the two directions are
     independent, G1(wi) G1(wo) (Walter et al. 2007), as in Mitsuba's ``roughdielectric``.
     """
     u1, u2, view = _samples()

@@ -3,7 +3,7 @@
 Notation
     wi, wo   directions of view and light, local; h their half vector; m = cos(wi)
     r        roughness, alpha = r^2 (GGX, height-correlated Smith term)
-    E, S     albedo tables of :mod:`.energy`, at (m, r); Eavg cosine-weighted mean of E over m
+    E, S     albedo tables of `energy`, at (m, r); Eavg cosine-weighted mean of E over m
     Fss      cosine-weighted mean of a lobe's Fresnel term
 
 Each lobe is scaled by 1 + Fms (1 - E) / E with Fms = Fss Eavg / (1 - Fss (1 - Eavg)): what single scattering loses

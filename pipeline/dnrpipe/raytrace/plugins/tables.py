@@ -1,4 +1,4 @@
-"""Albedo tables of :mod:`.energy` as textures over cosine and roughness."""
+"""Albedo tables of `energy` as textures over cosine and roughness."""
 
 from __future__ import annotations
 

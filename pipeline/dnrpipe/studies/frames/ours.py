@@ -20,7 +20,7 @@ from dnrtrain.exr import write_exr
 from dnrtrain.model import render_views
 
 from ...core.errors import UserError
-from ...raytrace.base import BaseRenderer
+from ...raytrace.base_renderer import BaseRenderer
 from ...raytrace.base_worker import denoised
 from ...raytrace.light_worker import read_light
 from ...raytrace.units import scaled_view

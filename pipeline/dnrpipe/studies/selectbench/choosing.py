@@ -13,18 +13,18 @@ from ...core.scene_files import split_views
 from ...core.workspace import Workspace
 
 if TYPE_CHECKING:
-    from dnrtrain.selector.sightings import Sightings
+    from dnrtrain.selector.visibility import SurfaceVisibility
 
 
 class Worker:
     """Task {"key", "workspace", "policy", "budget", "seed", "output"} -> what its file holds, see ``__call__``.
 
-    A pool's sightings are made once per process; what they took is part of every selection that looks at them, as if
-    it had made them itself.
+    A pool's visibility is made once per process; what that took is part of every selection that looks at it, as if
+    it had made it itself.
     """
 
     def __init__(self, common: dict[str, Any]) -> None:
-        self.place, self.sightings, self.spent = "", None, (0.0, 0.0)
+        self.place, self.visibility, self.spent = "", None, (0.0, 0.0)
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
         """{"views": names in order, "gains", "why", "details", "seconds", "cpu_seconds", "peak_mb"}."""
@@ -34,8 +34,8 @@ class Worker:
         views = split_views(Workspace.open(Path(task["workspace"])))["train"]
         policy = untrained(task["policy"])
         assert policy is not None  # a trained one is chosen by step 1
-        sightings, spent = self._look(task["workspace"]) if policy.looks else (None, (0.0, 0.0))
-        candidates = Candidates.of_views(views, sightings)
+        visibility, spent = self._look(task["workspace"]) if policy.needs_visibility else (None, (0.0, 0.0))
+        candidates = Candidates.of_views(views, visibility)
         wall, cpu = time.perf_counter(), time.process_time()
         choice = policy.choose(candidates, task["budget"], task["seed"])
         made = {
@@ -51,14 +51,14 @@ class Worker:
         write_json(Path(task["output"]), made)
         return made
 
-    def _look(self, place: str) -> tuple[Sightings, tuple[float, float]]:
+    def _look(self, place: str) -> tuple[SurfaceVisibility, tuple[float, float]]:
         """What the pool's candidates see, and the (wall, processor) seconds that looking took."""
-        from dnrtrain.selector.sightings import read_sightings
+        from dnrtrain.selector.visibility import read_visibility
 
-        if self.place != place or self.sightings is None:
+        if self.place != place or self.visibility is None:
             workspace = Workspace.open(Path(place))
             views = split_views(workspace)["train"]
             wall, cpu = time.perf_counter(), time.process_time()
-            self.sightings = read_sightings([workspace.passes("train", view.name) for view in views], views)
+            self.visibility = read_visibility([workspace.passes("train", view.name) for view in views], views)
             self.place, self.spent = place, (time.perf_counter() - wall, time.process_time() - cpu)
-        return self.sightings, self.spent
+        return self.visibility, self.spent

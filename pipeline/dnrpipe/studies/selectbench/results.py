@@ -64,5 +64,5 @@ def _line(
 
 
 def read_results(path: Path) -> dict[str, Any]:
-    """Results that :func:`gather` made. Raises UserError: missing, damaged or of another schema."""
+    """Results that `gather` made. Raises UserError: missing, damaged or of another schema."""
     return read_made(path, "bench-select", SCHEMA, "pools")

@@ -230,7 +230,7 @@ class Bench:
         bases: dict[str, str],
         coarse: dict[str, Any] | None,
     ) -> dict[str, Any]:
-        """The cell's task (:class:`..ablation.cells.Worker`); its key is a hash of all that decides what comes out."""
+        """The cell's task (`ablation.cells.Worker`); its key is a hash of all that decides what comes out."""
         model, step2 = settings.model.model_dump(mode="json"), settings.finetune.step2.model_dump(mode="json")
         worker_pool, data = self.worker_pool, pool.data
         used = [f"train/{name}" for name in views] + [f"test/{name}" for name in data.test]

@@ -19,7 +19,7 @@ from dnrtrain.selector.greedy import lazy_greedy
 from dnrtrain.selector.kmedoids import KMedoidsPolicy
 from dnrtrain.selector.pool import canonical_order, complete_useful
 from dnrtrain.selector.protocol import Candidates, Choice
-from dnrtrain.selector.sightings import sightings_of
+from dnrtrain.selector.visibility import visibility_of
 
 from .ensemble import Disagreement, Spread
 from .pieces import Pieces, pieces_of
@@ -62,9 +62,9 @@ def choose_actively(
         train: makes a renderer.
     """
     kind, count = KINDS[policy], KINDS[policy].models(settings)
-    sightings = sightings_of(views)
+    visibility = visibility_of(views)
     # Their places in ``views`` travel with the candidates: the pool's rules put them in another order.
-    known = Candidates(views.camera_positions, views.camera_directions, sightings, np.arange(len(views)))
+    known = Candidates(views.camera_positions, views.camera_directions, visibility, np.arange(len(views)))
     order = canonical_order(known)  # sums over all views are the same to the last bit whatever order they came in
     start, *wanted = sizes(budget, settings.rounds)
     first = KMedoidsPolicy().choose(known, start, seed)
@@ -80,7 +80,7 @@ def choose_actively(
         for gain, reason in zip(more.gains, more.why, strict=True):
             why.append(f"batch {number}: {reason or kind.WORD.format(gain)}")
         chosen, gains, left = [*chosen, *more.views], [*gains, *more.gains], more.details
-    why, facts = explained(sightings, chosen, why)
+    why, facts = explained(visibility, chosen, why)
     trained = {"models": count, "epochs": settings.epochs}
     unused = {name: left[name] for name in ("duplicates", "see_nothing") if name in left}
     details = {"measure": kind.MEASURE, "start": start, "trained": trained, "batches": batches, **unused, **facts}

@@ -8,7 +8,7 @@ a texture: q is 1 where a view that it was trained on sees the piece of surface,
     u(pixel) = mean over channels of Var over members of display RGB  +  (1 − q)²
 
 They take the view of largest u. The first view of a batch is that one; for further ones, u of a piece of surface from
-a direction that the batch has is divided by 1 + its sightings there, so that a batch is not one view many times.
+a direction that the batch has is divided by 1 + its views of it, so that a batch is not one view many times.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from dnrtrain.aggregator import Inside
 from dnrtrain.dataset import ViewSet
 from dnrtrain.model import DNR
 
-from .pieces import Pieces, Sighted, cells_of, seen_cells
+from .pieces import Observed, Pieces, cells_of, seen_cells
 from .settings import ActiveSettings
 
 
@@ -63,8 +63,8 @@ class Disagreement:
         return Spread(table)
 
 
-class Spread(Sighted):
-    """Σ over the view's pieces of what is unsure there / (1 + the batch's sightings of it)."""
+class Spread(Observed):
+    """Σ over the view's pieces of what is unsure there / (1 + the batch's views of it)."""
 
     def gain(self, pieces: Pieces) -> float:
-        return float((pieces.unsure / (1.0 + self.sighted[pieces.keys])).sum())
+        return float((pieces.unsure / (1.0 + self.observed[pieces.keys])).sum())

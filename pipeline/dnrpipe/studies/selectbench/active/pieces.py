@@ -1,6 +1,6 @@
 """What is unsure in a view's pixels, summed up over pieces of surface seen from about one direction.
 
-A piece is a cell of the atlas (`dnrtrain.selector.sightings`) from one of the bins of directions. Two pictures of one
+A piece is a cell of the atlas (`dnrtrain.selector.visibility`) from one of the bins of directions. Two pictures of one
 piece tell about the same: that is how policies that look at pixels keep from choosing alike views.
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from dnrtrain.dataset import ViewSet
 from dnrtrain.selector.geometry import BINS, direction_bins
-from dnrtrain.selector.sightings import GRID
+from dnrtrain.selector.visibility import GRID
 
 COUNT = GRID * GRID * BINS
 
@@ -45,8 +45,8 @@ def pieces_of(views: ViewSet, view: int, unsure: np.ndarray) -> Pieces:
     """The view's pieces. unsure: [P], of each pixel inside its mask."""
     maps = views.batch([view])
     inside = maps.mask[0, 0].cpu().numpy() > 0.5
-    toward = maps.view_dir[0].cpu().numpy()[:, inside]
-    bins = (direction_bins() @ toward).argmax(axis=0)
+    view_directions = maps.view_dir[0].cpu().numpy()[:, inside]
+    bins = (direction_bins() @ view_directions).argmax(axis=0)
     keys, place = np.unique(cells_of(views, view) * BINS + bins, return_inverse=True)
     share = 1.0 / inside.size
     return Pieces(
@@ -64,8 +64,8 @@ def seen_cells(views: ViewSet, some: Iterable[int]) -> np.ndarray:
     return seen
 
 
-class Sighted:
-    """How often the views taken so far sight each piece; 1 is a sighting with the mean number of pixels."""
+class Observed:
+    """How often the views taken so far show each piece; 1 is a view of it with the mean number of pixels."""
 
     def __init__(self, table: list[Pieces]) -> None:
         pixels, number = np.zeros(COUNT), np.zeros(COUNT)
@@ -73,12 +73,12 @@ class Sighted:
             pixels[one.keys] += one.pixels
             number[one.keys] += 1.0
         self.usual = np.where(number > 0, pixels / np.maximum(number, 1.0), 1.0)
-        self.sighted = np.zeros(COUNT)
+        self.observed = np.zeros(COUNT)
 
-    def sightings(self, pieces: Pieces) -> np.ndarray:
+    def observations(self, pieces: Pieces) -> np.ndarray:
         """Of one view: [E]."""
         return pieces.pixels / self.usual[pieces.keys]
 
     def take(self, pieces: Pieces) -> None:
         """Count a view."""
-        self.sighted[pieces.keys] += self.sightings(pieces)
+        self.observed[pieces.keys] += self.observations(pieces)

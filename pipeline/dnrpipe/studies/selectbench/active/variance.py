@@ -11,7 +11,7 @@ the view direction and its colour. The renderer's own weights do not follow the 
 it errs most (Seitzer et al. 2022).
 
 A piece of surface from a direction starts at the mean β² of the candidates' pixels that show it. Observations are as
-unsure as the prediction, so precisions add up to β² / (1 + s) after s usual sightings; and the expected reduction is
+unsure as the prediction, so precisions add up to β² / (1 + s) after s usual views of it; and the expected reduction is
 counted on the pixels of *all* candidates. Where no view of the training sees the surface the head knows nothing:
 β² is UNKNOWN there.
 """
@@ -31,7 +31,7 @@ from dnrtrain.renderer import SLOPE
 from dnrtrain.schedule import adam, guarded_step, learning_rate, require_target
 from dnrtrain.textures import spherical_harmonics
 
-from .pieces import COUNT, Pieces, Sighted, cells_of, seen_cells
+from .pieces import COUNT, Observed, Pieces, cells_of, seen_cells
 from .settings import ActiveSettings
 
 HIDDEN = 32
@@ -143,8 +143,8 @@ class PredictedVariance:
         return Reduction(table)
 
 
-class Reduction(Sighted):
-    """Σ over pieces of the variance that all candidates have there · (1/(1 + s) − 1/(1 + s + the view's sightings))."""
+class Reduction(Observed):
+    """Σ over pieces of the variance that all candidates have there · (1/(1 + s) − 1/(1 + s + the view's own))."""
 
     def __init__(self, table: list[Pieces]) -> None:
         super().__init__(table)
@@ -154,6 +154,6 @@ class Reduction(Sighted):
         self.variance /= max(1e-12, sum(float(one.pixels.sum()) for one in table))
 
     def gain(self, pieces: Pieces) -> float:
-        before = 1.0 + self.sighted[pieces.keys]
-        after = before + self.sightings(pieces)
+        before = 1.0 + self.observed[pieces.keys]
+        after = before + self.observations(pieces)
         return float((self.variance[pieces.keys] * (1.0 / before - 1.0 / after)).sum())

@@ -1,6 +1,6 @@
 """A readable twin of the texture half of the DNR: plain numpy loops, same weights, same numbers.
 
-What :mod:`dnrtrain.textures`, :mod:`dnrtrain.aggregator` (strategy ``concat``) and the composition compute
+What `dnrtrain.textures`, `dnrtrain.aggregator` (strategy ``concat``) and the composition compute
 fast, written once more the way the papers say it, one pixel at a time. For reading and for tests; slow.
 """
 

@@ -1,7 +1,7 @@
 """What each candidate sees of the surface, from its G-buffer: sparse, made view by view.
 
-The surface is the scene's atlas, cut into a grid of cells. A view's *sighting* of a cell is how many of its pixels
-fall there and from which mean direction they look. A cell covers a fixed piece of surface, so pixels per cell are
+The surface is the scene's atlas, cut into a grid of cells. What a view sees of a cell is how many of its pixels
+fall there and their mean view direction. A cell covers a fixed piece of surface, so pixels per cell are
 the resolution at which the view samples it: near, facing, unoccluded views have many.
 """
 
@@ -28,23 +28,23 @@ CHANNELS = ("uv.U", "uv.V", "mask")
 
 
 @dataclass(frozen=True)
-class Sightings:
-    """Sightings of N views, those of view i at ``start[i]:start[i + 1]``; cells ascend within a view.
+class SurfaceVisibility:
+    """What N views see: a table of E entries, those of view i at ``start[i]:start[i + 1]``; cells ascend within a view.
 
-    grid      cells per side of the atlas; cell = row · grid + column, column by U and row by V
-    start     int64 [N + 1]
-    cells     int32 [E]
-    pixels    float32 [E] pixels that fall on the cell, as a share of the view's pixels
-    toward    float32 [E, 3] unit world-space direction from the surface to the camera, mean over those pixels
-    seen      float32 [N] share of the view's pixels that hit a surface
-    pictures  uint64 [N] hash of what is seen in which pixel: equal for duplicates
+    grid             cells per side of the atlas; cell = row · grid + column, column by U and row by V
+    start            int64 [N + 1]
+    cells            int32 [E]
+    pixels           float32 [E] pixels that fall on the cell, as a share of the view's pixels
+    view_directions  float32 [E, 3] unit world-space direction from the surface to the camera, mean over those pixels
+    seen             float32 [N] share of the view's pixels that hit a surface
+    pictures         uint64 [N] hash of what is seen in which pixel: equal for duplicates
     """
 
     grid: int
     start: np.ndarray
     cells: np.ndarray
     pixels: np.ndarray
-    toward: np.ndarray
+    view_directions: np.ndarray
     seen: np.ndarray
     pictures: np.ndarray
 
@@ -52,46 +52,46 @@ class Sightings:
         return len(self.seen)
 
     def of(self, view: int) -> slice:
-        """Where the view's sightings lie."""
+        """Where the view's cells lie."""
         return slice(int(self.start[view]), int(self.start[view + 1]))
 
-    def take(self, order: np.ndarray) -> Sightings:
+    def take(self, order: np.ndarray) -> SurfaceVisibility:
         """The views at ``order``, in that order."""
         counts = np.diff(self.start)[order]
         start = np.concatenate([[0], np.cumsum(counts)])
         where = np.arange(start[-1]) + np.repeat(self.start[:-1][order] - start[:-1], counts)
-        return Sightings(
+        return SurfaceVisibility(
             self.grid,
             start,
             self.cells[where],
             self.pixels[where],
-            self.toward[where],
+            self.view_directions[where],
             self.seen[order],
             self.pictures[order],
         )
 
 
 @dataclass(frozen=True)
-class Sighting:
-    """One view's part of :class:`Sightings`."""
+class ViewVisibility:
+    """One view's part of `SurfaceVisibility`."""
 
     cells: np.ndarray
     pixels: np.ndarray
-    toward: np.ndarray
+    view_directions: np.ndarray
     seen: float
     picture: int
 
 
-def read_sightings(
+def read_visibility(
     files: Sequence[Path], views: Sequence[View], *, grid: int = GRID, tick: Callable[[], None] | None = None
-) -> Sightings:
+) -> SurfaceVisibility:
     """Look at the pass files of ``views``, one file in memory at a time. ``tick`` is called after each.
 
     Raises ContractError: counts differ, or a file is missing, damaged, of another size, or lacks channels.
     """
     from ..exr import read_exr
 
-    def look() -> Iterable[Sighting]:
+    def look() -> Iterable[ViewVisibility]:
         for file, view in zip(files, views, strict=True):
             channels, _ = read_exr(file)
             require_channels(file, channels, CHANNELS)
@@ -110,38 +110,39 @@ def read_sightings(
     return collect(look(), grid)
 
 
-def collect(looks: Iterable[Sighting], grid: int = GRID) -> Sightings:
-    """Sightings of views one after the other as one table."""
+def collect(looks: Iterable[ViewVisibility], grid: int = GRID) -> SurfaceVisibility:
+    """Views one after the other as one table."""
     every = list(looks)
     counts = [len(one.cells) for one in every]
-    return Sightings(
+    return SurfaceVisibility(
         grid,
         np.concatenate([[0], np.cumsum(counts, dtype=np.int64)]).astype(np.int64),
         np.concatenate([np.zeros(0, np.int32), *(one.cells for one in every)]),
         np.concatenate([np.zeros(0, np.float32), *(one.pixels for one in every)]),
-        np.concatenate([np.zeros((0, 3), np.float32), *(one.toward for one in every)]),
+        np.concatenate([np.zeros((0, 3), np.float32), *(one.view_directions for one in every)]),
         np.array([one.seen for one in every], np.float32),
         np.array([one.picture for one in every], np.uint64),
     )
 
 
-def look_at(channels: dict[str, np.ndarray], view: View, grid: int = GRID) -> Sighting:
-    """One view's sightings. channels: those of its pass file, [H, W] each."""
+def look_at(channels: dict[str, np.ndarray], view: View, grid: int = GRID) -> ViewVisibility:
+    """What one view sees. channels: those of its pass file, [H, W] each."""
     return _look(channels, -view.ray_directions(), grid)
 
 
-def sightings_of(views: ViewSet, grid: int = GRID) -> Sightings:
-    """Sightings of views in memory."""
+def visibility_of(views: ViewSet, grid: int = GRID) -> SurfaceVisibility:
+    """What views in memory see."""
     maps = views.tensors
     u, v = (0.5 * maps.uv[:, k].cpu().numpy() + 0.5 for k in range(2))
-    mask, toward = maps.mask[:, 0].cpu().numpy(), maps.view_dir.permute(0, 2, 3, 1).cpu().numpy()
+    mask, view_directions = maps.mask[:, 0].cpu().numpy(), maps.view_dir.permute(0, 2, 3, 1).cpu().numpy()
     return collect(
-        (_look({"uv.U": u[i], "uv.V": v[i], "mask": mask[i]}, toward[i], grid) for i in range(len(views))), grid
+        (_look({"uv.U": u[i], "uv.V": v[i], "mask": mask[i]}, view_directions[i], grid) for i in range(len(views))),
+        grid,
     )
 
 
-def _look(channels: dict[str, np.ndarray], toward: np.ndarray, grid: int) -> Sighting:
-    """One view's sightings. toward: unit vectors from the surface to the camera, world space, [H, W, 3]."""
+def _look(channels: dict[str, np.ndarray], view_directions: np.ndarray, grid: int) -> ViewVisibility:
+    """What one view sees. view_directions: unit vectors from the surface to the camera, world space, [H, W, 3]."""
     height, width = channels["mask"].shape
     step = max(1, min(height, width) // LOOK_SIDE)
     part = (slice(step // 2, None, step), slice(step // 2, None, step))
@@ -149,13 +150,13 @@ def _look(channels: dict[str, np.ndarray], toward: np.ndarray, grid: int) -> Sig
     u, v = (channels[name][part][mask] for name in ("uv.U", "uv.V"))
     column, row = (np.clip((value * grid).astype(np.int32), 0, grid - 1) for value in (u, v))
     cells, place = np.unique(row * grid + column, return_inverse=True)
-    toward = toward[part][mask]
-    sums = np.stack([np.bincount(place, toward[:, k], len(cells)) for k in range(3)], axis=1)
+    view_directions = view_directions[part][mask]
+    sums = np.stack([np.bincount(place, view_directions[:, k], len(cells)) for k in range(3)], axis=1)
     length = np.linalg.norm(sums, axis=1, keepdims=True)
     counts = np.bincount(place, minlength=len(cells))
     digest = hashlib.blake2b(np.packbits(mask).tobytes(), digest_size=8)
     digest.update(np.stack([u, v]).tobytes())
-    return Sighting(
+    return ViewVisibility(
         cells.astype(np.int32),
         (counts / mask.size).astype(np.float32),
         (sums / np.maximum(length, 1e-12)).astype(np.float32),

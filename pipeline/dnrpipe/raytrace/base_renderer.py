@@ -1,0 +1,135 @@
+"""Base images: what a view looks like by baked light and mirror-like paths alone, without noise and in milliseconds.
+
+Notation
+    E        light map (see `lightmap`), rho the diffuse reflectance of the point at hand
+    S        what a rough lobe sees of other surfaces (see `lightmap`): its directions end at emitters
+    path     follows the non-diffuse lobes: mirror reflection, refraction, glossy lobes, cut-outs (`specular_paths`)
+    chain    a path from its second vertex on, to the first surface with a diffuse lobe
+    sample   one of K rays through a pixel; the same K places in every pixel, so that nothing flickers
+
+    base     = mean over samples of the sum over the path's vertices of throughput (emission + rho E), and of S where
+               the path ends at a rough lobe
+    diffuse  = the first vertex's share of it
+
+The numbers that choose directions come from a fixed low-discrepancy sequence, which repeats over tiles of TILE² pixels.
+Emitter sampling serves a path's first glossy vertex; multiple importance sampling joins it with hits of emitters.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .finite import masked_channels
+from .recorded import Recorded, prepare_emitters
+from .sequence import GOLDEN, ORDER, TILE, fraction
+
+MAX_RAYS = 1 << 24
+"""Of a launch: bounds its memory (about 4 GiB). Larger pictures are rendered in bands of rows."""
+MEANS = (
+    *("base.R", "base.G", "base.B", "base.A", "diffuse.R", "diffuse.G", "diffuse.B"),
+    *("albedo.R", "albedo.G", "albedo.B"),
+)
+CENTRES = (
+    *("chain.U", "chain.V", "chain.mask", "chain.weight"),
+    *("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z", "mask"),
+)
+LOST = "lost"
+"""Whether a part of the sample was not finite and is left out; of a pixel, the share of such samples."""
+GBUFFER = ("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z")
+
+
+class BaseRenderer:
+    """Renders base images of one scene.
+
+    Args:
+        mi: the mitsuba module, a jit variant set.
+        scene: the scene.
+        light: E and S of the front and of the back, float32 [2, 2, size, size, 3], row 0 at V = 0.
+        samples: K, rays per pixel.
+
+    Of the last frame: ``repaired`` pixels had samples with parts that were not finite and are left out; ``masked``
+    pixels were not finite all the same, and are 0.
+    """
+
+    def __init__(self, mi: Any, scene: Any, light: np.ndarray, samples: int) -> None:
+        import drjit as dr
+
+        from .specular_paths import SpecularPaths  # imports Mitsuba
+
+        self.mi, self.scene, self.samples = mi, scene, samples
+        self.repaired = self.masked = 0
+        sides = [np.concatenate([light[0, i], light[1, i]], axis=-1) for i in range(2)]
+        self.light = [mi.Texture2f(mi.TensorXf(side), wrap_mode=dr.WrapMode.Clamp) for side in sides]
+        self.paths = SpecularPaths(scene, samples)
+        self.tables = mi.UInt32(ORDER.ravel()), self.paths.steps
+        prepare_emitters(mi, scene)
+        # Recorded at the first call: tracing the plugins anew would take longer than the frame itself.
+        self.kernel = Recorded(self._kernel)
+
+    def frame(self, view: Any) -> dict[str, np.ndarray]:
+        """Channels of BASE_CHANNELS and of the G-buffer: float32 [H, W] each, linear Rec.709, premultiplied.
+
+        view: in the bundle's units, as is ``depth.Z``. ``coverage`` is base.A, at most 1. Where cut-outs stand one
+        behind the other, base.A can be above 1 as the colours are: each surface adds its opaque share.
+        """
+        import drjit as dr
+
+        mi, m = self.mi, view.matrix
+        axes = [mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in m[:3, i])) for i in range(4)]
+        film = [dr.opaque(mi.Float, float(v)) for v in (view.fl_x, view.fl_y, view.cx, view.cy)]
+        names = (LOST, *MEANS, *CENTRES)
+        rows = max(1, min(view.height, MAX_RAYS // (view.width * self.samples)))
+        bands: list[list[np.ndarray]] = []
+        for first in range(0, view.height, rows):
+            start, count = dr.opaque(mi.UInt32, first), min(rows, view.height - first)
+            values = self.kernel(self.scene, self.light, self.tables, axes, film, start, view.width, count)
+            dr.eval(values)
+            bands.append([np.array(value) for value in values])
+        shape = (view.height, view.width)
+        channels = {
+            name: (parts[0] if len(parts) == 1 else np.concatenate(parts)).reshape(shape)
+            for name, parts in zip(names, zip(*bands, strict=True), strict=True)
+        }
+        self.repaired = int(np.count_nonzero(channels.pop(LOST)))
+        channels, self.masked = masked_channels(channels)
+        for name in GBUFFER:
+            channels[name] = channels[name] * channels["mask"]
+        return channels | {"coverage": np.minimum(channels["base.A"], 1)}
+
+    def _kernel(
+        self, scene: Any, light: Any, tables: Any, axes: Any, film: Any, start: Any, width: int, height: int
+    ) -> list[Any]:
+        """Values [height * width] of LOST, MEANS and CENTRES. Recorded once, replayed for every view of that size.
+
+        A pixel's samples lie side by side; the first goes through the pixel's centre.
+
+        Args:
+            scene: the scene.
+            light: E and S, a texture of six channels for the front and one for the back.
+            tables: places within a tile, steps of the random numbers.
+            axes: the camera's axes and its place, columns of c2w.
+            film: fl_x, fl_y, cx, cy in pixels.
+            start: the first row.
+            width, height: the size of the band.
+        """
+        import drjit as dr
+
+        mi, samples = self.mi, self.samples
+        index = dr.arange(mi.UInt32, width * height * samples)
+        pixel, sample = index // samples, index % samples
+        x, y = pixel % width, start + pixel // width
+        tile = dr.gather(mi.UInt32, tables[0], (y % TILE) * TILE + x % TILE)
+        number, place = mi.Float(sample * (TILE * TILE) + tile), mi.Float(sample)
+        right = mi.Float(x) + fraction(0.5 + place * GOLDEN[0]) - film[2]
+        down = mi.Float(y) + fraction(0.5 + place * GOLDEN[1]) - film[3]
+        direction = axes[0] * (right / film[0]) - axes[1] * (down / film[1]) - axes[2]
+        ray = mi.Ray3f(mi.Point3f(axes[3]), dr.normalize(direction))
+        values = self.paths.trace(scene, light, tables[1], ray, -axes[2], number)
+        if samples == 1:
+            return values
+        dr.eval(values)  # together: each sum alone would run it all again
+        means = [dr.block_sum(value, samples) / samples for value in values[: 1 + len(MEANS)]]
+        first = dr.arange(mi.UInt32, width * height) * samples
+        return [*means, *(dr.gather(mi.Float, value, first) for value in values[1 + len(MEANS) :])]

@@ -1,0 +1,278 @@
+"""Paths of base images: camera rays that follow mirrors, glass, glossy lobes and cut-outs, without noise.
+
+For the notation see `base_renderer`. What a scene has none of (media, glass, rough metal, ...) leaves no code in its
+kernel. Imports Mitsuba at the top: import this module where a variant is set.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from .frames_rays import lets_through
+from .lobes import (
+    bsdfs_of,
+    context_of,
+    diffuse_context,
+    ignores_context,
+    is_among,
+    is_rough,
+    mirrors_and_refracts,
+    reflectance,
+    specular_context,
+)
+from .paths import power_heuristic
+from .sequence import TILE, fraction, steps
+from .texels import ATTRIBUTE
+from .visibility import LAMP_PREFIX, UNSEEN_PREFIX, is_one_of
+
+MAX_VERTICES = 8
+NUMBERS = 5
+"""Random numbers per vertex: two for the direction, one for the lobe, two for the emitter."""
+MIRRORED = 0.25
+"""Share of the samples that the first glass reflects. By Fresnel's share, a lamp in the water would be a few specks."""
+LEAST_THROUGHPUT = 1e-3
+LEAST_RHO = 0.05
+"""Diffuse reflectance from which a surface ends a chain."""
+
+
+class SpecularPaths:
+    """Follows the specular paths of one scene.
+
+    Args:
+        scene: a scene of the current variant (jit variants only).
+        samples: rays per pixel.
+    """
+
+    def __init__(self, scene: Any, samples: int) -> None:
+        self.samples = samples
+        self.steps = mi.Float(steps(NUMBERS * (MAX_VERTICES + 1)))
+        self.hidden = [s for s in scene.shapes() if s.id().startswith((LAMP_PREFIX, UNSEEN_PREFIX))]
+        self.has_emitters = bool(scene.emitters())
+        self.has_media = any(shape.is_medium_transition() for shape in scene.shapes())
+        self.has_holes = lets_through(mi, scene)
+        bsdfs = bsdfs_of(scene)
+        flags = [bsdf.flags() for bsdf in bsdfs]
+        self.unsplit = [bsdf for bsdf in bsdfs if ignores_context(bsdf)]
+        self.has_unsplit_holes = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in self.unsplit)
+        self.translucent = bool(self.unsplit) or any(mi.has_flag(f, mi.BSDFFlags.DiffuseTransmission) for f in flags)
+        self.has_glossy = any(mi.has_flag(f, mi.BSDFFlags.GlossyReflection) for f in flags)
+        self.has_glass = any(mirrors_and_refracts(mi, f) for f in flags)
+
+        kinds = mi.BSDFFlags
+        self.diffuse = diffuse_context(mi)
+        self.not_diffuse = context_of(mi, int(kinds.All) & ~int(kinds.Diffuse))
+        self.specular = specular_context(mi)
+        self.glossy = context_of(mi, kinds.Glossy)
+        self.null = context_of(mi, kinds.Null)
+        self.mirrored = context_of(mi, kinds.DeltaReflection, kinds.GlossyReflection)
+        self.refracted = context_of(mi, kinds.DeltaTransmission, kinds.GlossyTransmission)
+
+    @dr.syntax
+    def trace(self, scene: Any, light: Any, steps: Any, ray: Any, forward: Any, number: Any) -> list[Any]:
+        """One sample along each ray -> the values that `base_renderer` names by LOST, MEANS and CENTRES, in that order.
+
+        Args:
+            scene: the scene.
+            light: E and S of the front and of the back, two textures of six channels.
+            steps: of the random numbers, ``self.steps``.
+            ray: camera rays.
+            forward: where the camera looks, in world space.
+            number: the samples' places in the sequence.
+        """
+        origin = mi.Point3f(ray.o)
+        every = number >= 0
+
+        # ------------------------------ The path ------------------------------
+        active = mi.Bool(every)
+        ray = mi.Ray3f(ray)
+        throughput = mi.Spectrum(1.0)
+        medium = dr.zeros(mi.MediumPtr, dr.width(number))
+        vertex = mi.UInt32(0)
+        straight = mi.Bool(every)  # nothing has turned the ray yet
+        unforked = mi.Bool(every)  # no glass yet
+        prev_rough = mi.Bool(False)  # S said what the lobe before sees of surfaces: only emitters count
+
+        # ------------------- Multiple importance sampling ---------------------
+        prev_si = dr.zeros(mi.SurfaceInteraction3f)
+        prev_pdf = mi.Float(1.0)
+        prev_sampled = mi.Bool(False)  # emitters were sampled from prev_si
+        emitters_sampled = mi.Bool(False)  # they were at any vertex
+
+        # ------------------------------ The sample ----------------------------
+        radiance, diffuse, albedo = mi.Spectrum(0.0), mi.Spectrum(0.0), mi.Spectrum(0.0)
+        opacity, lost = mi.Float(0.0), mi.Bool(False)
+        normal, uv, depth, covered = mi.Vector3f(0.0), mi.Point2f(0.0), mi.Float(0.0), mi.Bool(False)
+        chain_uv, chain_weight, chain_ended = mi.Point2f(0.0), mi.Float(0.0), mi.Bool(False)
+
+        while dr.hint(active, label="Specular paths"):
+            si = scene.ray_intersect(ray, mi.RayFlags.All, True, active)
+            bsdf = si.bsdf()
+            u = self._random_numbers(steps, number, vertex)
+            passed = active & straight & self._is_hidden(si)
+            going = active & ~passed
+            throughput *= self._transmittance(medium, ray, si, going)
+
+            # ------------------------ Light that is hit -----------------------
+            shows = going & (si.is_valid() | ~straight)
+            emission, mis = self._emission(scene, si, prev_si, prev_pdf, prev_sampled, shows)
+            here = dr.select(shows, throughput * mis * emission, 0)
+
+            # --------------------------- Baked light --------------------------
+            met = going & ~prev_rough & si.is_valid()
+            rho = dr.select(met, reflectance(mi, bsdf, self.diffuse, si, met, self.translucent), 0)
+            baked, around, place = self._baked(light, si, met)
+            here += dr.select(met, throughput * rho * baked, 0)
+            radiance += here
+
+            # ------------------- What the camera sees first -------------------
+            first = straight & met
+            diffuse += dr.select(straight, here, 0)
+            albedo += dr.select(first, throughput * rho, 0)
+            opacity += self._opacity(bsdf, si, first)
+            normal = dr.select(first, mi.Vector3f(dr.select(si.wi.z < 0, -si.sh_frame.n, si.sh_frame.n)), normal)
+            uv = dr.select(first, place, uv)
+            depth = dr.select(first, dr.dot(si.p - origin, forward), depth)
+
+            # ---------------------- Where the chain ends ----------------------
+            ends = met & ~straight & ~chain_ended & (dr.mean(rho) > LEAST_RHO)
+            chain_uv = dr.select(ends, place, chain_uv)
+            chain_weight = dr.select(ends, dr.mean(throughput), chain_weight)
+            chain_ended |= ends
+
+            # ------------------ Emitters through glossy lobes -----------------
+            # Once a path: measured, further vertices cost more than they bring.
+            onwards = met & ~is_among(mi, bsdf, self.unsplit)
+            rough = self._is_rough(bsdf, si, onwards)
+            glossy = onwards & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) & (~emitters_sampled | rough)
+            direct = self._direct(scene, bsdf, si, throughput, u, glossy)
+            fine = dr.all(dr.isfinite(direct))
+            radiance += dr.select(fine, direct, 0)
+            lost |= ~fine
+
+            # ---------------------- The mirror-like rest ----------------------
+            bsdf_sample, bsdf_weight, onwards, forked = self._sample(bsdf, si, number, u, met, onwards, unforked)
+            null = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Null)
+            delta = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
+            throughput = dr.select(onwards, throughput * bsdf_weight, throughput)
+            fine = dr.all(dr.isfinite(throughput))
+            throughput = dr.select(fine, throughput, 0)
+            lost |= ~fine & (bsdf_sample.pdf > 0)
+            radiance += dr.select(rough, throughput * around, 0)
+
+            # ------------------------- The next vertex ------------------------
+            alive = onwards & (bsdf_sample.pdf > 0) & (dr.max(throughput) > LEAST_THROUGHPUT)
+            covered |= met & ~(null & alive)
+            next_ray = si.spawn_ray(dr.select(passed, ray.d, si.to_world(bsdf_sample.wo)))
+            medium = self._next_medium(medium, si, bsdf_sample, next_ray, onwards)
+            ray = dr.select(passed | onwards, next_ray, ray)
+            prev_si = dr.select(onwards & ~null, si, prev_si)
+            prev_pdf = dr.select(null, prev_pdf, bsdf_sample.pdf)
+            prev_sampled = dr.select(null, prev_sampled, glossy & ~delta)
+            emitters_sampled |= glossy & ~null
+            prev_rough = rough
+            straight &= passed | (null & onwards)
+            unforked &= ~forked
+            active = passed | (alive & (vertex < MAX_VERTICES))
+            vertex += 1
+
+        lost, chain_ended, covered = (dr.select(where, mi.Float(1), 0) for where in (lost, chain_ended, covered))
+        means = [*radiance, opacity, *diffuse, *albedo]
+        return [lost, *means, *chain_uv, chain_ended, chain_weight, *normal, *uv, depth, covered]
+
+    def _random_numbers(self, steps: Any, number: Any, vertex: Any) -> list[Any]:
+        """NUMBERS numbers in [0, 1)."""
+        rows = [dr.gather(mi.Float, steps, vertex * NUMBERS + dimension) for dimension in range(NUMBERS)]
+        return [fraction(0.5 + number * step) for step in rows]
+
+    def _is_hidden(self, si: Any) -> Any:
+        """Whether the camera looks through what is hit: lamps and unseen shapes."""
+        return is_one_of(mi, si, self.hidden) if self.hidden else mi.Bool(False)
+
+    def _transmittance(self, medium: Any, ray: Any, si: Any, active: Any) -> Any:
+        """What ``medium`` lets through of the light along the ray's segment; what it scatters counts as passed."""
+        if not self.has_media:
+            return mi.Spectrum(1.0)
+        inside = active & si.is_valid() & (medium != dr.zeros(mi.MediumPtr))
+        middle = dr.zeros(mi.MediumInteraction3f)
+        middle.p = ray(0.5 * si.t)
+        scattered, _, extinction = medium.get_scattering_coefficients(middle, inside)
+        return dr.select(inside, dr.exp((scattered - extinction) * si.t), 1)
+
+    def _next_medium(self, medium: Any, si: Any, bsdf_sample: Any, next_ray: Any, active: Any) -> Any:
+        """The medium behind the surface where the path crosses it."""
+        if not self.has_media:
+            return medium
+        crossed = active & si.is_medium_transition() & (si.wi.z * bsdf_sample.wo.z < 0)
+        return dr.select(crossed, si.target_medium(next_ray.d), medium)
+
+    def _emission(self, scene: Any, si: Any, prev_si: Any, prev_pdf: Any, sampled: Any, active: Any) -> tuple[Any, Any]:
+        """(light of the emitter that is hit, its weight). sampled: emitters were sampled at the vertex before, too."""
+        if not self.has_emitters:
+            return mi.Spectrum(0.0), mi.Float(1.0)
+        source = mi.DirectionSample3f(scene, si, prev_si)
+        emitter_pdf = scene.pdf_emitter_direction(prev_si, source, active & sampled)
+        mis = dr.select(sampled, power_heuristic(prev_pdf, emitter_pdf), 1)
+        return source.emitter.eval(si, active), mis
+
+    def _baked(self, light: Any, si: Any, active: Any) -> tuple[Any, Any, Any]:
+        """(E, S, atlas coordinates) at the surface point, on the side that is seen."""
+        place = si.shape.eval_attribute_3(ATTRIBUTE, si, active & si.shape.has_attribute(ATTRIBUTE, active))
+        front = dr.dot(si.n, si.to_world(si.wi)) >= 0
+        uv = mi.Point2f(place.x, place.y)
+        found = [dr.select(front, *pair) for pair in zip(*(texture.eval(uv, active) for texture in light), strict=True)]
+        return mi.Spectrum(*found[:3]), mi.Spectrum(*found[3:]), uv
+
+    def _opacity(self, bsdf: Any, si: Any, active: Any) -> Any:
+        """Share of a surface's light that does not pass straight on; what the surface adds has the same weight."""
+        if not self.has_holes:
+            return dr.select(active, mi.Float(1), 0)
+        return dr.select(active, 1 - dr.mean(bsdf.eval_null_transmission(si, active)), 0)
+
+    def _is_rough(self, bsdf: Any, si: Any, active: Any) -> Any:
+        """Whether the lobe is so wide that S says what it sees."""
+        return is_rough(mi, bsdf, self.specular, si, active) if self.has_glossy else mi.Bool(False)
+
+    def _direct(self, scene: Any, bsdf: Any, si: Any, throughput: Any, u: list[Any], active: Any) -> Any:
+        """Light of one emitter that the glossy lobes send back."""
+        if not self.has_emitters:
+            return mi.Spectrum(0.0)
+        source, emitted = scene.sample_emitter_direction(si, mi.Point2f(u[3], u[4]), True, active)
+        active = active & (source.pdf > 0)
+        value, bsdf_pdf = bsdf.eval_pdf(self.glossy, si, si.to_local(source.d), active)
+        mis = dr.select(source.delta, 1, power_heuristic(source.pdf, bsdf_pdf))
+        return dr.select(active, throughput * value * emitted * mis, 0)
+
+    def _sample(
+        self, bsdf: Any, si: Any, number: Any, u: list[Any], met: Any, active: Any, unforked: Any
+    ) -> tuple[Any, Any, Any, Any]:
+        """Where the paths go on -> (BSDF sample, its weight, which paths go on, which were split by glass).
+
+        Args:
+            bsdf, si: the surfaces.
+            number: the samples' places in the sequence.
+            u: random numbers.
+            met: paths that are at a surface.
+            active: those of them whose BSDF splits into lobes.
+            unforked: paths that have met no glass yet.
+        """
+        direction = mi.Point2f(u[0], u[1])
+        bsdf_sample, bsdf_weight = bsdf.sample(self.not_diffuse, si, u[2], direction, active)
+        forked = mi.Bool(False)
+        if self.has_glass:
+            forked = active & unforked & mirrors_and_refracts(mi, bsdf.flags())
+            mirrored, mirrored_weight = bsdf.sample(self.mirrored, si, u[2], direction, forked)
+            refracted, refracted_weight = bsdf.sample(self.refracted, si, u[2], direction, forked)
+            mirrors = (number + 0.5) / (self.samples * TILE * TILE) >= 1 - MIRRORED
+            side = dr.select(mirrors, mirrored, refracted)
+            weight = dr.select(mirrors, mirrored_weight / MIRRORED, refracted_weight / (1 - MIRRORED))
+            bsdf_sample, bsdf_weight = dr.select(forked, side, bsdf_sample), dr.select(forked, weight, bsdf_weight)
+        if self.has_unsplit_holes:
+            passing = met & ~active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
+            through, weight = bsdf.sample(self.null, si, u[2], direction, passing)
+            passing &= u[3] < dr.max(weight)
+            bsdf_sample, bsdf_weight = dr.select(passing, through, bsdf_sample), dr.select(passing, 1, bsdf_weight)
+            active = active | passing
+        return bsdf_sample, bsdf_weight, active, forked
