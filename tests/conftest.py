@@ -23,13 +23,13 @@ ALONE = ("test_queue.py",)
 LONG = (
     "tests/e2e/test_demo.py",
     "tests/e2e/test_pipeline.py",
-    "tests/test_bench_select.py",
     "tests/service/",
+    "tests/test_bench_select.py",
+    "tests/test_export.py",
     "tests/test_planning.py",
-    "tests/test_frontier.py",
     "tests/e2e/test_damage.py",
+    "tests/test_frontier.py",
     "tests/e2e/test_targets.py",
-    "tests/test_ablation.py",
 )
 """What takes longest begins first, so that no process is left with it when the others have ended."""
 
