@@ -262,6 +262,7 @@ def test_a_second_run_does_nothing_and_a_lost_cell_is_made_again_the_same(smoke:
 
 
 @pytest.mark.slow
+@pytest.mark.robustness
 def test_rows_train_about_the_seconds_asked_for(smoke: tuple[Path, dict[str, Any]]) -> None:
     out, answer = smoke
     done = ablate(out, "--rows", "vanilla,paper", "--seconds", "4")
