@@ -37,7 +37,8 @@ def test_evaluation_is_booked_apart(tiny: Path) -> None:
     records = Ledger(tiny / "costs.jsonl").read()
     assert {r.purpose for r in records if r.stage in ("select", "raytrace")} == {"training"}
     shown = {(r.purpose, r.unit, r.name.partition(" ")[0]) for r in records if r.stage == "finetune"}
-    assert shown == {("training", "epoch", "epoch"), ("evaluation", "view", "preview/0001")}  # looked at, not needed
+    looked_at = {("evaluation", "view", name) for name in ("base/test/0001", "preview/0001")}  # and not needed
+    assert shown == {("training", "epoch", "epoch"), *looked_at}
     assert {r.purpose for r in records if r.stage == "evaluate"} == {"evaluation"}
     assert {r.purpose for r in records if r.name.startswith("test/")} == {"evaluation"}
 

@@ -112,7 +112,7 @@ class LivePicture:
         if view is None:
             self.console.say("no test views: the pictures while it trains are of a training view")
             return None
-        base = self.workspace.preview / "base" / f"{view.name}.exr"
+        base = self.workspace.preview / "base" / "test" / f"{view.name}.exr"
         try:
             base_views(self.run, [view], "test", paths=[base], purpose="evaluation")
             views = load(
