@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
 from ..core.errors import UserError
+
+if TYPE_CHECKING:
+    from ..core.ledger import CostSum, CostSummary
 
 
 @click.command()
@@ -62,32 +65,28 @@ def costs(workspace: str | None, as_json: bool) -> None:
         found.ledger.read(),
         n_candidates=prepared.detail["views"]["train"] if prepared else None,
         only={f"train/{name}" for name in chosen.detail["views"]} if chosen else None,
-        torn_lines=found.ledger.torn_lines(),
+        truncated_records=found.ledger.truncated_records(),
     )
-    click.echo(json.dumps(summary, indent=2) if as_json else _costs_table(summary))
+    click.echo(json.dumps(summary.model_dump(), indent=2) if as_json else _costs_table(summary))
 
 
-def _costs_table(summary: dict[str, Any]) -> str:
-    from ..core.console import clock
-
+def _costs_table(summary: CostSummary) -> str:
     lines = [f"{'stage':10} {'for':12} {'units':>6} {'wall':>8} {'cpu':>8}"]
-    for stage, purposes in summary["by_stage_and_purpose"].items():
-        for purpose, part in purposes.items():
-            lines.append(
-                f"{stage:10} {purpose:12} {part['records']:>6} {clock(part['wall_seconds']):>8}"
-                f" {clock(part['cpu_seconds']):>8}"
-            )
-    whole = summary["total"]
-    lines.append(
-        f"{'total':23} {whole['records']:>6} {clock(whole['wall_seconds']):>8} {clock(whole['cpu_seconds']):>8}"
-    )
-    tracing = summary["tracing_all"]
-    if tracing:
+    for stage, purposes in summary.by_stage_and_purpose.items():
+        lines += [f"{stage:10} {purpose:12} {_sum_columns(part)}" for purpose, part in purposes.items()]
+    lines.append(f"{'total':23} {_sum_columns(summary.total)}")
+    if tracing := summary.tracing_all:
         lines.append(
-            f"ray-traced {tracing['views']} of {tracing['candidates']} candidates in"
-            f" {tracing['actual_seconds']:.1f} s; all would have cost {tracing['all_seconds']:.1f} s"
+            f"ray-traced {tracing.views} of {tracing.candidates} candidates in {tracing.actual_seconds:.1f} s;"
+            f" all would have cost {tracing.all_seconds:.1f} s"
         )
     return "\n".join(lines)
+
+
+def _sum_columns(part: CostSum) -> str:
+    from ..core.console import clock
+
+    return f"{part.records:>6} {clock(part.wall_seconds):>8} {clock(part.cpu_seconds):>8}"
 
 
 @click.command()

@@ -17,7 +17,7 @@ from dnrtrain.records import ModelRecord
 from dnrtrain.records import Selection as SelectionRecord
 
 from ..core.errors import UserError
-from ..core.ledger import CostRecord, Ledger, break_even_frames, summarise, traced_views, upfront_seconds
+from ..core.ledger import CostRecord, CostSummary, Ledger, break_even_frames, summarise, traced_views, upfront_seconds
 from .advice import missing, notes
 from .budget import build_budget
 from .coverage import coverage_maps
@@ -44,13 +44,13 @@ Model = TypeVar("Model", bound=BaseModel)
 class Outline(BaseModel):
     """A workspace's figures without pictures: quick enough to read while a stage runs.
 
-    psnr: dB by test view, in the order of the evaluation. costs: see `core.ledger.summarise`.
+    psnr: dB by test view, in the order of the evaluation.
     """
 
     sphere: Sphere | None
     training: list[Training]
     psnr: dict[str, float | None]
-    costs: dict[str, Any]
+    costs: CostSummary
 
 
 def outline(root: Path) -> Outline:
@@ -81,10 +81,15 @@ def collect(root: Path, *, made_at: datetime | None = None) -> ReportData:
     metrics = _read_model(root / "evaluation" / "metrics.json", Metrics, "evaluate")
     chosen = _read_model(root / "selection.json", SelectionRecord, "select")
     ledger = Ledger(root / "costs.jsonl")
-    records, torn = ledger.read(), ledger.torn_lines()
+    records = ledger.read()
 
     selected = {f"train/{name}" for name in chosen.views} if chosen else None
-    summary = summarise(records, n_candidates=len(cameras["train"]) or None, only=selected, torn_lines=torn)
+    summary = summarise(
+        records,
+        n_candidates=len(cameras["train"]) or None,
+        only=selected,
+        truncated_records=ledger.truncated_records(),
+    )
     quality = build_quality(root, metrics, records) if metrics else None
     selection = _selection(root, chosen, records, cameras["train"]) if chosen else None
     training = [t for t in (_training(root, step) for step in (1, 2)) if t]

@@ -85,7 +85,7 @@ def get_workspace(name: NamePath, service: Shared) -> WorkspaceDetail:
         known = outline(path)
     except UserError as error:
         raise HTTPException(409, str(error)) from None
-    tracing = known.costs["tracing_all"]
+    tracing = known.costs.tracing_all
     sphere = known.sphere
     return WorkspaceDetail(
         name=name,
@@ -96,12 +96,12 @@ def get_workspace(name: NamePath, service: Shared) -> WorkspaceDetail:
         training=[Curve(title=t.title, losses=t.losses, psnr=t.psnr) for t in known.training],
         tests=[TestPicture(view=view, psnr=psnr) for view, psnr in known.psnr.items()],
         costs=CostState(
-            spent={stage: part["wall_seconds"] for stage, part in known.costs["by_stage"].items()},
-            total=known.costs["total"]["wall_seconds"],
-            traced_views=tracing["views"] if tracing else None,
-            candidates=tracing["candidates"] if tracing else None,
-            tracing_seconds=tracing["actual_seconds"] if tracing else None,
-            tracing_all_seconds=tracing["all_seconds"] if tracing else None,
+            spent={stage: part.wall_seconds for stage, part in known.costs.by_stage.items()},
+            total=known.costs.total.wall_seconds,
+            traced_views=tracing.views if tracing else None,
+            candidates=tracing.candidates if tracing else None,
+            tracing_seconds=tracing.actual_seconds if tracing else None,
+            tracing_all_seconds=tracing.all_seconds if tracing else None,
         ),
         plan=plan,
         viewable="finetune" in workspace.manifest.stages,
