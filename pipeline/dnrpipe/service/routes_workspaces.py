@@ -13,11 +13,15 @@ from fastapi.responses import FileResponse
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
+from dnrtrain.contract import DamagedFile
+from dnrtrain.records import read
+
 from ..core.errors import UserError
 from ..core.workspace import Workspace
 from ..report.collect import outline
 from ..report.sphere import AZIMUTH, ELEVATION, sphere_svg
 from ..stages.pipeline import status
+from ..stages.records import PREVIEW, PreviewState
 from ..stages.session import resolve_settings
 from .models import (
     NAME_PATTERN,
@@ -25,7 +29,6 @@ from .models import (
     CostState,
     Curve,
     PlacedView,
-    PreviewState,
     Scene,
     StageState,
     TestPicture,
@@ -112,12 +115,12 @@ def get_workspace(name: NamePath, service: Shared) -> WorkspaceDetail:
 @router.get("/workspaces/{name}/preview", responses=NOT_FOUND | CONFLICT)
 def preview(name: NamePath, service: Shared) -> PreviewState:
     """What the last picture of fine-tuning shows. 409: its file is damaged."""
-    path = service.root.workspace(name) / "preview" / "preview.json"
+    path = service.root.workspace(name) / "preview" / PREVIEW
     try:
-        return PreviewState.model_validate_json(path.read_bytes())
+        return read(path, PreviewState)
     except FileNotFoundError:
         raise HTTPException(404, f"{name} has no picture of a training") from None
-    except ValueError:
+    except DamagedFile:
         raise HTTPException(409, f"{name}: preview.json is damaged; the next training replaces it") from None
 
 
