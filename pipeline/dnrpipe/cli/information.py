@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import click
@@ -26,22 +27,20 @@ def status(workspace: str | None, as_json: bool) -> None:
     """
     from ..core.console import clock
     from ..core.workspace import Workspace, find_workspace
-    from ..stages import pipeline as stages
+    from ..stages.pipeline import status as status_of
     from ..stages.session import resolve_settings
 
     found = Workspace.open(find_workspace(workspace))
-    rows = stages.status(found, resolve_settings(found, {}, None))
+    rows = status_of(found, resolve_settings(found, {}, None))
     if as_json:
-        click.echo(json.dumps({"workspace": str(found.root), "stages": rows}, indent=2))
+        click.echo(json.dumps({"workspace": str(found.root), "stages": [asdict(row) for row in rows]}, indent=2))
         return
     click.echo(f"{found.root}  (from {found.manifest.source.path})")
     for row in rows:
-        took = clock(row["seconds"]) if row["seconds"] is not None else "-"
-        click.echo(
-            f"  {row['state']:8} {row['command']:18} {row['present']:>4}/{row['wanted']:<4} {took:>7}  {row['does']}"
-        )
-    due = next((row for row in rows if row["state"] != "done"), None)
-    click.echo(f"next: dnrpipe {due['command']}" if due else "next: dnrpipe render --orbit 60, or dnrpipe report")
+        took = clock(row.seconds) if row.seconds is not None else "-"
+        click.echo(f"  {row.state:8} {row.command:18} {row.present:>4}/{row.wanted:<4} {took:>7}  {row.does}")
+    due = next((row for row in rows if row.state != "done"), None)
+    click.echo(f"next: dnrpipe {due.command}" if due else "next: dnrpipe render --orbit 60, or dnrpipe report")
 
 
 @click.command()
@@ -59,12 +58,11 @@ def costs(workspace: str | None, as_json: bool) -> None:
     from ..core.workspace import Workspace, find_workspace
 
     found = Workspace.open(find_workspace(workspace))
-    prepared = found.manifest.stages.get("prepare")
-    chosen = found.manifest.stages.get("raytrace")
+    prepared, raytraced = found.manifest.prepared, found.manifest.raytraced
     summary = summarise(
         found.ledger.read(),
-        n_candidates=prepared.detail["views"]["train"] if prepared else None,
-        only={f"train/{name}" for name in chosen.detail["views"]} if chosen else None,
+        n_candidates=prepared.views["train"] if prepared else None,
+        only={f"train/{name}" for name in raytraced.views} if raytraced else None,
         truncated_records=found.ledger.truncated_records(),
     )
     click.echo(json.dumps(summary.model_dump(), indent=2) if as_json else _costs_table(summary))

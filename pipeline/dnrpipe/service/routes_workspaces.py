@@ -84,7 +84,7 @@ def get_workspace(name: NamePath, service: Shared) -> WorkspaceDetail:
         workspace = Workspace.open(path)
         settings = resolve_settings(workspace, {}, None)
         rows = status(workspace, settings)
-        plan = plan_state(workspace, settings, {row["stage"]: row["state"] for row in rows})
+        plan = plan_state(workspace, settings, {row.stage: row.state for row in rows})
         known = outline(path)
     except UserError as error:
         raise HTTPException(409, str(error)) from None
@@ -92,7 +92,7 @@ def get_workspace(name: NamePath, service: Shared) -> WorkspaceDetail:
     sphere = known.sphere
     return WorkspaceDetail(
         name=name,
-        stages=[StageState(**{key: row[key] for key in StageState.model_fields}) for row in rows],
+        stages=[StageState(**{key: getattr(row, key) for key in StageState.model_fields}) for row in rows],
         views=[PlacedView(**view.model_dump()) for view in sphere.views] if sphere else [],
         sphere=str(sphere_svg(sphere, "oblique")) if sphere else None,
         eye=(AZIMUTH, ELEVATION),
