@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.ledger import (
     CostRecord,
+    CostSummary,
     Ledger,
     break_even_frames,
     by_purpose,
@@ -55,7 +56,7 @@ def test_append_and_read_round_trip(tmp_path: Path) -> None:
     for each in written:
         ledger.append(each)
     assert ledger.read() == written
-    assert ledger.torn_lines() == 0
+    assert ledger.truncated_records() == 0
     assert len(ledger.path.read_bytes().splitlines()) == len(written)
 
 
@@ -67,10 +68,10 @@ def test_torn_last_line_is_tolerated_then_closed_by_the_next_append(tmp_path: Pa
     for cut in (1, 40, len(whole.splitlines()[1]) - 3):  # anywhere inside the second line
         ledger.path.write_bytes(whole.splitlines(keepends=True)[0] + whole.splitlines()[1][:cut])
         assert [r.name for r in ledger.read()] == ["a"]
-        assert ledger.torn_lines() == 1
+        assert ledger.truncated_records() == 1
         ledger.append(record(name="c"))
         assert [r.name for r in ledger.read()] == ["a", "c"]
-        assert ledger.torn_lines() == 1
+        assert ledger.truncated_records() == 1
 
 
 def test_a_whole_last_line_without_newline_is_kept(tmp_path: Path) -> None:
@@ -79,7 +80,7 @@ def test_a_whole_last_line_without_newline_is_kept(tmp_path: Path) -> None:
     ledger.path.write_bytes(ledger.path.read_bytes().rstrip(b"\n"))
     ledger.append(record(name="b"))
     assert [r.name for r in ledger.read()] == ["a", "b"]
-    assert ledger.torn_lines() == 0
+    assert ledger.truncated_records() == 0
 
 
 def test_blocks_of_zeros_and_noise_count_as_torn(tmp_path: Path) -> None:
@@ -89,7 +90,7 @@ def test_blocks_of_zeros_and_noise_count_as_torn(tmp_path: Path) -> None:
         file.write(b"\0" * 64 + b"\n" + b"\xff\xfe\x80\n")
     ledger.append(record(name="b"))
     assert [r.name for r in ledger.read()] == ["a", "b"]
-    assert ledger.torn_lines() == 2
+    assert ledger.truncated_records() == 2
 
 
 def test_a_foreign_line_is_refused_with_its_place(tmp_path: Path) -> None:
@@ -133,7 +134,7 @@ def test_concurrent_appends_lose_nothing(tmp_path: Path) -> None:
     assert [p.wait(timeout=60) for p in processes] == [0, 0, 0]
     ledger = Ledger(path)
     assert {r.name for r in ledger.read()} == {f"{p}/{i}" for p in range(3) for i in range(50)}
-    assert ledger.torn_lines() == 0
+    assert ledger.truncated_records() == 0
 
 
 def test_sums_by_stage_and_purpose_and_wall_clock() -> None:
@@ -226,14 +227,14 @@ def test_break_even() -> None:
 
 def test_summary_is_json_and_empty_ledgers_have_one() -> None:
     records = [record(spp=64, noise=0.1), record(name="train/1", spp=128, noise=0.3)]
-    summary = summarise(records, n_candidates=8, torn_lines=1)
-    assert json.loads(json.dumps(summary, allow_nan=False)) == summary
-    assert summary["raytraced"]["training"]["spp"] == [64, 128]
-    assert summary["raytraced"]["training"]["noise"] == pytest.approx(0.2)
-    assert summary["tracing_all"]["all_seconds"] == 16.0
-    assert summary["torn_lines"] == 1
+    summary = summarise(records, n_candidates=8, truncated_records=1)
+    assert CostSummary.model_validate_json(json.dumps(summary.model_dump(), allow_nan=False)) == summary
+    assert summary.raytraced["training"].spp == [64, 128]
+    assert summary.raytraced["training"].noise == pytest.approx(0.2)
+    assert summary.tracing_all is not None and summary.tracing_all.all_seconds == 16.0
+    assert summary.torn_lines == 1
     empty = summarise([])
-    assert empty["total"]["seconds"] == 0.0 and empty["tracing_all"] is None
+    assert empty.total.seconds == 0.0 and empty.tracing_all is None
 
 
 def test_upfront_cost_is_training_once() -> None:

@@ -7,8 +7,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from dnrtrain.contract import SPLITS, DamagedFile, SceneFrame, View, read_cameras
 from dnrtrain.records import Selection, read
 
@@ -23,9 +21,13 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise UserError(f"{path}: is missing; run `dnrpipe prepare --force`") from None
+        raise _missing(path) from None
     except (ValueError, RecursionError) as error:
         raise DamagedFile(path, str(error)) from None
+
+
+def _missing(path: Path) -> UserError:
+    return UserError(f"{path}: is missing; run `dnrpipe prepare --force`")
 
 
 def read_summary(workspace: Workspace) -> dict[str, Any]:
@@ -37,9 +39,9 @@ def read_frame(workspace: Workspace) -> SceneFrame:
     """``scene/frame.json``. Raises UserError when it is missing, DamagedFile when it does not read."""
     path = workspace.scene / "frame.json"
     try:
-        return SceneFrame.model_validate(read_json(path))
-    except ValidationError as error:
-        raise DamagedFile(path, error.errors()[0]["msg"]) from None
+        return read(path, SceneFrame)
+    except FileNotFoundError:
+        raise _missing(path) from None
 
 
 def scene_fingerprint(workspace: Workspace) -> str:
