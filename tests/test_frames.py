@@ -15,7 +15,7 @@ from dnrpipe.core.cameras import make_cameras
 from dnrpipe.core.settings import CameraSettings
 from dnrpipe.raytrace.variants import choose_variant
 
-SUMMARY = {"bounds": {"center": [0.0, 0.0, 0.0], "radius": 1.2}, "cameras": [], "animation": []}
+SUMMARY = sphere_summary((0.0, 0.0, 0.0), 1.2)
 SPHERE = """<scene version="3.0.0">
   <emitter type="constant"/>
   <shape type="sphere"><bsdf type="diffuse"><rgb name="reflectance" value="0.6, 0.4, 0.2"/></bsdf></shape>
@@ -39,6 +39,7 @@ import numpy as np
 from dnrtrain.contract import View
 from dnrpipe.raytrace.engine import Engine
 from dnrpipe.raytrace.frames import Frames
+from tests.scene_records import sphere_summary
 variant, folder, views = sys.argv[1], Path(sys.argv[2]), [View.model_validate(v) for v in json.loads(sys.argv[3])]
 engine = Engine(variant, 0, [folder / "scene.xml"])
 frames = Frames(engine, folder / "scene.xml", "path", 5, (views[0].width, views[0].height))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import shutil
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -14,10 +13,12 @@ import numpy as np
 import dnrpipe
 from dnrpipe.core.cameras import make_cameras, view_lenses
 from dnrpipe.core.console import Console
+from dnrpipe.core.scene_files import read_census, read_summary
 from dnrpipe.core.settings import CameraSettings, resolve
 from dnrpipe.core.workspace import Source, Workspace, file_sha256
 from dnrpipe.raytrace.variants import choose_variant
 from dnrpipe.stages import prepare
+from dnrpipe.stages.stage import Run
 from dnrpipe.workers.processes import Retry, TaskResult, run_tasks
 from dnrtrain.exr import read_exr
 
@@ -34,7 +35,7 @@ def convert(blend: Path, root: Path, *, quiet: bool = True) -> Workspace:
         shutil.rmtree(root)
     workspace = Workspace.create(root, Source(path=str(blend.resolve()), sha256=file_sha256(blend)))
     try:
-        prepare._convert(workspace, resolve(None, {}), Console(quiet=quiet), "fidelity")
+        prepare._convert(Run(workspace, resolve(None, {}), Console(quiet=quiet), id="fidelity"))
     except Exception as error:
         raise FidelityError(f"{blend.stem}: {' '.join(str(error).split())}") from error
     return workspace
@@ -44,10 +45,9 @@ def trace(
     workspace: Workspace, outputs: Sequence[Path], *, size: tuple[int, int], spp: int, bundle: Path | None = None
 ) -> list[dict[str, Any]]:
     """Trace the scene camera's view once per output, each with its own seed; linear premultiplied RGBA EXR."""
-    summary = json.loads((workspace.scene / "summary.json").read_text())
+    summary = read_summary(workspace.scene)
     settings = CameraSettings(source="scene", train=1, val=0, test=0, width=size[0], height=size[1])
-    active = [camera for camera in summary["cameras"] if camera["active"]]
-    summary = {**summary, "cameras": active}
+    summary = summary.model_copy(update={"cameras": [camera for camera in summary.cameras if camera.active]})
     view = make_cameras(summary, settings)["train"][0]
     lens = view_lenses(summary, settings).get(view.name)
     xml = bundle or workspace.scene / "scene.xml"
@@ -94,10 +94,14 @@ def picture(path: Path) -> np.ndarray:
 
 def findings(workspace: Workspace) -> list[dict[str, Any]]:
     """What the conversion said of the scene (``census.json``)."""
-    return json.loads((workspace.scene / "census.json").read_text())["findings"]
+    return [finding.data() for finding in read_census(workspace.scene).findings]
 
 
-CONVERSION = ("blender", "baking.py", "prepare.py", "scene_files.py", "settings.py")
+CONVERSION = (
+    "blender",
+    *("stages/baking.py", "stages/opening.py", "stages/prepare.py"),
+    *("core/cameras.py", "core/scene_files.py", "core/scene_records.py", "core/settings.py"),
+)
 TRACING = tuple(f"raytrace/{name}.py" for name in ("tracer", "engine", "sensors", "visibility", "coverage"))
 PLUGINS = ("raytrace/plugins",)
 
