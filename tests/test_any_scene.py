@@ -53,7 +53,7 @@ def test_opens_and_says_what_it_did(name: str, tmp_path: Path) -> None:
     "\n".join(loaded.warnings).encode("utf-8")  # no surrogates: terminals and JSON readers choke on them
     meshes = loaded.frozen.meshes
     assert meshes and all(np.isfinite(mesh.positions).all() for mesh in meshes)
-    assert np.isfinite(loaded.bounds["radius"]) and loaded.bounds["radius"] > 0
+    assert np.isfinite(loaded.bounds.radius) and loaded.bounds.radius > 0
     assert loaded.scene.camera.type == "CAMERA"
     assert not (tmp_path / "executed").exists()
 

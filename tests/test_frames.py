@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.scene_records import sphere_summary
 
 from dnrpipe.core.cameras import make_cameras
 from dnrpipe.core.settings import CameraSettings
@@ -39,7 +40,6 @@ import numpy as np
 from dnrtrain.contract import View
 from dnrpipe.raytrace.engine import Engine
 from dnrpipe.raytrace.frames import Frames
-from tests.scene_records import sphere_summary
 variant, folder, views = sys.argv[1], Path(sys.argv[2]), [View.model_validate(v) for v in json.loads(sys.argv[3])]
 engine = Engine(variant, 0, [folder / "scene.xml"])
 frames = Frames(engine, folder / "scene.xml", "path", 5, (views[0].width, views[0].height))
