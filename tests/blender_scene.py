@@ -140,9 +140,9 @@ def freeze(source: str, folder: str) -> None:
     report = {
         "warnings": warnings + frozen.warnings + ensure_light(scene, frozen.meshes),
         "repairs": frozen.repairs,
-        "atlas": atlas,
-        "cameras": scene_cameras(scene),
-        "animation": camera_animation(scene),
+        "atlas": atlas.data(),
+        "cameras": [camera.data() for camera in scene_cameras(scene)],
+        "animation": [camera.data() for camera in camera_animation(scene)],
         "has_light": has_light(scene, frozen.meshes),
         "packing": pack_everything(),
     }

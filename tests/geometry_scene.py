@@ -102,7 +102,7 @@ def prepare(folder: Path) -> None:
     add_gbuffer_scene(frozen.meshes, {name: converted.opacity for name, converted in materials.items()})
     save_blend(folder / "source.blend")
     meshes = {mesh.name: [mesh.triangles, len(mesh.copies), mesh.object_id] for mesh in frozen.meshes}
-    report = {"meshes": meshes, "atlas": atlas, "findings": frozen.findings.to_list()}
+    report = {"meshes": meshes, "atlas": atlas.data(), "findings": [finding.data() for finding in frozen.findings]}
     (folder / "report.json").write_text(json.dumps(report))
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
+from tests.scene_records import scene_census, scene_summary
 
 from dnrpipe.core.ledger import CostRecord, Ledger
 from dnrtrain.contract import SceneFrame, View, write_cameras
@@ -40,20 +41,15 @@ def make_workspace(
         write_cameras(root / "cameras" / f"{split}.json", members, split)
     frame = SceneFrame(near=1.0, far=9.0, center=CENTER, radius=1.2)
     _dump(root / "scene" / "frame.json", frame.model_dump())
-    _dump(
-        root / "scene" / "summary.json",
-        {
-            "bounds": {"min": [-1, -1, -0.7], "max": [1.4, 1.1, 1.7], "center": list(CENTER), "radius": 1.2},
-            "triangles": 18424,
-            "objects": 6,
-            "blender_version": "5.0.1",
-            "atlas": {"occupancy": 0.641, "overlap": 0.0},
-            "repairs": {"zero_area_triangles": 3},
-            "warnings": ["image 'wood.png' is missing"],
-            "has_light": True,
-        },
+    summary = scene_summary(
+        bounds={"min": [-1, -1, -0.7], "max": [1.4, 1.1, 1.7], "center": CENTER, "radius": 1.2},
+        triangles=18424,
+        objects=6,
+        repairs={"zero_area_triangles": 3},
+        warnings=["image 'wood.png' is missing"],
     )
-    _dump(root / "scene" / "census.json", {"findings": _findings(hostile)})
+    _dump(root / "scene" / "summary.json", summary.data())
+    _dump(root / "scene" / "census.json", scene_census(findings=_findings(hostile)).data())
     for view in views["train"]:
         raster = _ball(view, shading=0.55)
         write_exr(root / "passes" / "train" / f"{view.name}.exr", raster, {})

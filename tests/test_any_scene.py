@@ -23,8 +23,9 @@ from dnrpipe.blender.reading.missing import missing_files  # noqa: E402
 from dnrpipe.blender.reading.names import find_material  # noqa: E402
 from dnrpipe.blender.reading.opening import open_scene  # noqa: E402
 from dnrpipe.blender.reading.packing import pack_everything, save_blend  # noqa: E402
+from dnrpipe.blender.tasks import InspectAnswer, InspectTask  # noqa: E402
 from dnrpipe.core.errors import UserError  # noqa: E402
-from dnrpipe.core.scene_files import scene_fingerprint  # noqa: E402
+from dnrpipe.core.scene_files import read_summary, scene_fingerprint  # noqa: E402
 from dnrpipe.effects.plan import plan_effects  # noqa: E402
 
 
@@ -52,7 +53,7 @@ def test_opens_and_says_what_it_did(name: str, tmp_path: Path) -> None:
     "\n".join(loaded.warnings).encode("utf-8")  # no surrogates: terminals and JSON readers choke on them
     meshes = loaded.frozen.meshes
     assert meshes and all(np.isfinite(mesh.positions).all() for mesh in meshes)
-    assert np.isfinite(loaded.bounds["radius"]) and loaded.bounds["radius"] > 0
+    assert np.isfinite(loaded.bounds.radius) and loaded.bounds.radius > 0
     assert loaded.scene.camera.type == "CAMERA"
     assert not (tmp_path / "executed").exists()
 
@@ -71,12 +72,12 @@ def test_refuses_in_one_line(name: str, tmp_path: Path) -> None:
 def test_a_file_without_a_surface_can_be_inspected(name: str, tmp_path: Path) -> None:
     """There is nothing to convert, but what it holds can be said."""
     builder, said = REFUSED[name]
-    task = {"source": str(builder(tmp_path)), "folder": str(tmp_path / "bundle"), "bake_size": 64}
-    answer = Worker({})(task)
-    assert said in answer["warnings"][0]
-    assert sum(answer["census"]["objects"].values()) >= 1 and answer["census"]["triangles"] == 0
-    assert plan_effects(answer["census"], answer["bundle"]).effects
-    json.dumps(answer)
+    task = InspectTask(source=builder(tmp_path), folder=tmp_path / "bundle", bake_size=64)
+    answer = Worker({})(task.data())
+    found = InspectAnswer.model_validate(json.loads(json.dumps(answer)))
+    assert said in found.warnings[0]
+    assert sum(found.census.objects.values()) >= 1 and found.census.triangles == 0
+    assert plan_effects(found.census, {}).effects
 
 
 @pytest.mark.parametrize("name", ["awkward names", "broken transforms", "not finite"])
@@ -84,7 +85,7 @@ def test_converts(name: str, tmp_path: Path) -> None:
     """The whole conversion of what is hardest on file names, JSON and XML."""
     path = OPENS[name][0](tmp_path)
     summary = prepare(path, tmp_path / "scene")
-    assert json.loads((tmp_path / "scene" / "summary.json").read_text(encoding="utf-8"))["bounds"] == summary["bounds"]
+    assert read_summary(tmp_path / "scene") == summary
     bundle = tmp_path / "scene"
     assert (bundle / "scene.xml").read_text(encoding="utf-8").count("<shape") >= 1
     names = [file.name for file in (bundle / "meshes").iterdir()]
@@ -105,7 +106,7 @@ def test_strict_names_all_that_is_missing(tmp_path: Path) -> None:
 
 def test_findings_name_what_is_missing(tmp_path: Path) -> None:
     loaded = load_scene(nasty_scenes.missing_everything(tmp_path))
-    features = {entry["feature"] for entry in loaded.findings.to_list() if entry["kind"] == "missing"}
+    features = {finding.feature for finding in loaded.findings if finding.kind == "missing"}
     assert {"linked library 'library.blend'", "volume 'smoke'", "linked object 'linked [library.blend]'"} <= features
 
 
@@ -209,4 +210,4 @@ def test_numbers_become_a_new_nodes(tmp_path: Path) -> None:
 def test_findings_take_any_text() -> None:
     findings = Findings()
     findings.add("missing", "image 'x'", "not found: \udcfcbel.png")
-    assert findings.to_list()[0]["note"] == "not found: \\xfcbel.png"
+    assert next(iter(findings)).note == "not found: \\xfcbel.png"

@@ -26,9 +26,12 @@ from dnrpipe.blender.shading.sheets import on_region  # noqa: E402
 from dnrpipe.blender.shading.sockets import resolve  # noqa: E402
 from dnrpipe.blender.shading.textures import Constant, ImageReader, Placement, Textured  # noqa: E402
 from dnrpipe.blender.shading.values import Evaluator  # noqa: E402
+from dnrpipe.blender.tasks import BakeTask, PendingBakes  # noqa: E402
 from dnrpipe.core.console import Console  # noqa: E402
+from dnrpipe.core.settings import Settings  # noqa: E402
 from dnrpipe.core.workspace import Source, Workspace  # noqa: E402
 from dnrpipe.stages.baking import FOLDER, bake  # noqa: E402
+from dnrpipe.stages.stage import Run  # noqa: E402
 
 SIZE = 128
 FULL = baking.SAMPLES
@@ -103,7 +106,7 @@ class Bench:
         }
         worker = baking.Worker(common)
         for layer in self.book.layers():
-            worker({"layer": layer})
+            worker(BakeTask(layer=tuple(layer), output=self.folder).data())
         self.book = BakeBook.open(self.meshes, self.folder, SIZE)
 
     def baked(self, name: str, socket: str, kind: str) -> np.ndarray:
@@ -200,7 +203,7 @@ def test_groups_scalars_and_normals(tmp_path: Path) -> None:
     for socket in ("Roughness", "Metallic", "Alpha"):
         bench.book.value("m", "scalar", source_of(material, socket), socket, Findings())
     bench.book.value("m", "normal", source_of(material, "Normal"), "Normal", Findings())
-    assert [len(entry["taps"]) for layer in bench.book.layers() for entry in layer] in ([3, 1], [2, 1])
+    assert [len(entry.taps) for layer in bench.book.layers() for entry in layer] in ([3, 1], [2, 1])
     bench.bake()
     x_values = bench.expected("m", lambda mesh: generated(mesh)[:, :1])
     np.testing.assert_allclose(bench.baked("m", "Roughness", "scalar"), x_values, atol=2e-3)
@@ -235,7 +238,7 @@ def test_cached_by_content(tmp_path: Path) -> None:
         source_of(edited).socket.links[0].to_socket
     )
     assert isinstance(value, Constant)
-    assert [entry["kind"] for entry in findings.to_list()] == ["approximated"]
+    assert [finding.kind for finding in findings] == ["approximated"]
 
 
 def test_what_is_exact_is_not_baked(tmp_path: Path) -> None:
@@ -352,7 +355,9 @@ def test_bake_processes_fill_the_cache_and_name_what_failed(tmp_path: Path) -> N
     bpy.ops.wm.save_as_mainfile(filepath=str(source))
     save_geometry(geometry, meshes)
     (layer,) = book.layers()
-    gone = [{"material": "gone", "taps": [{**layer[0]["taps"][0], "key": "k"}]}]
-    pending = {"layers": [layer, gone], "frame": 1}
-    assert bake(workspace, Console(quiet=True), source, geometry, pending, SIZE, 1) == ["k"]
+    tap = layer[0].taps[0].model_copy(update={"key": "k"})
+    gone = layer[0].model_copy(update={"material": "gone", "taps": (tap,)})
+    pending = PendingBakes(layers=(tuple(layer), (gone,)), frame=1)
+    run = Run(workspace, Settings.model_validate({"passes": {"bake_size": SIZE, "workers": 1}}), Console(quiet=True))
+    assert bake(run, source, geometry, pending) == ["k"]
     assert [path.stem for path in (workspace.root / FOLDER).glob("*.npy")] == list(book.missing)

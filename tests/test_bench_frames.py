@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.scene_records import sphere_summary
 from tools.bench_frames.motion import Surface, changes, flicker, project, reproject
 from tools.bench_frames.standing import classes, standing
 from tools.bench_frames.upfront import at_equal_time, break_even, lines, upfront
@@ -20,7 +21,7 @@ from dnrtrain.contract import View
 
 LADDER = {"1": (10.0, 20.0), "1 dear": (30.0, 19.0), "4": (40.0, 26.0), "16": (160.0, 30.0), "dull": (200.0, 30.0)}
 LINE = [(10.0, 20.0), (40.0, 26.0), (160.0, 30.0)]
-SUMMARY = {"bounds": {"center": [0.0, 0.0, 0.0], "radius": 1.0}, "cameras": [], "animation": []}
+SUMMARY = sphere_summary((0.0, 0.0, 0.0), 1.0)
 
 
 def test_the_frontier_leaves_out_what_is_dearer_and_no_better() -> None:

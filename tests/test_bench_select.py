@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
+from tests.scene_records import scene_summary
 
 from dnrpipe.blender.geometry.frozen import FrozenMesh
 from dnrpipe.core.cameras import make_cameras
@@ -31,11 +32,9 @@ from dnrpipe.studies.selectbench.tables import difference, markdown, together
 from dnrtrain.contract import View
 from dnrtrain.selector.names import TRAINED_NAMES, UNTRAINED_NAMES
 
-SUMMARY = {
-    "bounds": {"center": [1.0, -2.0, 0.5], "radius": 1.5, "min": [0, -3, 0], "max": [2, -1, 1]},
-    "cameras": [],
-    "animation": [],
-}
+SUMMARY = scene_summary(
+    bounds={"center": [1.0, -2.0, 0.5], "radius": 1.5, "min": [0, -3, 0], "max": [2, -1, 1]},
+)
 
 
 # -- intervals ---------------------------------------------------------------------------------------------
@@ -125,7 +124,7 @@ def test_a_walk_has_near_duplicates_and_views_that_see_nothing(count: int, seed:
     train, test = views["train"], views["test"]
     assert [len(train), len(test)] == [count, 9]
     assert len({view.name for view in [*train, *test]}) == count + 9
-    center = SUMMARY["bounds"]["center"]
+    center = SUMMARY.bounds.center
     blind = [view for view in train if not looks_at(view, center)]
     assert len(blind) == round(0.1 * count) and all(looks_at(view, center) for view in test)
     places = np.array([view.position for view in train])
@@ -168,7 +167,7 @@ def test_points_are_drawn_evenly_by_area_and_on_copies() -> None:
 
 def test_cameras_indoors_stand_in_free_air_and_look_at_surfaces() -> None:
     room, block = box([-2, -2, 0], [2, 2, 2], "room"), box([-1, -1, 0], [1, 1, 1.2], "block")
-    summary = {"bounds": {"center": [0, 0, 1], "radius": 3.0, "min": [-2, -2, 0], "max": [2, 2, 2]}, "cameras": []}
+    summary = scene_summary(bounds={"center": [0, 0, 1], "radius": 3.0, "min": [-2, -2, 0], "max": [2, 2, 2]})
     views = inside(summary, CameraSettings(train=60, test=8), [room, block], "room")
     places = np.array([view.position for members in views.values() for view in members])
     assert len(places) == 68 and (np.abs(places[:, :2]) < 2).all()

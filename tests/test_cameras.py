@@ -10,29 +10,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.scene_records import CAMERA, sphere_summary
 
 from dnrpipe.core.cameras import depth_range, make_cameras, orbit_views, split_views
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import CameraSettings
 from dnrtrain.contract import ContractError, View, parse_transforms, read_cameras, write_cameras
 
-SUMMARY = {"bounds": {"center": [1.0, -2.0, 0.5], "radius": 1.5}, "cameras": [], "animation": []}
+CENTER, RADIUS = (1.0, -2.0, 0.5), 1.5
+SUMMARY = sphere_summary(CENTER, RADIUS)
 
 
 def _camera(**changes) -> dict:
-    camera = {
-        "name": "Camera",
-        "type": "PERSP",
-        "c2w": np.eye(4).tolist(),
-        "lens": 35.0,
-        "sensor_width": 36.0,
-        "sensor_height": 24.0,
-        "sensor_fit": "AUTO",
-        "shift_x": 0.0,
-        "shift_y": 0.0,
-        "active": True,
-    }
-    return camera | changes
+    return {**CAMERA, "active": True, **changes}
 
 
 def _project(view: View, point: np.ndarray) -> np.ndarray:
@@ -46,7 +36,7 @@ def test_every_view_holds_the_bounding_sphere(source: str, size: tuple[int, int]
     cameras = CameraSettings(source=source, train=30, val=3, test=7, width=size[0], height=size[1])
     views = make_cameras(SUMMARY, cameras)
     assert [len(views[s]) for s in ("train", "val", "test")] == [30, 3, 7]
-    center = np.array(SUMMARY["bounds"]["center"])
+    center = np.array(SUMMARY.bounds.center)
     rng = np.random.default_rng(0)
     points = rng.normal(size=(200, 3))
     points = center + 1.5 * points / np.linalg.norm(points, axis=1, keepdims=True)
@@ -73,13 +63,14 @@ def test_splits_share_no_view_and_do_not_move_each_other() -> None:
 def test_scene_camera_shift_and_fit_follow_blender() -> None:
     camera = _camera(shift_x=0.1, shift_y=-0.2)
     landscape = CameraSettings(source="scene", width=200, height=100, test=0, val=0)
-    view = make_cameras(SUMMARY | {"cameras": [camera]}, landscape)["train"][0]
+    view = make_cameras(sphere_summary(CENTER, RADIUS, cameras=[camera]), landscape)["train"][0]
     assert view.fl_x == pytest.approx(35 / 36 * 200)
     assert (view.cx, view.cy) == pytest.approx((100 - 20, 50 - 40))
     portrait = landscape.model_copy(update={"width": 100, "height": 200})
-    assert make_cameras(SUMMARY | {"cameras": [camera]}, portrait)["train"][0].fl_x == pytest.approx(35 / 36 * 200)
+    view = make_cameras(sphere_summary(CENTER, RADIUS, cameras=[camera]), portrait)["train"][0]
+    assert view.fl_x == pytest.approx(35 / 36 * 200)
     vertical = _camera(sensor_fit="VERTICAL")
-    view = make_cameras(SUMMARY | {"cameras": [vertical]}, landscape)["train"][0]
+    view = make_cameras(sphere_summary(CENTER, RADIUS, cameras=[vertical]), landscape)["train"][0]
     assert view.fl_x == pytest.approx(35 / 24 * 100)
 
 
@@ -105,7 +96,7 @@ def test_depth_range_holds_the_scene() -> None:
     views = make_cameras(SUMMARY, CameraSettings(train=20, width=64, height=64))["train"]
     near, far = depth_range(views, SUMMARY)
     for view in views:
-        distance = np.linalg.norm(view.position - np.array(SUMMARY["bounds"]["center"]))
+        distance = np.linalg.norm(view.position - np.array(SUMMARY.bounds.center))
         assert near <= distance - 1.5 + 1e-9
         assert far >= distance + 1.5 - 1e-9
 
@@ -172,7 +163,9 @@ def test_camera_files_must_have_one_size_and_square_pixels(tmp_path: Path) -> No
 
 def test_names_are_safe_and_unique() -> None:
     cameras = [_camera(name=name) for name in ("Cam 1", "Cam.1", "Cam_1", "Камера")]
-    views = make_cameras(SUMMARY | {"cameras": cameras}, CameraSettings(source="scene", test=0, val=0))["train"]
+    views = make_cameras(
+        sphere_summary(CENTER, RADIUS, cameras=cameras), CameraSettings(source="scene", test=0, val=0)
+    )["train"]
     names = [view.name for view in views]
     assert names == ["Cam_1", "Cam.1", "Cam_1-2", "______"]
 

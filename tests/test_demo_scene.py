@@ -35,17 +35,17 @@ def test_has_what_a_demo_needs(tmp_path: Path) -> None:
     findings = Findings()
     meshes = freeze_scene(scene).meshes
     census = take_census(scene, findings, meshes)
-    assert census["objects"]["MESH"] >= 6 and scene.camera is not None
-    assert census["world"]["kind"] == "hdri" and not census["lights"]
-    assert census["transmission"] == ["Glass"] and "Brass" in census["metals"]
-    assert census["normal_maps"] and not census["procedural_textures"]
-    assert max(census["triangles_by_object"].values()) > 10_000
+    assert census.objects["MESH"] >= 6 and scene.camera is not None
+    assert census.world and census.world.kind == "hdri" and not census.lights
+    assert census.transmission == ["Glass"] and "Brass" in census.metals
+    assert census.normal_maps and not census.procedural_textures
+    assert max(census.triangles_by_object.values()) > 10_000
     assert export_display(scene, tmp_path)["display_lut"] is None
     center, radius = bounding_sphere(meshes)
     assert radius < 2.1 and np.hypot(center[0], center[1]) < 0.1
     export_bundle(meshes, tmp_path, findings)
     # Nothing in it is beyond the converter: rough metal's energy is made up for, no more.
-    assert {(f["kind"], f["feature"]) for f in findings.to_list()} <= {("approximated", "rough metal")}
+    assert {(f.kind, f.feature) for f in findings} <= {("approximated", "rough metal")}
 
 
 @pytest.mark.slow

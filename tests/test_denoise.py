@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
+from tests.scene_records import sphere_summary
 
 from dnrpipe.core.cameras import make_cameras
 from dnrpipe.core.errors import UserError
@@ -19,7 +20,7 @@ from dnrpipe.raytrace.variants import choose_variant
 from dnrpipe.workers.processes import TaskResult, run_tasks
 from dnrtrain.exr import read_exr
 
-SUMMARY = {"bounds": {"center": [0.0, 0.0, 0.0], "radius": 1.2}, "cameras": [], "animation": []}
+SUMMARY = sphere_summary((0.0, 0.0, 0.0), 1.2)
 BUNDLE = """<scene version="3.0.0">
   <integrator type="path"/>
   <emitter type="constant"/>

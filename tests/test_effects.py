@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.scene_records import CAMERA, MATT, scene_census, scene_summary
 
 from dnrpipe.core.cameras import view_lenses
 from dnrpipe.core.effect_names import FORCEABLE, LAMPS, NAMES, NEURAL
@@ -22,23 +23,6 @@ from dnrpipe.raytrace.statistics import DepthStep, difference, enough, remaining
 from dnrpipe.studies.effect_costs import override_settings, table
 from dnrtrain.settings import ModelSettings
 
-MATT: dict[str, Any] = {
-    "reflects": True,
-    "glossy": False,
-    "transparent": False,
-    "transmissive": False,
-    "refractive": False,
-    "ior": None,
-    "emissive": False,
-    "subsurface": False,
-    "metallic": False,
-    "volume": False,
-    "thin_film": False,
-    "view_dependent": [],
-    "min_roughness": None,
-    "roughness_linked": False,
-    "objects": ["Floor"],
-}
 GLASS = MATT | {
     "glossy": True,
     "transmissive": True,
@@ -47,11 +31,6 @@ GLASS = MATT | {
     "min_roughness": 0.0,
     "objects": ["Ball"],
 }
-
-
-def census(**changes: Any) -> dict[str, Any]:
-    base = {"materials": {"Chalk": MATT}, "lights": [], "world": None, "instances": 1, "meshes": 1, "triangles": 12}
-    return base | changes
 
 
 def pilot(depth: int) -> DepthPilot:
@@ -77,34 +56,36 @@ def on(plan: EffectPlan) -> set[str]:
 
 
 def test_a_matt_scene_calls_for_indirect_light_alone() -> None:
-    plan = plan_effects(census(), {})
+    plan = plan_effects(scene_census(), {})
     assert on(plan) == {"indirect"}
     assert plan.max_depth is None and plan.integrator == "path"
     assert all(effect.evidence and all(effect.evidence) for effect in plan.effects)
 
 
 def test_the_pilot_decides_depth_and_indirect_light() -> None:
-    deep = plan_effects(census(), {}, pilot=pilot(6))
+    deep = plan_effects(scene_census(), {}, pilot=pilot(6))
     assert (deep.integrator, deep.max_depth, deep.depth_by) == ("path", 6, "pilot")
-    shallow = plan_effects(census(), {}, pilot=pilot(2))
+    shallow = plan_effects(scene_census(), {}, pilot=pilot(2))
     assert (shallow.integrator, shallow.max_depth) == ("direct", 2) and not shallow.on("indirect")
-    fixed = plan_effects(census(), {}, max_depth=9, pilot=pilot(2))
+    fixed = plan_effects(scene_census(), {}, max_depth=9, pilot=pilot(2))
     assert (fixed.max_depth, fixed.depth_by) == (9, "settings")
-    black = plan_effects(census(materials={"Lamp": MATT | {"reflects": False, "emissive": True}}), {"glow": ["a"]})
+    black = plan_effects(
+        scene_census(materials={"Lamp": MATT | {"reflects": False, "emissive": True}}), {"glow": ["a"]}
+    )
     assert (black.integrator, black.max_depth, black.depth_by) == ("direct", 2, "scene")
     assert on(black) == {"glow"}
 
 
 def test_evidence_names_material_object_lamp_and_camera() -> None:
     lamps = [
-        {"name": "Bulb", "type": "POINT", "power": 10.0, "size": 0.1},
-        {"name": "Spark", "type": "SPOT", "power": 5.0, "size": 0.0},
-        {"name": "Off", "type": "POINT", "power": 0.0, "size": 0.1},
+        {"name": "Bulb", "type": "POINT", "power": 10.0, "color": [1, 1, 1], "size": 0.1},
+        {"name": "Spark", "type": "SPOT", "power": 5.0, "color": [1, 1, 1], "size": 0.0},
+        {"name": "Off", "type": "POINT", "power": 0.0, "color": [1, 1, 1], "size": 0.1},
     ]
-    world = {"name": "Sky", "kind": "sky", "emits": True}
+    world = {"name": "Sky", "kind": "sky", "image": None, "emits": True, "volume": False, "nodes": {}}
     held = {"refraction": ["mat-Glass"], "environment": ["w"], "area-lights": ["l1"], "point-lights": ["l2"]}
     plan = plan_effects(
-        census(materials={"Chalk": MATT, "Glass": GLASS}, lights=lamps, world=world), held, lenses=("Close-up",)
+        scene_census(materials={"Chalk": MATT, "Glass": GLASS}, lights=lamps, world=world), held, lenses=("Close-up",)
     )
     wanted = {"refraction": ["'Glass'", "'Ball'", "1.5"], "caustics": ["'Glass'"], "environment": ["'Sky'"]}
     wanted |= {"area-lights": ["'Bulb'"], "point-lights": ["'Spark'"], "depth-of-field": ["'Close-up'"]}
@@ -117,34 +98,34 @@ def test_evidence_names_material_object_lamp_and_camera() -> None:
 
 
 def test_what_the_converted_scene_does_not_hold_is_off_and_says_so() -> None:
-    plan = plan_effects(census(materials={"Fog": MATT | {"volume": True}}, hair=["Fur"]), {})
+    plan = plan_effects(scene_census(materials={"Fog": MATT | {"volume": True}}, hair=["Fur"]), {})
     assert not plan.on("volumes") and not plan.on("hair")
     assert "inspect" in plan.effect("volumes").evidence[0] and "'Fog'" in plan.effect("volumes").evidence[1]
 
 
 def test_integrator_follows_the_plan() -> None:
-    glass = census(materials={"Chalk": MATT, "Glass": GLASS})
+    glass = scene_census(materials={"Chalk": MATT, "Glass": GLASS})
     assert plan_effects(glass, {"volumes": ["m"]}).integrator == "volpath"
     assert plan_effects(glass, {}, disable=["caustics"]).integrator == "path-without-caustics"
     # `direct` stops at null surfaces: cut-outs keep `path`.
-    assert plan_effects(census(), {"alpha": ["m"]}, max_depth=2).integrator == "path"
+    assert plan_effects(scene_census(), {"alpha": ["m"]}, max_depth=2).integrator == "path"
     # Shadow rays of `path` stop at cut-outs: a lamp's light would not come through.
-    assert plan_effects(census(), {"alpha": ["m"], "point-lights": ["m"]}).integrator == "volpath"
-    assert plan_effects(census(), {"null": ["m"]}, max_depth=2).integrator == "path"
+    assert plan_effects(scene_census(), {"alpha": ["m"], "point-lights": ["m"]}).integrator == "volpath"
+    assert plan_effects(scene_census(), {"null": ["m"]}, max_depth=2).integrator == "path"
     kept = plan_effects(glass, {"volumes": ["m"]}, disable=["caustics"])
     assert kept.on("caustics") and kept.integrator == "volpath"
 
 
 def test_instances_that_share_a_place_keep_depth_and_normal() -> None:
-    plan = plan_effects(census(instances=50, meshes=2), {})
+    plan = plan_effects(scene_census(instances=50, meshes=2), {})
     assert plan.on("depth") and plan.on("normal") and not plan.on("view-dependence")
 
 
 def test_the_neural_renderer_loses_what_is_off_and_gains_nothing() -> None:
-    plain = plan_effects(census(), {})
+    plain = plan_effects(scene_census(), {})
     model = plain.model(ModelSettings())
     assert (model.modalities, model.spherical_harmonics) == ("uv", False)
-    shiny = plan_effects(census(materials={"Glass": GLASS}), {"refraction": ["m"]})
+    shiny = plan_effects(scene_census(materials={"Glass": GLASS}), {"refraction": ["m"]})
     assert shiny.model(ModelSettings()) == ModelSettings()
     own = ModelSettings(modalities="uv+normal", spherical_harmonics=False)
     assert shiny.model(own) == own
@@ -164,7 +145,7 @@ BUNDLE_NAMES = ("refraction", "volumes", "subsurface", "alpha", "environment", "
 def test_overrides_are_obeyed_or_have_nothing_to_act_on(
     held: set[str], enable: set[Any], disable: set[Any], depth: Any, piloted: int | None
 ) -> None:
-    scene = census(materials={"Chalk": MATT, "Glass": GLASS})
+    scene = scene_census(materials={"Chalk": MATT, "Glass": GLASS})
     bundle = {name: ["x"] for name in held}
     arguments: dict[str, Any] = {"max_depth": depth, "pilot": None if piloted is None else pilot(piloted)}
     plan = plan_effects(scene, bundle, enable=sorted(enable), disable=sorted(disable), **arguments)
@@ -327,10 +308,9 @@ def test_difference_is_free_of_noise() -> None:
 
 
 def test_only_the_scenes_own_cameras_have_lenses() -> None:
-    camera = {"name": "Main", "type": "PERSP", "lens": 50.0, "sensor_width": 36.0, "sensor_height": 24.0}
-    camera |= {"sensor_fit": "AUTO", "shift_x": 0.0, "shift_y": 0.0, "c2w": np.eye(4).tolist()}
+    camera = CAMERA | {"name": "Main"}
     lens = {"aperture_radius": 0.01, "focus_distance": 3.0}
-    summary = {"cameras": [camera | {"dof": lens}, camera | {"dof": None}], "animation": []}
+    summary = scene_summary(cameras=[camera | {"dof": lens}, camera | {"dof": None}])
     assert view_lenses(summary, CameraSettings(source="scene")) == {"Main": lens}
     assert view_lenses(summary, CameraSettings()) == {}
 

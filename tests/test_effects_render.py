@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from tests.scene_records import sphere_summary
 
 from dnrpipe.core.cameras import make_cameras
 from dnrpipe.core.settings import CameraSettings
@@ -15,7 +16,7 @@ from dnrpipe.effects.bundle import write_without
 from dnrpipe.raytrace.variants import choose_variant
 from dnrpipe.workers.processes import TaskResult, run_tasks
 
-SUMMARY = {"bounds": {"center": [0.0, 0.0, 0.3], "radius": 1.5}, "cameras": [], "animation": []}
+SUMMARY = sphere_summary((0.0, 0.0, 0.3), 1.5)
 SIZE, SPP = 48, 64
 SAME, DIFFERENT = 4.5, 8.0  # standard errors: chance of the first being passed by noise is 7e-6
 

@@ -505,7 +505,7 @@ def test_matches_cycles(build: Callable[[], None], energy: float, rmse: float, t
 
 
 def _kinds(findings: Findings) -> set[tuple[str, str]]:
-    return {(entry["kind"], entry["feature"]) for entry in findings.to_list()}
+    return {(finding.kind, finding.feature) for finding in findings}
 
 
 def test_procedural_and_unsupported_features_are_reported(tmp_path: Path) -> None:
@@ -531,8 +531,8 @@ def test_procedural_and_unsupported_features_are_reported(tmp_path: Path) -> Non
         ("approximated", "stretched spot"),
     }
     assert expected <= _kinds(findings)
-    assert {e["material"] for e in findings.to_list() if e["feature"] == "Bump node"} == {"Procedural"}
-    json.dumps(findings.to_list())
+    assert {f.material for f in findings if f.feature == "Bump node"} == {"Procedural"}
+    json.dumps([finding.data() for finding in findings])
 
 
 def test_missing_image_is_magenta_and_reported(tmp_path: Path) -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from dnrpipe.blender.finding_lines import LISTED, finding_lines
+from dnrpipe.core.scene_records import Finding, FindingKind
 
 
-def _row(feature: str, note: str, **names: str) -> dict[str, Any]:
-    return {"kind": "ignored", "object": None, "material": None, "feature": feature, "note": note, **names}
+def _row(feature: str, note: str, kind: FindingKind = "ignored", **names: str) -> Finding:
+    return Finding.model_validate(
+        {"object": None, "material": None, **names, "kind": kind, "feature": feature, "note": note}
+    )
 
 
 def test_a_few_get_a_line_each_with_their_names() -> None:
@@ -28,5 +29,5 @@ def test_many_share_a_line_that_counts_them() -> None:
 
 def test_other_kinds_and_features_stay_apart() -> None:
     rows = [_row("hair", "x", object=str(n)) for n in range(5)] + [_row("fog", "y")]
-    rows.append({**_row("hair", "x", object="baked"), "kind": "baked"})
+    rows.append(_row("hair", "x", kind="baked", object="baked"))
     assert finding_lines(rows)[1:] == ["fog: y", "hair (object 'baked'): x"]

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.scene_records import sphere_summary
 
 from dnrpipe.core.cameras import make_cameras
 from dnrpipe.core.settings import CameraSettings
 from dnrpipe.raytrace.variants import choose_variant
 
-SUMMARY = {"bounds": {"center": [0.0, 0.0, 0.0], "radius": 1.2}, "cameras": [], "animation": []}
+SUMMARY = sphere_summary((0.0, 0.0, 0.0), 1.2)
 SPHERE = """<scene version="3.0.0">
   <emitter type="constant"/>
   <shape type="sphere"><bsdf type="diffuse"><rgb name="reflectance" value="0.6, 0.4, 0.2"/></bsdf></shape>

@@ -15,7 +15,7 @@ bpy = pytest.importorskip("bpy")
 
 from dnrpipe.blender.reading.opening import open_scene  # noqa: E402
 from dnrpipe.core.cameras import make_cameras  # noqa: E402
-from dnrpipe.core.scene_files import read_json  # noqa: E402
+from dnrpipe.core.scene_files import read_census, read_summary  # noqa: E402
 from dnrpipe.core.settings import CameraSettings  # noqa: E402
 from dnrpipe.raytrace.variants import choose_variant  # noqa: E402
 from dnrpipe.workers.processes import TaskResult, run_tasks  # noqa: E402
@@ -63,13 +63,13 @@ def traced(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Traced]:
     subprocess.run(command, check=True, timeout=120, capture_output=True)
     sources = {name: HARD / f"{name}.blend" for name in TOLERANCES} | {"unit": unit}
     tasks = [{"source": str(path), "scene_dir": str(root / name)} for name, path in sources.items()]
-    summaries = outcomes("dnrpipe.blender.prepare", {}, tasks, log)
+    outcomes("dnrpipe.blender.prepare", {}, tasks, log)
     choice = choose_variant()
     found = {}
-    for name, summary in zip(sources, summaries, strict=True):
+    for name in sources:
         folder = root / name
         settings = CameraSettings(source="scene", train=1, val=0, test=0, width=SIZE, height=SIZE)
-        (view,) = make_cameras(summary, settings)["train"]
+        (view,) = make_cameras(read_summary(folder), settings)["train"]
         task = {"view": view.model_dump(mode="json"), "output": str(folder / "traced.exr"), "fingerprint": "f"}
         task |= {"spp": SPP, "max_depth": DEPTH, "seed": 5, "integrator": "volpath" if name == "volume" else "path"}
         common = {"bundle": str(folder / "scene.xml"), "variant": choice.variant, "threads": 1}
@@ -182,7 +182,6 @@ def test_builder_makes_the_committed_files(tmp_path: Path) -> None:
 
 
 def test_census_of_a_hard_scene_names_what_it_holds(traced: dict[str, Traced]) -> None:
-    census = read_json(traced["all_glass"].folder / "census.json")
-    assert census["transmission"]
-    findings = read_json(traced["all_mirror"].folder / "census.json")["findings"]
-    assert not [f for f in findings if f["kind"] in ("ignored", "missing")]
+    assert read_census(traced["all_glass"].folder).transmission
+    findings = read_census(traced["all_mirror"].folder).findings
+    assert not [f for f in findings if f.kind in ("ignored", "missing")]

@@ -10,21 +10,24 @@ import subprocess
 import sys
 import threading
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from pydantic import ValidationError
+from tests.scene_records import scene_census, scene_summary
 
 from dnrpipe.core.cameras import read_camera_file
 from dnrpipe.core.errors import UserError
-from dnrpipe.core.scene_files import read_selection
+from dnrpipe.core.scene_files import read_census, read_selection, read_summary
 from dnrpipe.core.settings import CameraSettings
 from dnrpipe.core.workspace import Manifest, Source, Workspace
 from dnrpipe.stages.pipeline import owner_of
 from dnrtrain.contract import ContractError, DamagedFile, SceneFrame, View, file_name, parse_transforms, write_cameras
 from dnrtrain.display import DisplayTransform
 from dnrtrain.exr import read_exr, write_exr
+from dnrtrain.records import Record
 
 REPO = Path(__file__).resolve().parents[1]
 EYE = tuple(tuple(row) for row in np.eye(4).tolist())
@@ -49,6 +52,17 @@ def test_the_fuzz_can_fail(tmp_path: Path) -> None:
 
     careless = Target("a.json", b'{"views": ["a"]}', lambda path: json.loads(path.read_text())["views"][0], text=True)
     assert fuzz("careless", careless, tmp_path, 50, 0)["escaped"] > 10
+
+
+@pytest.mark.parametrize(("record", "read"), [(scene_summary(), read_summary), (scene_census(), read_census)])
+def test_mutated_records_of_a_scene(tmp_path: Path, record: Record, read: Callable[[Path], Record]) -> None:
+    from tools.faults.fuzz import Target, fuzz
+
+    name = f"{read.__name__.removeprefix('read_')}.json"
+    target = Target(name, json.dumps(record.data()).encode(), lambda path: read(path.parent), text=True)
+    row = fuzz(name, target, tmp_path, 300, 0)
+    assert row["escaped"] == 0, row["errors"]
+    assert row["refused"] > 100
 
 
 @pytest.mark.parametrize("header", [b"no array at all", b"\x93NUMPY\x01\x00\x10\x00{'descr': (\x00,\n     "])

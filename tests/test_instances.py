@@ -145,5 +145,5 @@ def test_heavy_crowds_are_simplified_to_the_budget_and_reported() -> None:
     assert heavy.triangles * 200 + unchanged * 200 < 44_000 and before * 200 > 400_000
     assert len(heavy.copies) == 200
     assert np.linalg.norm(heavy.positions, axis=1) == pytest.approx(1, abs=0.1)
-    (finding,) = findings.to_list()
-    assert finding["feature"] == "heavy instances" and f"{before:,}" in finding["note"]
+    (finding,) = findings
+    assert finding.feature == "heavy instances" and f"{before:,}" in finding.note

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.scene_records import sphere_summary
 
 from dnrpipe.core.cameras import make_cameras
 from dnrpipe.core.settings import CameraSettings
@@ -18,7 +19,7 @@ from dnrpipe.raytrace.variants import choose_variant
 from dnrpipe.workers.processes import TaskResult, run_tasks
 from dnrtrain.exr import read_exr
 
-SUMMARY = {"bounds": {"center": [0.0, 0.0, 0.0], "radius": 1.2}, "cameras": [], "animation": []}
+SUMMARY = sphere_summary((0.0, 0.0, 0.0), 1.2)
 BUNDLE = """<scene version="3.0.0">
   <integrator type="path"/>
   <emitter type="constant"/>

@@ -197,4 +197,4 @@ def test_textures_that_are_not_finite_are_a_finding() -> None:
     texels[0, 0, 0], texels[2, 1, 2] = np.nan, np.inf
     fixed = finite_texels(texels, "image 'a'", findings)
     assert np.isfinite(fixed).all() and fixed[0, 0, 0] == 0 and fixed[2, 1, 2] > 1e4
-    assert "2 texels" in findings.to_list()[0]["note"]
+    assert "2 texels" in next(iter(findings)).note

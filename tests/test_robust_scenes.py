@@ -16,6 +16,7 @@ import pytest
 bpy = pytest.importorskip("bpy")
 
 from dnrpipe.core.cameras import depth_range, make_cameras  # noqa: E402
+from dnrpipe.core.scene_files import read_summary  # noqa: E402
 from dnrpipe.core.settings import CameraSettings  # noqa: E402
 from dnrpipe.workers.processes import TaskResult, run_tasks  # noqa: E402
 from dnrtrain.exr import read_exr  # noqa: E402
@@ -67,10 +68,11 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Made]:
         if outcome.result is None:
             found[name] = Made(f"conversion: {outcome.error}")
             continue
-        said[name] = outcome.result["warnings"]
+        summary = read_summary(folders[name] / "scene")
+        said[name] = summary.warnings
         settings = CameraSettings(source="scene", train=1, val=0, test=0, width=SIDE, height=SIDE)
-        (views[name],) = make_cameras(outcome.result, settings)["train"]
-        near, far = depth_range([views[name]], outcome.result)
+        (views[name],) = make_cameras(summary, settings)["train"]
+        near, far = depth_range([views[name]], summary)
         if not 0 < near < far < np.inf:
             found[name] = Made(f"depth range {near} to {far}")
             del views[name]

@@ -306,7 +306,7 @@ def test_lamp_nodes_become_their_colour_and_strength(tmp_path: Path) -> None:
     assert found is not None
     values = [float(v) for v in found.get("value", "").split()]
     assert values == pytest.approx([0.885, 0.422, 0.136], rel=0.01)  # half of 3000 K of luminance 1
-    assert not [entry for entry in findings.to_list() if entry["object"] == "POINT"]
+    assert not [finding for finding in findings if finding.object == "POINT"]
 
 
 def test_hair_melanin_becomes_a_colour(tmp_path: Path) -> None:

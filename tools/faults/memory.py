@@ -173,9 +173,11 @@ def many_candidates(folder: Path, count: int, timeout: float) -> list[Reading]:
 def cameras_of(count: int) -> list[View]:
     """Views of a dome around the unit sphere."""
     from dnrpipe.core.cameras import make_cameras
+    from dnrpipe.core.scene_records import Bounds, SceneSummary
     from dnrpipe.core.settings import CameraSettings
 
-    summary = {"bounds": {"center": [0.0, 0.0, 0.0], "radius": 1.0}, "cameras": [], "animation": []}
+    sphere = Bounds(min=(-1, -1, -1), max=(1, 1, 1), center=(0, 0, 0), radius=1)
+    summary = SceneSummary.model_construct(bounds=sphere, cameras=[])  # no more is asked of it
     chosen = CameraSettings(source="dome", train=count, val=0, test=0, width=SMALL, height=SMALL)
     return make_cameras(summary, chosen)["train"]
 

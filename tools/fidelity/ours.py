@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import shutil
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 import dnrpipe
 from dnrpipe.core.cameras import make_cameras, view_lenses
 from dnrpipe.core.console import Console
+from dnrpipe.core.scene_files import read_census, read_summary
 from dnrpipe.core.settings import CameraSettings, resolve
 from dnrpipe.core.workspace import Source, Workspace, file_sha256
 from dnrpipe.raytrace.variants import choose_variant
@@ -45,10 +45,9 @@ def trace(
     workspace: Workspace, outputs: Sequence[Path], *, size: tuple[int, int], spp: int, bundle: Path | None = None
 ) -> list[dict[str, Any]]:
     """Trace the scene camera's view once per output, each with its own seed; linear premultiplied RGBA EXR."""
-    summary = json.loads((workspace.scene / "summary.json").read_text())
+    summary = read_summary(workspace.scene)
     settings = CameraSettings(source="scene", train=1, val=0, test=0, width=size[0], height=size[1])
-    active = [camera for camera in summary["cameras"] if camera["active"]]
-    summary = {**summary, "cameras": active}
+    summary = summary.model_copy(update={"cameras": [camera for camera in summary.cameras if camera.active]})
     view = make_cameras(summary, settings)["train"][0]
     lens = view_lenses(summary, settings).get(view.name)
     xml = bundle or workspace.scene / "scene.xml"
@@ -95,10 +94,14 @@ def picture(path: Path) -> np.ndarray:
 
 def findings(workspace: Workspace) -> list[dict[str, Any]]:
     """What the conversion said of the scene (``census.json``)."""
-    return json.loads((workspace.scene / "census.json").read_text())["findings"]
+    return [finding.data() for finding in read_census(workspace.scene).findings]
 
 
-CONVERSION = ("blender", "stages/baking.py", "stages/prepare.py", "core/scene_files.py", "core/settings.py")
+CONVERSION = (
+    "blender",
+    *("stages/baking.py", "stages/opening.py", "stages/prepare.py"),
+    *("core/cameras.py", "core/scene_files.py", "core/scene_records.py", "core/settings.py"),
+)
 TRACING = tuple(f"raytrace/{name}.py" for name in ("tracer", "engine", "sensors", "visibility", "coverage"))
 PLUGINS = ("raytrace/plugins",)
 

@@ -133,6 +133,11 @@ def read(path: Path, kind: type[Model]) -> Model:
     try:
         return kind.model_validate_json(path.read_bytes())
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise DamagedFile(path, f"{where}: {first['msg']}" if where else first["msg"]) from None
+        raise DamagedFile(path, first_error(error)) from None
+
+
+def first_error(error: ValidationError) -> str:
+    """The first thing that is wrong, with its place, in one line."""
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"])
+    return f"{where}: {first['msg']}" if where else first["msg"]

@@ -1,4 +1,4 @@
-"""Cameras of the scene file and their animation, for summary.json."""
+"""Cameras of the scene file and their animation."""
 
 from __future__ import annotations
 
@@ -7,18 +7,20 @@ from typing import Any
 
 import bpy
 
+from dnrpipe.core.scene_records import SceneCamera
+
 from .passes.camera import describe
 from .reading.framing import usable
 
 MAX_FRAMES = 500
 
 
-def scene_cameras(scene: bpy.types.Scene) -> list[dict[str, Any]]:
-    """Every camera of the scene that can see, at the current frame (see :func:`camera.describe`)."""
-    return [{"name": obj.name, "active": obj == scene.camera, **describe(obj)} for obj in scene.objects if usable(obj)]
+def scene_cameras(scene: bpy.types.Scene) -> list[SceneCamera]:
+    """Every camera of the scene that can see, at the current frame."""
+    return [describe(obj).model_copy(update={"active": obj == scene.camera}) for obj in scene.objects if usable(obj)]
 
 
-def camera_animation(scene: bpy.types.Scene, max_frames: int = MAX_FRAMES) -> list[dict[str, Any]]:
+def camera_animation(scene: bpy.types.Scene, max_frames: int = MAX_FRAMES) -> list[SceneCamera]:
     """The active camera over the frame range, at most ``max_frames`` frames; [] when it does not move.
 
     Camera markers are followed. Frames are evaluated in a scene that holds the cameras alone, with what they
@@ -39,11 +41,11 @@ def camera_animation(scene: bpy.types.Scene, max_frames: int = MAX_FRAMES) -> li
             helper.frame_set(frame)
             evaluated = None if camera is None else camera.evaluated_get(helper.view_layers[0].depsgraph)
             if evaluated is not None and usable(evaluated):
-                frames.append({"frame": frame, "name": evaluated.name, **describe(evaluated)})
+                frames.append(describe(evaluated).model_copy(update={"frame": frame}))
     finally:
         bpy.data.scenes.remove(helper)
-    moves = any({**f, "frame": 0, "name": ""} != {**frames[0], "frame": 0, "name": ""} for f in frames)
-    return frames if moves else []
+    seen = [camera.model_copy(update={"frame": 0, "name": ""}) for camera in frames]
+    return frames if any(camera != seen[0] for camera in seen) else []
 
 
 def _camera_at(scene: bpy.types.Scene, frame: int) -> Any:

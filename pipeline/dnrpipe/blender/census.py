@@ -10,6 +10,8 @@ from typing import Any
 import bpy
 import numpy as np
 
+from dnrpipe.core.scene_records import Census, ImageFacts, LightFacts, MaterialFacts, WorldFacts
+
 from .census_materials import describe_material
 from .findings import Findings
 from .geometry.frozen import FrozenMesh
@@ -20,54 +22,55 @@ from .shading.sockets import find_input, resolve, surface_source, walk
 NAMES_PER_MATERIAL = 8  # objects listed as examples for each material
 
 
-def take_census(scene: bpy.types.Scene, findings: Findings, meshes: Sequence[FrozenMesh]) -> dict[str, Any]:
+def take_census(scene: bpy.types.Scene, findings: Findings, meshes: Sequence[FrozenMesh]) -> Census:
     """Count the objects, materials, lights, images and special features that renders of ``scene`` see.
 
-    meshes: the frozen geometry, so that nothing is evaluated twice. Missing images are recorded as findings
-    ``missing``; motion blur as ``ignored`` (hair and volume objects are the freezing's to report). The result is
-    JSON-able; its key ``findings`` holds everything collected so far.
+    meshes: the frozen geometry, so that nothing is evaluated twice. Adds missing images to the findings as
+    ``missing``, and motion blur as ``ignored``; freezing reports hair and volumes. The census holds all findings so
+    far; `with_findings` replaces them.
     """
     instances, triangles, by_object = _counts(meshes)
     layer = next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
     types = Counter(obj.type for obj in layer.objects if not obj.hide_render)
     users = _users(meshes)
-    described = {
-        name: {**describe_material(material), "objects": users[name]} for name, material in _materials(users).items()
-    }
-    hair = _hair(scene)
+    described = {name: describe_material(material, users[name]) for name, material in _materials(users).items()}
     volumes = sorted(obj.name for obj in scene.objects if obj.type == "VOLUME" and not obj.hide_render)
-    report: dict[str, Any] = {
-        "scene": scene.name,
-        "blender": bpy.app.version_string,
-        "file_version": ".".join(str(v) for v in bpy.data.version),
-        "objects": dict(sorted(types.items())),
-        "meshes": len(meshes),
-        "instances": instances,
-        "triangles": triangles,
-        "triangles_by_object": by_object,
-        "materials": described,
-        "default_material": users.get(None, []),
-        "lights": _lights(scene),
-        "world": _world(scene.world),
-        "images": _images(findings),
-        "node_groups": sorted({tree.name for tree in bpy.data.node_groups if tree.bl_idname == "ShaderNodeTree"}),
-        "procedural_textures": _using(described, "procedural"),
-        "transparency": _using(described, "transparent"),
-        "transmission": _using(described, "transmissive"),
-        "emission": _using(described, "emissive"),
-        "subsurface": _using(described, "subsurface"),
-        "metals": _using(described, "metallic"),
-        "normal_maps": _using(described, "normal_map"),
-        "view_dependent_nodes": _using(described, "view_dependent"),
-        "volumes": sorted({*volumes, *_using(described, "volume")}),
-        "hair": hair,
-        "depth_of_field": sorted(o.name for o in scene.objects if o.type == "CAMERA" and o.data.dof.use_dof),
-        "motion": _motion(scene, findings),
-        "view_transform": scene.view_settings.view_transform,
-        "render_engine": scene.render.engine,
-    }
-    report["findings"] = findings.to_list()
-    return report
+    return Census(
+        scene=scene.name,
+        blender=bpy.app.version_string,
+        file_version=".".join(str(v) for v in bpy.data.version),
+        objects=dict(sorted(types.items())),
+        meshes=len(meshes),
+        instances=instances,
+        triangles=triangles,
+        triangles_by_object=by_object,
+        materials=described,
+        default_material=users.get(None, []),
+        lights=_lights(scene),
+        world=_world(scene.world),
+        images=_images(findings),
+        node_groups=sorted({tree.name for tree in bpy.data.node_groups if tree.bl_idname == "ShaderNodeTree"}),
+        procedural_textures=_using(described, "procedural"),
+        transparency=_using(described, "transparent"),
+        transmission=_using(described, "transmissive"),
+        emission=_using(described, "emissive"),
+        subsurface=_using(described, "subsurface"),
+        metals=_using(described, "metallic"),
+        normal_maps=_using(described, "normal_map"),
+        view_dependent_nodes=_using(described, "view_dependent"),
+        volumes=sorted({*volumes, *_using(described, "volume")}),
+        hair=_hair(scene),
+        depth_of_field=sorted(o.name for o in scene.objects if o.type == "CAMERA" and o.data.dof.use_dof),
+        motion=_motion(scene, findings),
+        view_transform=scene.view_settings.view_transform,
+        render_engine=scene.render.engine,
+        findings=list(findings),
+    )
+
+
+def with_findings(census: Census, findings: Findings) -> Census:
+    """The census with all that was found since."""
+    return census.model_copy(update={"findings": list(findings)})
 
 
 def _counts(meshes: Sequence[FrozenMesh]) -> tuple[int, int, dict[str, int]]:
@@ -96,42 +99,37 @@ def _materials(users: dict[str | None, list[str]]) -> dict[str, Any]:
     return {name: material for name, material in sorted(found.items()) if material is not None}
 
 
-def _lights(scene: bpy.types.Scene) -> list[dict[str, Any]]:
+def _lights(scene: bpy.types.Scene) -> list[LightFacts]:
     found = []
     for obj, _ in visible_lights(scene):
         light = obj.data
-        entry: dict[str, Any] = {
-            "name": obj.name,
-            "type": light.type,
-            "power": float(light.energy) * 2.0 ** float(light.exposure),
-            "color": [float(v) for v in light.color],
-        }
+        size: dict[str, Any] = {}
         if light.type == "SUN":
-            entry["size"] = float(light.angle)
+            size["size"] = float(light.angle)
         elif light.type == "AREA":
-            entry["shape"] = light.shape
             both = light.shape in {"RECTANGLE", "ELLIPSE"}
-            entry["size"] = [float(light.size), float(light.size_y if both else light.size)]
+            size = {"shape": light.shape, "size": (light.size, light.size_y if both else light.size)}
         else:
-            entry["size"] = float(light.shadow_soft_size)
-        found.append(entry)
+            size["size"] = float(light.shadow_soft_size)
+        power = float(light.energy) * 2.0 ** float(light.exposure)
+        found.append(LightFacts(name=obj.name, type=light.type, power=power, color=tuple(light.color), **size))
     return found
 
 
-def _world(world: Any) -> dict[str, Any] | None:
+def _world(world: Any) -> WorldFacts | None:
     if world is None:
         return None
     tree = world.node_tree
     kinds = Counter(node.type for node in walk(tree))
     image = next((n.image.name for n in walk(tree) if n.type == "TEX_ENVIRONMENT" and n.image), None)
-    return {
-        "name": world.name,
-        "kind": "hdri" if image else "sky" if kinds["TEX_SKY"] else "nodes" if tree else "color",
-        "image": image,
-        "emits": _world_emits(world),
-        "volume": surface_source(tree, "Volume") is not None,
-        "nodes": dict(sorted(kinds.items())),
-    }
+    return WorldFacts(
+        name=world.name,
+        kind="hdri" if image else "sky" if kinds["TEX_SKY"] else "nodes" if tree else "color",
+        image=image,
+        emits=_world_emits(world),
+        volume=surface_source(tree, "Volume") is not None,
+        nodes=dict(sorted(kinds.items())),
+    )
 
 
 def _world_emits(world: Any) -> bool:
@@ -155,7 +153,7 @@ def _world_emits(world: Any) -> bool:
     return True
 
 
-def _images(findings: Findings) -> list[dict[str, Any]]:
+def _images(findings: Findings) -> list[ImageFacts]:
     """Images with users; those whose file is gone are recorded."""
     found = []
     for image in bpy.data.images:
@@ -169,14 +167,14 @@ def _images(findings: Findings) -> list[dict[str, Any]]:
                 f"file not found: {image.filepath}; put it there or pack it into the .blend",
             )
         found.append(
-            {
-                "name": image.name,
-                "size": [int(v) for v in image.size],
-                "float": bool(image.is_float),
-                "packed": image.packed_file is not None,
-                "color_space": image.colorspace_settings.name,
-                "missing": missing,
-            }
+            ImageFacts(
+                name=image.name,
+                size=tuple(image.size),
+                float=bool(image.is_float),
+                packed=image.packed_file is not None,
+                color_space=image.colorspace_settings.name,
+                missing=missing,
+            )
         )
     return found
 
@@ -217,5 +215,5 @@ def _motion(scene: bpy.types.Scene, findings: Findings) -> list[str]:
     return moving
 
 
-def _using(materials: dict[str, dict[str, Any]], feature: str) -> list[str]:
-    return sorted(name for name, entry in materials.items() if entry[feature])
+def _using(materials: dict[str, MaterialFacts], feature: str) -> list[str]:
+    return sorted(name for name, facts in materials.items() if getattr(facts, feature))

@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
+from dnrpipe.core.scene_records import MaterialFacts
+
 from .shading.sockets import find_input, resolve, surface_source, walk
 
 PROCEDURAL = {
@@ -39,12 +41,8 @@ NOT_REFLECTING = {"EMISSION", "HOLDOUT", "BACKGROUND", "BSDF_TRANSPARENT", "MIX_
 STRUCTURE = {"GROUP", "GROUP_INPUT", "REROUTE"}
 
 
-def describe_material(material: Any) -> dict[str, Any]:
-    """JSON-able facts of one material.
-
-    min_roughness: smallest roughness of its mirror-like lobes, 0 to 1; None when it has none or it is an image
-    (then roughness_linked). ior: largest index of refraction of a transmitting lobe, or None.
-    """
+def describe_material(material: Any, objects: list[str]) -> MaterialFacts:
+    """The facts of one material. objects: some that show it."""
     tree = material.node_tree
     nodes = list(_reachable(tree))
     kinds = {node.type for node in nodes}
@@ -54,30 +52,31 @@ def describe_material(material: Any) -> dict[str, Any]:
         n for n in principled if _active(n, "Transmission Weight", "Transmission")
     ]
     rough = [_roughness(node) for node in glossy]
-    return {
-        "bsdfs": sorted({node.bl_label for node in nodes if _is_shader(node)}),
-        "nodes": dict(sorted(Counter(node.bl_label for node in nodes).items())),
-        "procedural": sorted(node.bl_label for node in nodes if node.type in PROCEDURAL),
-        "reflects": tree is None or any(_is_shader(n) and n.type not in NOT_REFLECTING for n in nodes),
-        "glossy": bool(glossy),
-        "transparent": "BSDF_TRANSPARENT" in kinds or any(_active(n, "Alpha", off=1.0) for n in principled),
-        "transmissive": bool(kinds & TRANSMISSIVE) or bool(refracting),
-        "refractive": bool(refracting),
-        "ior": max((_number(n, 1.45, "IOR") for n in refracting), default=None),
-        "emissive": any(_emits(n) for n in nodes if n.type in {"EMISSION", "BSDF_PRINCIPLED"}),
-        "subsurface": "SUBSURFACE_SCATTERING" in kinds
+    return MaterialFacts(
+        bsdfs=sorted({node.bl_label for node in nodes if _is_shader(node)}),
+        nodes=dict(sorted(Counter(node.bl_label for node in nodes).items())),
+        procedural=sorted(node.bl_label for node in nodes if node.type in PROCEDURAL),
+        reflects=tree is None or any(_is_shader(n) and n.type not in NOT_REFLECTING for n in nodes),
+        glossy=bool(glossy),
+        transparent="BSDF_TRANSPARENT" in kinds or any(_active(n, "Alpha", off=1.0) for n in principled),
+        transmissive=bool(kinds & TRANSMISSIVE) or bool(refracting),
+        refractive=bool(refracting),
+        ior=max((_number(n, 1.45, "IOR") for n in refracting), default=None),
+        emissive=any(_emits(n) for n in nodes if n.type in {"EMISSION", "BSDF_PRINCIPLED"}),
+        subsurface="SUBSURFACE_SCATTERING" in kinds
         or any(_active(n, "Subsurface Weight", "Subsurface") for n in principled),
-        "metallic": bool(kinds & {"BSDF_GLOSSY", "BSDF_METALLIC"}) or any(_active(n, "Metallic") for n in principled),
-        "normal_map": "NORMAL_MAP" in kinds,
-        "bump": "BUMP" in kinds,
-        "volume": bool(kinds & VOLUME_NODES) or surface_source(tree, "Volume") is not None,
-        "displacement": surface_source(tree, "Displacement") is not None,
-        "thin_film": any(_active(n, "Thin Film Thickness") for n in nodes),
-        "hair": bool(kinds & HAIR),
-        "view_dependent": sorted({node.bl_label for node in nodes if node.type in VIEW_DEPENDENT}),
-        "min_roughness": min((value for value in rough if value is not None), default=None),
-        "roughness_linked": any(value is None for value in rough),
-    }
+        metallic=bool(kinds & {"BSDF_GLOSSY", "BSDF_METALLIC"}) or any(_active(n, "Metallic") for n in principled),
+        normal_map="NORMAL_MAP" in kinds,
+        bump="BUMP" in kinds,
+        volume=bool(kinds & VOLUME_NODES) or surface_source(tree, "Volume") is not None,
+        displacement=surface_source(tree, "Displacement") is not None,
+        thin_film=any(_active(n, "Thin Film Thickness") for n in nodes),
+        hair=bool(kinds & HAIR),
+        view_dependent=sorted({node.bl_label for node in nodes if node.type in VIEW_DEPENDENT}),
+        min_roughness=min((value for value in rough if value is not None), default=None),
+        roughness_linked=any(value is None for value in rough),
+        objects=objects,
+    )
 
 
 def _reachable(tree: Any) -> Iterator[Any]:

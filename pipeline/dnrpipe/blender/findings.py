@@ -1,26 +1,10 @@
-"""What the conversion did with each feature of a scene: the user is always told. No bpy here."""
+"""What the conversion did with each feature of a scene. No bpy here."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from collections.abc import Iterator
 
-Kind = Literal["exact", "approximated", "baked", "ignored", "missing"]
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One feature and what became of it.
-
-    kind: exact (converted one to one), approximated (converted, visibly different in general), baked
-    (turned into an image), ignored (left out), missing (the scene refers to something that is not there).
-    """
-
-    kind: Kind
-    object: str | None
-    material: str | None
-    feature: str
-    note: str
+from dnrpipe.core.scene_records import Finding, FindingKind
 
 
 def printable(text: str) -> str:
@@ -36,7 +20,7 @@ class Findings:
 
     def add(
         self,
-        kind: Kind,
+        kind: FindingKind,
         feature: str,
         note: str,
         *,
@@ -46,16 +30,16 @@ class Findings:
         """Record a finding; a repetition is dropped."""
         owner = None if object is None else printable(object)
         shader = None if material is None else printable(material)
-        self._found.setdefault(Finding(kind, owner, shader, printable(feature), printable(note)))
+        found = Finding(kind=kind, object=owner, material=shader, feature=printable(feature), note=printable(note))
+        self._found.setdefault(found)
 
     def merge(self, other: Findings) -> None:
         """Add all of another collector's findings."""
-        for finding in other._found:
+        for finding in other:
             self._found.setdefault(finding)
 
-    def to_list(self) -> list[dict[str, Any]]:
-        """JSON-able list of {"kind", "object", "material", "feature", "note"}."""
-        return [asdict(finding) for finding in self._found]
+    def __iter__(self) -> Iterator[Finding]:
+        return iter(self._found)
 
     def __len__(self) -> int:
         return len(self._found)

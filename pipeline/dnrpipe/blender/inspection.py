@@ -1,51 +1,52 @@
-"""Worker of `dnrpipe inspect`: open, freeze, count, and convert into a folder that nobody keeps."""
+"""Worker of `dnrpipe inspect`: opens, freezes, counts, and converts into a folder that nobody keeps."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import bpy
 
 from dnrpipe.core.errors import NothingVisible
 
-from .baking.rehearsal import BakeOptions, convert_materials, place_atlas
+from .baking.rehearsal import convert_materials, place_atlas
 from .bundle.export import export_bundle
-from .census import take_census
+from .census import take_census, with_findings
 from .findings import Findings
 from .reading.loading import load_scene
 from .reading.missing import note_missing
 from .reading.scripts import note_drivers
+from .tasks import BakeOptions, InspectAnswer, InspectTask
 
 
 class Worker:
-    """Inspects one scene per task: ``source`` (file), ``folder`` (scratch for the converted bundle), ``bake_size``."""
+    """Inspects one scene per task, an `InspectTask`."""
 
     def __init__(self, common: dict[str, Any]) -> None:
         del common
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
-        try:
-            loaded = load_scene(Path(task["source"]))
-        except NothingVisible as nothing:
-            return _without_surface(str(nothing))
-        folder = Path(task["folder"])
-        folder.mkdir(parents=True)
-        meshes, findings = loaded.frozen.meshes, loaded.findings
-        place_atlas(meshes, folder)
-        census = take_census(loaded.scene, findings, meshes)
-        # What would be baked is in the findings; placeholders stand for it in the bundle.
-        converter = convert_materials(meshes, folder, findings, BakeOptions(folder / "bakes", int(task["bake_size"])))
-        export_bundle(meshes, folder, findings, converter)
-        census["findings"] = findings.to_list()
-        return {"census": census, "warnings": loaded.warnings}
+        return inspect(InspectTask.model_validate(task)).data()
 
 
-def _without_surface(reason: str) -> dict[str, Any]:
+def inspect(task: InspectTask) -> InspectAnswer:
+    """Census, findings of the conversion, and warnings. Raises UserError for unusable input."""
+    try:
+        loaded = load_scene(task.source)
+    except NothingVisible as nothing:
+        return _without_surface(str(nothing))
+    task.folder.mkdir(parents=True)
+    meshes, findings = loaded.frozen.meshes, loaded.findings
+    place_atlas(meshes, task.folder)
+    census = take_census(loaded.scene, findings, meshes)
+    # What would be baked is in the findings; placeholders stand for it in the bundle.
+    bakes = BakeOptions(folder=task.folder / "bakes", size=task.bake_size)
+    export_bundle(meshes, task.folder, findings, convert_materials(meshes, task.folder, findings, bakes))
+    return InspectAnswer(census=with_findings(census, findings), warnings=loaded.warnings)
+
+
+def _without_surface(reason: str) -> InspectAnswer:
     """What can be said of the open file when there is nothing to convert; ``reason`` is a warning."""
     findings = Findings()
     note_missing(findings)
     note_drivers(findings)
-    census = take_census(bpy.context.scene, findings, [])
-    census["findings"] = findings.to_list()
-    return {"census": census, "warnings": [reason]}
+    return InspectAnswer(census=take_census(bpy.context.scene, findings, []), warnings=[reason])

@@ -85,7 +85,7 @@ def _render(
     else:
         if resolution is not None:
             cameras = cameras.model_copy(update={"width": resolution, "height": resolution})
-        views = orbit_views(read_summary(session.workspace), cameras, orbit, elevation)
+        views = orbit_views(read_summary(session.workspace.scene), cameras, orbit, elevation)
         name = f"orbit-{orbit}"
     console = session.console
     run = session.run.for_stage("render")

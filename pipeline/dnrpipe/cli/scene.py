@@ -30,7 +30,7 @@ def inspect(scene: Path, as_json: bool) -> None:
     from ..stages.inspect_scene import describe, inspect_scene
 
     found = inspect_scene(scene)
-    click.echo(json.dumps(found, indent=2) if as_json else describe(found))
+    click.echo(json.dumps(found.data(), indent=2) if as_json else describe(found))
 
 
 @click.command()

@@ -12,13 +12,13 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from dnrtrain.contract import SPLITS, ContractError, View, file_name, parse_transforms, unique_names
 
 from .errors import UserError
+from .scene_records import Lens, SceneCamera, SceneSummary
 from .settings import CameraSettings
 
 KEYWORDS = ("auto", "dome", "sphere", "scene", "animation")
@@ -30,8 +30,8 @@ LOWEST, HIGHEST = math.radians(5.0), math.radians(85.0)
 _STREAM = {"train": 0, "val": 1, "test": 2}
 
 
-def make_cameras(summary: dict[str, Any], settings: CameraSettings) -> dict[str, list[View]]:
-    """Views of each split for a prepared scene (``scene/summary.json``).
+def make_cameras(summary: SceneSummary, settings: CameraSettings) -> dict[str, list[View]]:
+    """Views of each split for a prepared scene.
 
     Raises UserError: a source that the scene does not have, or a broken camera file.
     """
@@ -48,12 +48,12 @@ def make_cameras(summary: dict[str, Any], settings: CameraSettings) -> dict[str,
             for split in SPLITS
         }
     if source == "scene":
-        cameras = [c for c in summary["cameras"] if c["type"] == "PERSP"]
+        cameras = [c for c in summary.cameras if c.type == "PERSP"]
         if not cameras:
             raise UserError("--cameras scene: the scene has no perspective camera; use --cameras dome")
         return split_views(unique_names([_scene_view(c, settings) for c in cameras]), settings)
     if source == "animation":
-        frames = [f for f in summary["animation"] if f.get("type", "PERSP") == "PERSP"]
+        frames = [f for f in summary.animation if f.type == "PERSP"]
         if len(frames) < 2:
             raise UserError("--cameras animation: the active camera does not move; use --cameras scene or dome")
         return split_views([_scene_view(f, settings) for f in frames], settings)
@@ -77,21 +77,20 @@ def own_splits(path: Path, views: Sequence[View]) -> dict[str, list[View]] | Non
     return {split: [v for v, own in zip(views, named, strict=True) if own == split] for split in SPLITS}
 
 
-def view_lenses(summary: dict[str, Any], settings: CameraSettings) -> dict[str, dict[str, float]]:
+def view_lenses(summary: SceneSummary, settings: CameraSettings) -> dict[str, Lens]:
     """Lenses of the views whose camera in the scene has depth of field, by view name.
 
-    {"aperture_radius", "focus_distance"} in scene units. Only the scene's own cameras have lenses; domes, spheres
-    and camera files are pinholes.
+    Only the scene's own cameras have lenses; domes, spheres and camera files are pinholes.
     """
     if settings.source == "scene":
-        cameras = [c for c in summary["cameras"] if c["type"] == "PERSP"]
+        cameras = [c for c in summary.cameras if c.type == "PERSP"]
         named = unique_names([_scene_view(camera, settings) for camera in cameras])
     elif settings.source == "animation":
-        cameras = [f for f in summary["animation"] if f.get("type", "PERSP") == "PERSP"]
+        cameras = [f for f in summary.animation if f.type == "PERSP"]
         named = [_scene_view(frame, settings) for frame in cameras]
     else:
         return {}
-    return {view.name: camera["dof"] for view, camera in zip(named, cameras, strict=True) if camera.get("dof")}
+    return {view.name: camera.dof for view, camera in zip(named, cameras, strict=True) if camera.dof}
 
 
 def read_camera_file(path: Path, settings: CameraSettings) -> list[View]:
@@ -118,7 +117,7 @@ def read_camera_file(path: Path, settings: CameraSettings) -> list[View]:
 
 
 def sphere_views(
-    summary: dict[str, Any], settings: CameraSettings, *, count: int, stream: int, hemisphere: bool
+    summary: SceneSummary, settings: CameraSettings, *, count: int, stream: int, hemisphere: bool
 ) -> list[View]:
     """``count`` views on a (hemi)sphere that looks at the scene's centre.
 
@@ -126,9 +125,8 @@ def sphere_views(
     splits never share a direction. The lens is the scene camera's where it has one.
     """
     rng = np.random.default_rng([settings.seed, stream])
-    center = np.asarray(summary["bounds"]["center"], dtype=np.float64)
-    radius = float(summary["bounds"]["radius"])
-    focal, distance = framing(summary, settings, radius)
+    center = np.asarray(summary.bounds.center, dtype=np.float64)
+    focal, distance = framing(summary, settings)
     low, high = (math.sin(LOWEST), math.sin(HIGHEST)) if hemisphere else (-math.sin(HIGHEST), math.sin(HIGHEST))
     turn = rng.uniform(0, 2 * math.pi)
     order = (np.arange(count) + rng.uniform(0, 1, count)) / max(count, 1)
@@ -145,11 +143,11 @@ def sphere_views(
 
 
 def orbit_views(
-    summary: dict[str, Any], settings: CameraSettings, count: int, elevation_degrees: float = 25.0
+    summary: SceneSummary, settings: CameraSettings, count: int, elevation_degrees: float = 25.0
 ) -> list[View]:
     """A turntable: ``count`` views at one elevation, evenly spaced over a full turn."""
-    center = np.asarray(summary["bounds"]["center"], dtype=np.float64)
-    focal, distance = framing(summary, settings, float(summary["bounds"]["radius"]))
+    center = np.asarray(summary.bounds.center, dtype=np.float64)
+    focal, distance = framing(summary, settings)
     elevation = math.radians(elevation_degrees)
     views = []
     for index in range(count):
@@ -201,26 +199,26 @@ def scaled_to(view: View, side: int) -> View:
     )
 
 
-def depth_range(views: Sequence[View], summary: dict[str, Any]) -> tuple[float, float]:
+def depth_range(views: Sequence[View], summary: SceneSummary) -> tuple[float, float]:
     """(near, far) planar depth, scene units, that holds the bounding sphere for every view."""
-    center = np.asarray(summary["bounds"]["center"])
-    radius = float(summary["bounds"]["radius"])
+    center = np.asarray(summary.bounds.center)
+    radius = summary.bounds.radius
     planar = [float(-(np.linalg.inv(v.matrix) @ np.append(center, 1.0))[2]) for v in views]
     near = max(min(planar) - radius, 1e-3 * radius)
     return near, max(max(planar) + radius, near * 1.001)
 
 
-def framing(summary: dict[str, Any], settings: CameraSettings, radius: float) -> tuple[float, float]:
+def framing(summary: SceneSummary, settings: CameraSettings) -> tuple[float, float]:
     """(focal length in pixels, camera distance): the bounding sphere fits the shorter side.
 
     The lens is the scene camera's, or Blender's default where it has none.
     """
-    active = next((c for c in summary["cameras"] if c.get("active") and c["type"] == "PERSP"), None)
-    lens, sensor = (active["lens"], active["sensor_width"]) if active else (DEFAULT_LENS, DEFAULT_SENSOR)
+    active = next((c for c in summary.cameras if c.active and c.type == "PERSP"), None)
+    lens, sensor = (active.lens, active.sensor_width) if active else (DEFAULT_LENS, DEFAULT_SENSOR)
     focal = lens / sensor * max(settings.width, settings.height)
     half_angle = math.atan(0.5 * min(settings.width, settings.height) / focal)
     # A sphere touches the edge of the frustum at radius / sin(half angle).
-    return focal, settings.distance * radius / math.sin(half_angle)
+    return focal, settings.distance * summary.bounds.radius / math.sin(half_angle)
 
 
 def look_at_view(name: str, position: np.ndarray, target: np.ndarray, focal: float, settings: CameraSettings) -> View:
@@ -243,27 +241,27 @@ def look_at_view(name: str, position: np.ndarray, target: np.ndarray, focal: flo
     )
 
 
-def _scene_view(camera: dict[str, Any], settings: CameraSettings) -> View:
+def _scene_view(camera: SceneCamera, settings: CameraSettings) -> View:
     """Blender camera -> View. Sensor fit and shift as in Blender's manual, "Camera / Lens"."""
     width, height = settings.width, settings.height
-    fit = camera["sensor_fit"]
+    fit = camera.sensor_fit
     if fit == "AUTO":
         fit = "HORIZONTAL" if width >= height else "VERTICAL"
-        sensor = camera["sensor_width"]
+        sensor = camera.sensor_width
     else:
-        sensor = camera["sensor_width"] if fit == "HORIZONTAL" else camera["sensor_height"]
+        sensor = camera.sensor_width if fit == "HORIZONTAL" else camera.sensor_height
     side = width if fit == "HORIZONTAL" else height
-    focal = camera["lens"] / sensor * side
-    name = f"frame{camera['frame']:05d}" if "frame" in camera else camera["name"]
+    focal = camera.lens / sensor * side
+    name = f"frame{camera.frame:05d}" if camera.frame is not None else camera.name
     return View(
         name=file_name(name),
         width=width,
         height=height,
         fl_x=focal,
         fl_y=focal,
-        cx=width / 2 - camera["shift_x"] * side,
-        cy=height / 2 + camera["shift_y"] * side,
-        c2w=tuple(tuple(float(x) for x in row) for row in camera["c2w"]),
+        cx=width / 2 - camera.shift_x * side,
+        cy=height / 2 + camera.shift_y * side,
+        c2w=camera.c2w,
     )
 
 

@@ -1,19 +1,24 @@
-"""Read ``scene/``: summary, frame, and the fingerprint of what the scene was converted from."""
+"""Read ``scene/``: summary, census, frame, and the fingerprint of what the scene was converted from."""
 
 from __future__ import annotations
 
 import functools
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+from pydantic import BaseModel
 
 from dnrtrain.contract import SPLITS, DamagedFile, SceneFrame, View, read_cameras
 from dnrtrain.records import Selection, read
 
 from .errors import UserError
+from .scene_records import Census, Prepared, RasterChoice, SceneSummary
 from .workspace import Workspace, digest, file_sha256
 
 SCENE_VERSION = 6  # raise when the conversion or the G-buffer scene changes what it writes
+
+Model = TypeVar("Model", bound=BaseModel)
 
 
 def read_json(path: Path) -> Any:
@@ -30,35 +35,55 @@ def _missing(path: Path) -> UserError:
     return UserError(f"{path}: is missing; run `dnrpipe prepare --force`")
 
 
-def read_summary(workspace: Workspace) -> dict[str, Any]:
-    """``scene/summary.json``: bounds, cameras, counts, external files."""
-    return read_json(workspace.scene / "summary.json")
+def read_record(path: Path, kind: type[Model]) -> Model:
+    """JSON that an earlier stage wrote, as a record. Raises UserError, DamagedFile as `read_json`."""
+    try:
+        return read(path, kind)
+    except FileNotFoundError:
+        raise _missing(path) from None
+
+
+def read_summary(scene: Path) -> SceneSummary:
+    """``summary.json`` of the folder ``scene/``. Raises UserError, DamagedFile as `read_json`."""
+    return read_record(scene / "summary.json", SceneSummary)
+
+
+def read_census(scene: Path) -> Census:
+    """``census.json`` of the folder ``scene/``. Raises UserError, DamagedFile as `read_json`."""
+    return read_record(scene / "census.json", Census)
+
+
+def read_prepared(scene: Path) -> Prepared:
+    """``prepared.json`` of the folder ``scene/``. Raises UserError, DamagedFile as `read_json`."""
+    return read_record(scene / "prepared.json", Prepared)
+
+
+def read_raster_choice(workspace: Workspace) -> RasterChoice | None:
+    """``passes/raster.json``, or None while no engine is chosen. Raises DamagedFile as `read_json`."""
+    path = workspace.root / "passes" / "raster.json"
+    return read_record(path, RasterChoice) if path.exists() else None
 
 
 def read_frame(workspace: Workspace) -> SceneFrame:
-    """``scene/frame.json``. Raises UserError when it is missing, DamagedFile when it does not read."""
-    path = workspace.scene / "frame.json"
-    try:
-        return read(path, SceneFrame)
-    except FileNotFoundError:
-        raise _missing(path) from None
+    """``scene/frame.json``. Raises UserError, DamagedFile as `read_json`."""
+    return read_record(workspace.scene / "frame.json", SceneFrame)
 
 
 def scene_fingerprint(workspace: Workspace) -> str:
     """Hash of what the scene is converted from: the scene file and the files it refers to.
 
-    A file that is gone counts as it was: a workspace lives without its sources. A damaged summary counts as none.
+    A file that is gone counts as it was: a workspace lives without its sources. A missing or damaged summary counts
+    as one without such files.
     """
-    summary = workspace.scene / "summary.json"
     try:
-        content = read_json(summary) if summary.exists() else {}
-    except DamagedFile:
-        content = {}
-    recorded: dict[str, str] = content.get("external", {})
+        summary = read_summary(workspace.scene)
+        recorded, bake_size = summary.external, summary.bake_size
+    except (UserError, DamagedFile):
+        recorded, bake_size = {}, None
     current = {name: _sha256_now(Path(name)) if Path(name).is_file() else sha for name, sha in recorded.items()}
     # Without their folders: moving a scene with its textures changes nothing.
     files = sorted((Path(name).name, sha) for name, sha in current.items())
-    return digest([SCENE_VERSION, workspace.manifest.source.sha256, files, content.get("bake_size")])
+    return digest([SCENE_VERSION, workspace.manifest.source.sha256, files, bake_size])
 
 
 def _sha256_now(path: Path) -> str:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+
+from ..core.effect_names import EffectName
+from ..core.scene_records import Census, MaterialFacts, WorldFacts
 
 SHARP = 0.25
 """Roughness up to which metal and glass throw caustics that a viewer would notice."""
@@ -20,7 +22,7 @@ class Evidence:
     words: tuple[str, ...] = ()
 
 
-NOTHING: dict[str, str] = {
+NOTHING: dict[EffectName, str] = {
     "indirect": "no surface reflects light",
     "refraction": "no material refracts",
     "caustics": "no sharp metal or glass beside a surface that shows its caustics",
@@ -41,31 +43,29 @@ NOTHING: dict[str, str] = {
 }
 
 
-def gather(
-    census: Mapping[str, Any], bundle: Mapping[str, Sequence[str]], lenses: Sequence[str]
-) -> dict[Any, Evidence]:
+def gather(census: Census, bundle: Mapping[str, Sequence[str]], lenses: Sequence[str]) -> dict[EffectName, Evidence]:
     """Evidence by effect name."""
-    materials: Mapping[str, Mapping[str, Any]] = census.get("materials", {})
-    result = {
+    materials = census.materials
+    result: dict[EffectName, Evidence] = {
         "indirect": _indirect(census, materials),
-        "refraction": _held(bundle, "refraction", _where(materials, lambda m: m["refractive"], _with_ior)),
+        "refraction": _held(bundle, "refraction", _where(materials, lambda m: m.refractive, _with_ior)),
         "caustics": _caustics(materials, bundle),
         "volumes": _held(bundle, "volumes", _volumes(census, materials)),
-        "subsurface": _held(bundle, "subsurface", _where(materials, lambda m: m["subsurface"])),
-        "alpha": _held(bundle, "alpha", _where(materials, lambda m: m["transparent"])),
-        "environment": _held(bundle, "environment", _world(census.get("world"))),
+        "subsurface": _held(bundle, "subsurface", _where(materials, lambda m: m.subsurface)),
+        "alpha": _held(bundle, "alpha", _where(materials, lambda m: m.transparent)),
+        "environment": _held(bundle, "environment", _world(census.world)),
         "area-lights": _held(bundle, "area-lights", _lamps(census, sized=True)),
         "point-lights": _held(bundle, "point-lights", _lamps(census, sized=False)),
-        "glow": _held(bundle, "glow", _where(materials, lambda m: m["emissive"])),
-        "hair": _held(bundle, "hair", tuple(f"'{name}'" for name in census.get("hair", ()))),
+        "glow": _held(bundle, "glow", _where(materials, lambda m: m.emissive)),
+        "hair": _held(bundle, "hair", tuple(f"'{name}'" for name in census.hair)),
         "depth-of-field": _lenses(census, lenses),
         "spectral": _spectral(materials),
         "motion": _motion(census),
     }
-    shiny = [f"'{n}'" for n, m in materials.items() if m["glossy"] or m["transmissive"] or m["view_dependent"]]
+    shiny = [f"'{n}'" for n, m in materials.items() if m.glossy or m.transmissive or m.view_dependent]
     glossy = (f"{len(shiny)} materials are not matt: {_list(shiny)}",) if shiny else ()
     result["view-dependence"] = Evidence(bool(glossy), True, glossy)
-    shared = census.get("instances", 0) > census.get("meshes", census.get("instances", 0))
+    shared = census.instances > census.meshes
     extra = (("instances share one place in the atlas",) if shared else ()) + glossy
     result["depth"] = result["normal"] = Evidence(bool(extra), True, extra)
     return result
@@ -82,9 +82,9 @@ def _held(bundle: Mapping[str, Sequence[str]], name: str, words: tuple[str, ...]
 
 
 def _where(
-    materials: Mapping[str, Mapping[str, Any]],
-    wanted: Callable[[Mapping[str, Any]], Any],
-    detail: Callable[[Mapping[str, Any]], str] = lambda entry: "",
+    materials: Mapping[str, MaterialFacts],
+    wanted: Callable[[MaterialFacts], object],
+    detail: Callable[[MaterialFacts], str] = lambda entry: "",
 ) -> tuple[str, ...]:
     """A sentence for each material that fits: its name, what is special, the objects that show it."""
     words = []
@@ -96,9 +96,8 @@ def _where(
     return tuple(words)
 
 
-def _on(entry: Mapping[str, Any]) -> str:
-    objects = entry.get("objects", ())
-    return f"on {_list([repr(name) for name in objects])}" if objects else ""
+def _on(entry: MaterialFacts) -> str:
+    return f"on {_list([repr(name) for name in entry.objects])}" if entry.objects else ""
 
 
 def _list(names: Sequence[str]) -> str:
@@ -106,34 +105,34 @@ def _list(names: Sequence[str]) -> str:
     return ", ".join(names[:LISTED]) + (f" and {more} more" if more > 0 else "")
 
 
-def _with_ior(entry: Mapping[str, Any]) -> str:
-    return f"index {entry['ior']:.3g}" if entry.get("ior") else ""
+def _with_ior(entry: MaterialFacts) -> str:
+    return f"index {entry.ior:.3g}" if entry.ior else ""
 
 
-def _with_roughness(entry: Mapping[str, Any]) -> str:
-    return "roughness by image" if entry["min_roughness"] is None else f"roughness {entry['min_roughness']:.2g}"
+def _with_roughness(entry: MaterialFacts) -> str:
+    return "roughness by image" if entry.min_roughness is None else f"roughness {entry.min_roughness:.2g}"
 
 
-def _indirect(census: Mapping[str, Any], materials: Mapping[str, Mapping[str, Any]]) -> Evidence:
-    names = [name for name, entry in materials.items() if entry["reflects"]]
-    count = len(names) + bool(census.get("default_material"))
+def _indirect(census: Census, materials: Mapping[str, MaterialFacts]) -> Evidence:
+    names = [name for name, entry in materials.items() if entry.reflects]
+    count = len(names) + bool(census.default_material)
     if not count:
         return Evidence(False, False)
-    passing = [name for name, entry in materials.items() if entry["transparent"] or entry["transmissive"]]
+    passing = [name for name, entry in materials.items() if entry.transparent or entry.transmissive]
     words = f"{count} material{'s' if count > 1 else ''} reflect light"
     if passing:
         words += f"; {_list([repr(name) for name in passing])} let it pass"
     return Evidence(True, True, (words,))
 
 
-def _caustics(materials: Mapping[str, Mapping[str, Any]], bundle: Mapping[str, Sequence[str]]) -> Evidence:
-    def throws(entry: Mapping[str, Any]) -> bool:
-        sharp = entry["roughness_linked"] or (entry["min_roughness"] is not None and entry["min_roughness"] <= SHARP)
-        return bool(sharp and (entry["metallic"] or entry["refractive"]))
+def _caustics(materials: Mapping[str, MaterialFacts], bundle: Mapping[str, Sequence[str]]) -> Evidence:
+    def throws(entry: MaterialFacts) -> bool:
+        sharp = entry.roughness_linked or (entry.min_roughness is not None and entry.min_roughness <= SHARP)
+        return bool(sharp and (entry.metallic or entry.refractive))
 
-    def shows(entry: Mapping[str, Any]) -> bool:
-        mirror = entry["metallic"] or entry["refractive"]
-        return bool(entry["reflects"] and not (mirror and throws(entry)))
+    def shows(entry: MaterialFacts) -> bool:
+        mirror = entry.metallic or entry.refractive
+        return bool(entry.reflects and not (mirror and throws(entry)))
 
     words = _where(materials, throws, _with_roughness)
     if not words or not any(shows(entry) for entry in materials.values()):
@@ -142,49 +141,45 @@ def _caustics(materials: Mapping[str, Mapping[str, Any]], bundle: Mapping[str, S
     return Evidence(True, not bundle.get("volumes"), words)
 
 
-def _volumes(census: Mapping[str, Any], materials: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:
-    words = list(_where(materials, lambda m: m["volume"]))
-    words += [f"'{name}'" for name in census.get("volumes", ()) if name not in materials]
-    world = census.get("world")
-    if world and world.get("volume"):
-        words.append(f"world '{world['name']}'")
+def _volumes(census: Census, materials: Mapping[str, MaterialFacts]) -> tuple[str, ...]:
+    words = list(_where(materials, lambda m: m.volume))
+    words += [f"'{name}'" for name in census.volumes if name not in materials]
+    if census.world and census.world.volume:
+        words.append(f"world '{census.world.name}'")
     return tuple(words)
 
 
-def _world(world: Mapping[str, Any] | None) -> tuple[str, ...]:
-    if not world or not world.get("emits", True):
+def _world(world: WorldFacts | None) -> tuple[str, ...]:
+    if not world or not world.emits:
         return ()
-    what = {"hdri": f"image '{world.get('image')}'", "sky": "sky", "color": "plain colour"}.get(world["kind"], "nodes")
-    return (f"world '{world['name']}' ({what})",)
+    what = {"hdri": f"image '{world.image}'", "sky": "sky", "color": "plain colour"}.get(world.kind, "nodes")
+    return (f"world '{world.name}' ({what})",)
 
 
-def _lamps(census: Mapping[str, Any], *, sized: bool) -> tuple[str, ...]:
+def _lamps(census: Census, *, sized: bool) -> tuple[str, ...]:
     words = []
-    for lamp in census.get("lights", ()):
-        size = lamp["size"]
-        largest = max(size) if isinstance(size, list | tuple) else size
-        if lamp["power"] and (largest > 0) == sized:
-            words.append(f"{lamp['type'].lower()} lamp '{lamp['name']}'")
+    for lamp in census.lights:
+        largest = max(lamp.size) if isinstance(lamp.size, tuple) else lamp.size
+        if lamp.power and (largest > 0) == sized:
+            words.append(f"{lamp.type.lower()} lamp '{lamp.name}'")
     return (_list(words),) if words else ()
 
 
-def _lenses(census: Mapping[str, Any], lenses: Sequence[str]) -> Evidence:
+def _lenses(census: Census, lenses: Sequence[str]) -> Evidence:
     if lenses:
         return Evidence(True, True, (f"camera {_list([repr(name) for name in lenses])}",))
-    unused = census.get("depth_of_field", ())
-    if not unused:
+    if not census.depth_of_field:
         return Evidence(False, False)
-    named = _list([repr(name) for name in unused])
+    named = _list([repr(name) for name in census.depth_of_field])
     return Evidence(False, False, (f"camera {named} has it, but the views in use are not its own",))
 
 
-def _spectral(materials: Mapping[str, Mapping[str, Any]]) -> Evidence:
-    films = _where(materials, lambda m: m["thin_film"])
+def _spectral(materials: Mapping[str, MaterialFacts]) -> Evidence:
+    films = _where(materials, lambda m: m.thin_film)
     return Evidence(False, False, ("not in the converted scene, see `dnrpipe inspect`", *films) if films else ())
 
 
-def _motion(census: Mapping[str, Any]) -> Evidence:
-    moving = census.get("motion", ())
-    if not moving:
+def _motion(census: Census) -> Evidence:
+    if not census.motion:
         return Evidence(False, False)
-    return Evidence(False, False, (f"asked for, but the scene is frozen: {_list([repr(n) for n in moving])}",))
+    return Evidence(False, False, (f"asked for, but the scene is frozen: {_list([repr(n) for n in census.motion])}",))

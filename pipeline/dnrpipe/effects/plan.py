@@ -1,20 +1,21 @@
-"""Which light-transport effects a scene calls for: census and bundle in, :class:`EffectPlan` out.
+"""Which light-transport effects a scene calls for: census and bundle in, an `EffectPlan` out.
 
 Pure data in, pure data out: no Blender, no Mitsuba, no files. An effect is on where the scene has what makes it
 and the converted bundle holds it; the evidence names the materials, lights and objects. Path depth is on top of
-that a measurement (see :mod:`.statistics`), handed in as a :class:`DepthPilot`.
+that a measurement (see `raytrace.statistics`), handed in as a `DepthPilot`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import Field
 
 from dnrtrain.settings import ModelSettings, Strict
 
 from ..core.effect_names import FORCEABLE, LAMPS, NAMES, NEURAL, REMOVABLE, TITLES, EffectName
+from ..core.scene_records import Census
 from ..raytrace.statistics import REFERENCE_DEPTH, DepthStep, Measured
 from .evidence import NOTHING, Evidence, gather
 
@@ -88,7 +89,7 @@ class EffectPlan(Strict):
 
 
 def plan_effects(
-    census: Mapping[str, Any],
+    census: Census,
     bundle: Mapping[str, Sequence[str]],
     *,
     enable: Sequence[EffectName] = (),
@@ -100,8 +101,7 @@ def plan_effects(
     """Decide every effect.
 
     Args:
-        census: ``scene/census.json``.
-        bundle: what the Mitsuba scene holds, effect name -> ids (:func:`.bundle.bundle_facts`).
+        bundle: what the Mitsuba scene holds, effect name -> ids (`bundle.bundle_facts`).
         enable, disable: the user's overrides; ``disable`` wins.
         max_depth: the user's path depth, or "auto": the pilot's.
         lenses: names of the cameras in use that have depth of field.

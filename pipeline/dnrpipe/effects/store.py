@@ -13,7 +13,8 @@ from dnrtrain.contract import read_cameras
 from ..core.cameras import scaled_to, view_lenses
 from ..core.effect_names import EffectName
 from ..core.errors import UserError
-from ..core.scene_files import read_json, read_summary, scene_fingerprint
+from ..core.scene_files import read_census, read_json, read_summary, scene_fingerprint
+from ..core.scene_records import Lens
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest
 from ..raytrace.statistics import REFERENCE_DEPTH, Measured
@@ -42,7 +43,7 @@ def plan_of(
     Raises UserError where the scene is not prepared.
     """
     chosen = settings.effects
-    census = read_json(workspace.scene / "census.json")
+    census = read_census(workspace.scene)
     arguments: dict[str, Any] = {
         "census": census,
         "bundle": bundle_facts(workspace.scene / "scene.xml"),
@@ -95,9 +96,9 @@ def variant_for(plan: EffectPlan, settings: Settings) -> VariantChoice:
     return choose_variant(choice.variant.replace("_rgb", "_spectral")) if plan.on("spectral") else choice
 
 
-def lenses(workspace: Workspace, settings: Settings) -> dict[str, dict[str, float]]:
+def lenses(workspace: Workspace, settings: Settings) -> dict[str, Lens]:
     """Lenses of the views that have depth of field, by view name."""
-    return view_lenses(read_summary(workspace), settings.cameras)
+    return view_lenses(read_summary(workspace.scene), settings.cameras)
 
 
 def pilot_views(workspace: Workspace, settings: Settings, plan: EffectPlan) -> list[dict[str, Any]]:
@@ -140,7 +141,7 @@ def _stored(workspace: Workspace) -> EffectPlan | None:
         return None
     try:
         return EffectPlan.model_validate(read_json(path))
-    except (ValidationError, UserError):  # of another version, or damaged: the plan is made again
+    except ValidationError:  # of another version: the plan is made again
         return None
 
 

@@ -16,8 +16,7 @@ from pydantic import BaseModel, ConfigDict
 
 from dnrtrain.contract import View
 
-Lens = dict[str, float]
-"""``aperture_radius`` and ``focus_distance`` in scene units: see `sensors.sensor_dict`."""
+from ..core.scene_records import Lens
 
 
 class Task(BaseModel):

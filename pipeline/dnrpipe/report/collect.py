@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,6 +18,8 @@ from dnrtrain.records import Selection as SelectionRecord
 
 from ..core.errors import UserError
 from ..core.ledger import CostRecord, CostSummary, Ledger, break_even_frames, summarise, traced_views, upfront_seconds
+from ..core.scene_files import read_census, read_summary
+from ..core.scene_records import FindingKind
 from ..stages.records import METRICS, Metrics
 from .advice import missing, notes
 from .budget import build_budget
@@ -27,19 +29,21 @@ from .pictures import ExrPictures
 from .quality import build_quality
 from .words import verdict
 
-KINDS: dict[str, tuple[str, bool]] = {
+KINDS: dict[FindingKind, tuple[str, bool]] = {
     "missing": ("The file refers to something that is not there.", True),
     "ignored": ("No counterpart in the ray tracer; left out of the ground truth.", True),
     "approximated": ("Converted to the nearest thing; the ground truth differs a little from Blender.", True),
     "baked": ("Evaluated once into a texture.", False),
     "exact": ("Converted without loss.", False),
 }
+ROW = ("object", "material", "feature", "note")
 STEP_TITLES = {
     1: "Step 1: rasterised images, all candidates",
     2: "Step 2: ray-traced images, chosen views",
 }
 AGENT_TERMS = ("reward", "q")  # recorded beside the losses of step 1, but signed and no losses
 Model = TypeVar("Model", bound=BaseModel)
+R = TypeVar("R")
 
 
 class Outline(BaseModel):
@@ -149,6 +153,16 @@ def _read_model(path: Path, model: type[Model], command: str) -> Model | None:
         raise UserError(f"{path}: damaged ({damage.reason}); run `dnrpipe {command}` again") from None
 
 
+def _of_scene(root: Path, name: str, reader: Callable[[Path], R]) -> R | None:
+    """What ``reader`` finds in ``scene/``; None where the file is missing."""
+    if not (root / "scene" / name).exists():
+        return None
+    try:
+        return reader(root / "scene")
+    except DamagedFile as error:
+        raise UserError(f"{error.path}: {error.reason}; run `dnrpipe prepare` again") from None
+
+
 def _read_views(root: Path, split: str) -> list[View]:
     path = root / "cameras" / f"{split}.json"
     if not path.exists():
@@ -232,13 +246,13 @@ def _sphere(
     shown = [("candidate", view) for view in cameras["train"]] + [("test", view) for view in cameras["test"]]
     if not shown:
         return None
-    bounds = (_read_json(root / "scene" / "summary.json", "prepare") or {}).get("bounds", {})
-    frame = _read_json(root / "scene" / "frame.json", "prepare") or {}
-    center = bounds.get("center") or frame.get("center")
-    if center is None:
+    summary = _of_scene(root, "summary.json", read_summary)
+    sphere = summary.bounds if summary else _read_model(root / "scene" / "frame.json", SceneFrame, "prepare")
+    if sphere is None:
         axes = list(zip(*(view.position for _, view in shown), strict=True))
-        center = [statistics.fmean(float(value) for value in axis) for axis in axes]
-    radius = float(bounds.get("radius") or frame.get("radius") or 0.0)
+        center, radius = tuple(statistics.fmean(float(value) for value in axis) for axis in axes), 0.0
+    else:
+        center, radius = sphere.center, sphere.radius
     offsets = [tuple(float(p - c) for p, c in zip(view.position, center, strict=True)) for _, view in shown]
     scale = max(max(math.hypot(*offset) for offset in offsets), 1e-9)
     order = {name: i for i, name in enumerate(chosen.views, start=1)} if chosen else {}
@@ -260,36 +274,26 @@ def _sphere(
 
 
 def _findings(root: Path) -> list[FindingGroup]:
-    census = _read_json(root / "scene" / "census.json", "prepare") or {}
-    by_kind: dict[str, list[dict[str, str]]] = {kind: [] for kind in KINDS}
-    for finding in census.get("findings", []):
-        row = {key: str(finding.get(key) or "") for key in ("object", "material", "feature", "note")}
-        by_kind.setdefault(str(finding.get("kind", "other")), []).append(row)
-    return [
-        FindingGroup(
-            kind=kind,
-            meaning=KINDS.get(kind, ("", True))[0],
-            serious=KINDS.get(kind, ("", True))[1],
-            findings=rows,
-        )
-        for kind, rows in by_kind.items()
-        if rows
-    ]
+    census = _of_scene(root, "census.json", read_census)
+    groups = []
+    for kind, (meaning, serious) in KINDS.items():
+        found = [finding for finding in census.findings if finding.kind == kind] if census else []
+        rows = [{key: getattr(finding, key) or "" for key in ROW} for finding in found]
+        if rows:
+            groups.append(FindingGroup(kind=kind, meaning=meaning, serious=serious, findings=rows))
+    return groups
 
 
 def _summary(root: Path) -> list[tuple[str, str]]:
-    summary = _read_json(root / "scene" / "summary.json", "prepare") or {}
-    rows = []
-    for key in ("triangles", "objects"):
-        if isinstance(summary.get(key), int):
-            rows.append((key, f"{summary[key]:,}".replace(",", " ")))
-    if "blender_version" in summary:
-        rows.append(("blender", str(summary["blender_version"])))
-    for part in ("atlas", "repairs"):
-        if isinstance(summary.get(part), dict):
-            rows += [(f"{part} {k}".replace("_", " "), _plain(v)) for k, v in sorted(summary[part].items())]
-    rows += [("warning", str(text)) for text in summary.get("warnings", [])]
-    return rows
+    summary = _of_scene(root, "summary.json", read_summary)
+    if summary is None:
+        return []
+    counts = (("triangles", summary.triangles), ("objects", summary.objects))
+    rows = [(name, f"{count:,}".replace(",", " ")) for name, count in counts]
+    rows.append(("blender", summary.blender_version))
+    for part, facts in (("atlas", summary.atlas.data()), ("repairs", summary.repairs)):
+        rows += [(f"{part} {k}".replace("_", " "), _plain(v)) for k, v in sorted(facts.items())]
+    return rows + [("warning", text) for text in summary.warnings]
 
 
 def _plain(value: Any) -> str:

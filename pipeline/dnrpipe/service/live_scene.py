@@ -103,9 +103,8 @@ def open_scene(root: Path) -> LiveScene:
     if kind in RENDERED:
         renderer = ready_renderer(workspace, settings)
         base, environment = renderer.common, renderer.environment
-    frame, summary = read_frame(workspace), read_summary(workspace)
-    radius = float(summary["bounds"]["radius"])
-    pixels, distance = framing(summary, settings.cameras, radius)
+    frame, summary = read_frame(workspace), read_summary(workspace.scene)
+    pixels, distance = framing(summary, settings.cameras)
     names = set(read_selection(workspace).views)
     views = [view for view in read_cameras(workspace.cameras("train")) if view.name in names]
     return LiveScene(
@@ -122,8 +121,8 @@ def open_scene(root: Path) -> LiveScene:
         },
         environment=environment,
         hello={
-            "center": [float(x) for x in summary["bounds"]["center"]],
-            "radius": radius,
+            "center": list(summary.bounds.center),
+            "radius": summary.bounds.radius,
             "distance": float(distance),
             "size": min(max(settings.cameras.width, SIZES[0]), SIZES[1]),
             "modes": [m for m in Mode.__args__ if kind != "none" or m not in ("base", "albedo")],

@@ -1,11 +1,10 @@
-"""Bake procedural textures before a scene is exported: tasks, progress, and what could not be baked."""
+"""Procedural textures are baked before a scene is exported: tasks, progress, and what could not be baked."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
+from ..blender.tasks import BakeCommon, BakeTask, PendingBakes
 from ..workers.answers import answers, warn_of_retries
 from ..workers.view_tasks import worker_count
 from .stage import Run
@@ -14,43 +13,43 @@ FOLDER = "bakes"
 """Of a workspace: baked values by content hash. They outlive ``--force`` and changes elsewhere in the file."""
 
 
-def bake(run: Run, source: Path, geometry: Path, pending: dict[str, Any]) -> list[str]:
-    """Run the bake tasks in worker processes; returns the keys of values that could not be baked.
+def bake(run: Run, source: Path, geometry: Path, pending: PendingBakes) -> list[str]:
+    """Bake in worker processes; returns the keys of values that could not be baked.
 
-    Every task appears on disk whole: after Ctrl-C only what is missing is baked again.
+    Every value appears on disk whole: after Ctrl-C only what is missing is baked again.
 
     Args:
         geometry: ``geometry.npz`` of the conversion that asked for the bakes.
-        pending: its ``bakes``: layers of tasks, and the scene's frame.
+        pending: what it asked for.
     """
-    layers: Sequence[list[dict[str, Any]]] = pending["layers"]
     passes, console = run.settings.passes, run.console
-    count = min(worker_count(passes.workers), len(layers))
+    count = min(worker_count(passes.workers), len(pending.layers))
     folder = run.workspace.root / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
-    common = {
-        "source": str(source),
-        "geometry": str(geometry),
-        "frame": pending["frame"],
-        "folder": str(folder),
-        "size": passes.bake_size,
-        "threads": max(1, worker_count(0) // count),
-    }
+    common = BakeCommon(
+        source=source,
+        frame=pending.frame,
+        geometry=geometry,
+        folder=folder,
+        size=passes.bake_size,
+        threads=max(1, worker_count(0) // count),
+    )
     refused: list[str] = []
-    tasks = [{"layer": layer, "output": str(folder)} for layer in layers]
+    tasks = [BakeTask(layer=layer, output=folder).data() for layer in pending.layers]
     with console.bar("bakes", len(tasks)) as bar:
         for outcome in answers(
             "dnrpipe.blender.baking.bake",
-            common,
+            common.data(),
             tasks,
             workers=count,
             log=run.log,
             retried=warn_of_retries("bake", console),
         ):
             if outcome.result is None:
-                names = ", ".join(f"'{entry['material']}'" for entry in outcome.task["layer"][:5])
+                layer = BakeTask.model_validate(outcome.task).layer
+                names = ", ".join(f"'{entry.material}'" for entry in layer[:5])
                 console.warn(f"could not bake textures of {names}: {outcome.error}; averages stand for them")
-                refused += [tap["key"] for entry in outcome.task["layer"] for tap in entry["taps"]]
+                refused += [tap.key for entry in layer for tap in entry.taps]
             else:
                 for name, lost in outcome.result["repaired"].items():
                     console.warn(

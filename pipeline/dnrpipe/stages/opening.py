@@ -5,20 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from ..blender.tasks import InspectTask, PrepareTask
 from ..core.errors import UserError
 from ..workers.answers import answers
 from ..workers.processes import Retry
 
 
-def open_scene(module: str, source: Path, task: dict[str, Any], log: Path) -> tuple[dict[str, Any], str]:
-    """Run the task, which opens ``source``, on a worker of ``module``: (its result, why the first try failed or "").
+def open_scene(module: str, task: PrepareTask | InspectTask, log: Path) -> tuple[dict[str, Any], str]:
+    """Run the task on a worker of ``module``: (its answer, why the first try failed or "").
 
     Raises UserError: both tries failed; says whether Blender itself died of the file. Raises OSError: a full disk.
     """
     failed: list[Retry] = []
-    for outcome in answers(module, {}, [task], workers=1, log=log, retried=failed.append):
+    for outcome in answers(module, {}, [task.data()], workers=1, log=log, retried=failed.append):
         if outcome.died:
-            raise UserError(f"{source}: Blender could not open it ({outcome.error}): damaged or truncated?")
+            raise UserError(f"{task.source}: Blender could not open it ({outcome.error}): damaged or truncated?")
         if outcome.result is None:
             raise UserError(str(outcome.error))
         return outcome.result, failed[0].reason if failed else ""

@@ -12,10 +12,19 @@ from dnrtrain.atomic import write_json
 from dnrtrain.contract import SPLITS, View, write_cameras
 
 from ..blender.finding_lines import finding_lines
+from ..blender.tasks import BakeOptions, PassesCommon, PassesTask, PrepareAnswer, PrepareTask
 from ..core.cameras import depth_range, make_cameras
 from ..core.console import Console
 from ..core.errors import UserError
-from ..core.scene_files import read_frame, read_json, read_summary, scene_fingerprint
+from ..core.scene_files import (
+    read_census,
+    read_frame,
+    read_prepared,
+    read_raster_choice,
+    read_summary,
+    scene_fingerprint,
+)
+from ..core.scene_records import Prepared, RasterChoice, SceneSummary
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest, file_sha256
 from ..effects.store import keep_plan
@@ -36,7 +45,7 @@ def prepare(run: Run) -> Outcome:
     workspace = run.workspace
     summary, views = scene_and_views(run)
     _plan_effects(run)
-    engine, reason = _raster_engine(run)
+    chosen = _raster_engine(run)
     raster = run.settings.model.base == "raster"  # then test views need it, too
     wanted = [(split, view) for split in SPLITS for view in views[split]]
     tasks = draw_passes(
@@ -44,7 +53,7 @@ def prepare(run: Run) -> Outcome:
         "passes",
         [view for _, view in wanted],
         [workspace.passes(split, view.name) for split, view in wanted],
-        engine,
+        chosen.engine,
         raster=[split in RASTERISED or raster for split, _ in wanted],
     )
     warn_of_repairs(tasks, run.console)
@@ -52,10 +61,10 @@ def prepare(run: Run) -> Outcome:
         # Views, scene and engine are all in the tasks' fingerprints.
         digest([[Path(task["output"]).parent.name, task["fingerprint"]] for task in tasks]),
         {
-            "raster_engine": engine,
-            "raster_reason": reason,
+            "raster_engine": chosen.engine,
+            "raster_reason": chosen.reason,
             "views": {split: len(views[split]) for split in SPLITS},
-            "triangles": summary["triangles"],
+            "triangles": summary.triangles,
         },
     )
 
@@ -68,7 +77,7 @@ def _plan_effects(run: Run) -> None:
     run.console.say(f"effects: {', '.join(named) or 'none'} (`dnrpipe effects` says why)")
 
 
-def scene_and_views(run: Run) -> tuple[dict[str, Any], dict[str, list[View]]]:
+def scene_and_views(run: Run) -> tuple[SceneSummary, dict[str, list[View]]]:
     """Convert the scene and place the cameras, where that is not done: (summary, views by split). No passes."""
     summary = convert_scene(run)
     return summary, _place_cameras(run.workspace, run.settings, summary)
@@ -101,21 +110,22 @@ def draw_passes(
         raster: for each view, whether it gets rasterised colour.
     """
     passes = run.settings.passes
+    common = PassesCommon(
+        scene_dir=run.workspace.scene,
+        raster_engine=engine,
+        raster_samples=passes.raster_samples,
+        coverage_samples=passes.coverage_samples,
+    )
     tasks = []
     for view, path, coloured in zip(views, paths, raster, strict=True):
-        data = view.model_dump(mode="json")
         colour = [engine, passes.raster_samples] if coloured else None
-        decisive = [PASSES_VERSION, run.scene_fingerprint, data, passes.coverage_samples, colour]
-        tasks.append({"view": data, "output": str(path), "raster": coloured, "fingerprint": digest(decisive)})
+        view_data = view.model_dump(mode="json")
+        fingerprint = digest([PASSES_VERSION, run.scene_fingerprint, view_data, passes.coverage_samples, colour])
+        tasks.append(PassesTask(view=view, output=path, raster=coloured, fingerprint=fingerprint).data())
     run.view_tasks(
         label,
         "dnrpipe.blender.passes.worker",
-        {
-            "scene_dir": str(run.workspace.scene),
-            "raster_engine": engine,
-            "raster_samples": passes.raster_samples,
-            "coverage_samples": passes.coverage_samples,
-        },
+        common.data(),
         tasks,
         workers=worker_count(passes.workers),
         book=run.book_views("cpu"),
@@ -123,13 +133,13 @@ def draw_passes(
     return tasks
 
 
-def convert_scene(run: Run) -> dict[str, Any]:
+def convert_scene(run: Run) -> SceneSummary:
     """Open the scene in a worker and write ``scene/``, whole or not at all."""
     workspace, settings, console = run.workspace, run.settings, run.console
     marker = workspace.scene / "prepared.json"
-    if marker.exists() and read_json(marker)["fingerprint"] == scene_fingerprint(workspace):
-        summary = read_summary(workspace)
-        if summary["bake_size"] in (None, settings.passes.bake_size):
+    if marker.exists() and read_prepared(workspace.scene).fingerprint == scene_fingerprint(workspace):
+        summary = read_summary(workspace.scene)
+        if summary.bake_size in (None, settings.passes.bake_size):
             _refuse_if_strict(Path(workspace.manifest.source.path), workspace.scene, settings)
             return summary
     source = Path(workspace.manifest.source.path)
@@ -146,8 +156,8 @@ def convert_scene(run: Run) -> dict[str, Any]:
     if workspace.scene.exists():
         shutil.rmtree(workspace.scene)
     fresh.rename(workspace.scene)
-    summary = read_summary(workspace)
-    for warning in summary["warnings"]:
+    summary = read_summary(workspace.scene)
+    for warning in summary.warnings:
         console.warn(warning)
     _show_findings(workspace, console)
     run.book("training", "scene", "convert", time.monotonic() - started)
@@ -157,7 +167,7 @@ def convert_scene(run: Run) -> dict[str, Any]:
         for path in sorted(workspace.scene.rglob("[!.]*"))
         if path.is_file() and path.name != "frame.json"
     }
-    write_json(marker, {"fingerprint": scene_fingerprint(workspace), "files": files})
+    write_json(marker, Prepared(fingerprint=scene_fingerprint(workspace), files=files).data())
     return summary
 
 
@@ -166,16 +176,17 @@ def _run_conversion(run: Run, source: Path, folder: Path) -> None:
     workspace, settings = run.workspace, run.settings
     size, refused = settings.passes.bake_size, list[str]()
     for _ in range(MAX_BAKE_ROUNDS):
-        options = {"folder": str(workspace.root / FOLDER), "size": size, "refused": refused}
-        task = {"source": str(source), "scene_dir": str(folder), "strict": settings.strict, "bakes": options}
+        bakes = BakeOptions(folder=workspace.root / FOLDER, size=size, refused=tuple(refused))
+        task = PrepareTask(source=source, scene_dir=folder, strict=settings.strict, bakes=bakes)
         with run.console.bar("scene", 1) as bar:
-            result, first_failure = open_scene("dnrpipe.blender.prepare", source, task, run.log)
+            answer, first_failure = open_scene("dnrpipe.blender.prepare", task, run.log)
             bar.advance()
         if first_failure:
             run.console.warn(f"scene: {first_failure}; opening it once more went well")
-        if result.get("bakes") is None:
+        pending = PrepareAnswer.model_validate(answer).bakes
+        if pending is None:
             return
-        refused += bake(run, source, folder / "geometry.npz", result["bakes"])
+        refused += bake(run, source, folder / "geometry.npz", pending)
     raise RuntimeError(f"{source}: the same textures are to be baked again and again")
 
 
@@ -183,30 +194,28 @@ def _refuse_if_strict(source: Path, scene_dir: Path, settings: Settings) -> None
     """With ``--strict``: raise UserError that names all that is missing or was left out."""
     if not settings.strict:
         return
-    found = [f for f in read_json(scene_dir / "census.json")["findings"] if f["kind"] in ("missing", "ignored")]
+    found = [f for f in read_census(scene_dir).findings if f.kind in ("missing", "ignored")]
     if found:
         names = [
-            f"{f['kind']} {f['feature']} ('{f['object'] or f['material']}')"
-            if f["object"] or f["material"]
-            else f"{f['kind']} {f['feature']}"
+            f"{f.kind} {f.feature}" + (f" ('{f.object or f.material}')" if f.object or f.material else "")
             for f in found
         ]
         raise UserError(f"{source}: {', '.join(names)}; repair the scene, or leave out --strict (--set strict=false)")
 
 
 def _show_findings(workspace: Workspace, console: Console) -> None:
-    """Whatever was not converted exactly is said by name, once, in the terminal; all of it is in census.json."""
-    census = read_json(workspace.scene / "census.json")
-    baked = [finding for finding in census["findings"] if finding["kind"] == "baked" and finding["material"]]
+    """Name whatever was not converted exactly, once, in the terminal; census.json has all of it."""
+    findings = read_census(workspace.scene).findings
+    baked = [finding for finding in findings if finding.kind == "baked" and finding.material]
     if baked:
-        count = len({finding["material"] for finding in baked})
+        count = len({finding.material for finding in baked})
         console.say(f"  baked: {len(baked)} procedural value(s) of {count} material(s); census.json names them")
     for kind in ("approximated", "ignored", "missing"):
-        for line in finding_lines(finding for finding in census["findings"] if finding["kind"] == kind):
+        for line in finding_lines(finding for finding in findings if finding.kind == kind):
             console.say(f"  {kind}: {line}")
 
 
-def _place_cameras(workspace: Workspace, settings: Settings, summary: dict[str, Any]) -> dict[str, list[View]]:
+def _place_cameras(workspace: Workspace, settings: Settings, summary: SceneSummary) -> dict[str, list[View]]:
     views = make_cameras(summary, settings.cameras)
     if not views["train"]:
         raise UserError("no candidate views: give more cameras or set cameras.train")
@@ -223,16 +232,15 @@ def _place_cameras(workspace: Workspace, settings: Settings, summary: dict[str, 
     return views
 
 
-def _raster_engine(run: Run) -> tuple[str, str]:
+def _raster_engine(run: Run) -> RasterChoice:
     """The engine for rasterised colour, probed once per workspace: a busy machine must not change it midway."""
     from ..blender.passes.choice import choose_raster
 
-    record = run.workspace.root / "passes" / "raster.json"
-    if record.exists():
-        chosen = read_json(record)
-        if chosen["requested"] == run.settings.passes.raster:
-            return chosen["engine"], chosen["reason"]
-    engine, reason = choose_raster(run.settings.passes.raster)
-    run.console.say(f"raster colour by {engine}: {reason}")
-    write_json(record, {"requested": run.settings.passes.raster, "engine": engine, "reason": reason})
-    return engine, reason
+    requested = run.settings.passes.raster
+    chosen = read_raster_choice(run.workspace)
+    if chosen is None or chosen.requested != requested:
+        engine, reason = choose_raster(requested)
+        run.console.say(f"raster colour by {engine}: {reason}")
+        chosen = RasterChoice(requested=requested, engine=engine, reason=reason)
+        write_json(run.workspace.root / "passes" / "raster.json", chosen.data())
+    return chosen

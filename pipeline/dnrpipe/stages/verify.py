@@ -6,7 +6,6 @@ and archives must read. Nothing is rendered and nothing is executed.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from dnrtrain.contract import SPLITS, ContractError, DamagedFile
 
 from ..core.console import Console
 from ..core.errors import UserError
+from ..core.scene_records import Prepared
 from ..core.workspace import Workspace, file_sha256
 from .pipeline import discard, owner_of
 
@@ -73,7 +73,7 @@ def repair(workspace: Workspace, faults: list[Fault]) -> list[str]:
     return [stage.command for stage in STAGES.values() if stage.command in due]
 
 
-def _checks(workspace: Workspace) -> Iterator[tuple[Path, Callable[[Path], None]]]:
+def _checks(workspace: Workspace) -> Iterator[tuple[Path, Callable[[Path], object]]]:
     """Each file that is there, with the function that raises when something is wrong with it."""
     root = workspace.root
     yield from ((path, _cameras) for path in map(workspace.cameras, SPLITS) if path.exists())
@@ -96,19 +96,19 @@ def _checks(workspace: Workspace) -> Iterator[tuple[Path, Callable[[Path], None]
         yield workspace.ledger.path, lambda path: _ledger(workspace, path)
 
 
-def _scene(workspace: Workspace) -> Iterator[tuple[Path, Callable[[Path], None]]]:
+def _scene(workspace: Workspace) -> Iterator[tuple[Path, Callable[[Path], object]]]:
     marker = workspace.scene / "prepared.json"
     if not workspace.scene.exists():
         return
-    yield marker, _json
+    yield marker, lambda _: _prepared(workspace)
     frame = workspace.scene / "frame.json"
     yield frame, lambda _: _frame(workspace)
     try:
-        files = json.loads(marker.read_text(encoding="utf-8")).get("files", {})
-    except (OSError, ValueError, AttributeError, RecursionError):
+        files = _prepared(workspace).files
+    except (UserError, DamagedFile):
         return  # said by the check of the marker itself
-    for name, wanted in files.items() if isinstance(files, dict) else ():
-        path = workspace.scene / str(name)
+    for name, wanted in files.items():
+        path = workspace.scene / name
         if path.resolve().is_relative_to(workspace.scene.resolve()):
             yield path, lambda path, wanted=wanted: _same(path, wanted)
 
@@ -144,6 +144,12 @@ def _json(path: Path) -> None:
     from ..core.scene_files import read_json
 
     read_json(path)
+
+
+def _prepared(workspace: Workspace) -> Prepared:
+    from ..core.scene_files import read_prepared
+
+    return read_prepared(workspace.scene)
 
 
 def _frame(workspace: Workspace) -> None:

@@ -1,4 +1,4 @@
-"""Worker: bakes socket values of many materials into the scene atlas, one Cycles EMIT bake per task.
+"""Worker that bakes socket values of many materials into the scene atlas, one Cycles EMIT bake per task.
 
 A DIFFUSE bake would be black on metals; emission is what it is.
 """
@@ -6,7 +6,7 @@ A DIFFUSE bake would be black on metals; emission is what it is.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,10 @@ from ..geometry.frozen import ATLAS_LAYER, FrozenMesh, load_geometry
 from ..reading.names import find_material
 from ..reading.opening import open_scene
 from ..shading.sockets import walk
+from ..tasks import BakeAnswer, BakeCommon, BakeTask, Tap
 from .mesh import MAX_OWN, add_object, needs_own_space
 from .regions import Atlas
-from .trees import Tap, TreeCopier
+from .trees import TreeCopier
 
 EMPTY = -12345.0
 """What the image holds before the bake: texels that Cycles did not reach keep it."""
@@ -31,40 +32,32 @@ HALF_MAX = 65504.0
 
 
 class Worker:
-    """Bakes one layer per task: ``layer`` (list of {material, taps: [{kind, groups, node, socket, key}]}).
-
-    common: source (scene file), frame, geometry (npz), size (texels), folder (results: ``KEY.npy``, float16 or
-    float32 [N, C], a row per texel of the material's region, see :mod:`.regions`), threads. ``repaired`` of the
-    answer: texels that were not finite, by material.
-    """
+    """Bakes a layer per task. common: a `BakeCommon`, task: a `BakeTask`."""
 
     def __init__(self, common: dict[str, Any]) -> None:
-        open_scene(Path(common["source"]))
-        bpy.context.scene.frame_set(int(common["frame"]))
-        self.meshes = load_geometry(Path(common["geometry"]))
-        self.folder = Path(common["folder"])
-        self.threads = int(common["threads"])
-        self.atlas = Atlas(self.meshes, int(common["size"]))
+        settings = BakeCommon.model_validate(common)
+        open_scene(settings.source)
+        bpy.context.scene.frame_set(settings.frame)
+        self.meshes = load_geometry(settings.geometry)
+        self.folder, self.threads = settings.folder, settings.threads
+        self.atlas = Atlas(self.meshes, settings.size)
 
-    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
+    def __call__(self, task: dict[str, Any]) -> BakeAnswer:
         started = time.monotonic()
-        layer = {
-            entry["material"]: [Tap(t["kind"], tuple(t["groups"]), t["node"], t["socket"]) for t in entry["taps"]]
-            for entry in task["layer"]
-        }
+        layer = {entry.material: entry.taps for entry in BakeTask.model_validate(task).layer}
         pixels = bake_layer(self.meshes, layer, self.atlas.size, self.threads)
         repaired: dict[str, int] = {}
-        for entry in task["layer"]:
-            values, lost = _complete(pixels, self.atlas.region(entry["material"]).texels, self.atlas.size)
+        for material, taps in layer.items():
+            values, lost = _complete(pixels, self.atlas.region(material).texels, self.atlas.size)
             if lost:
-                repaired[entry["material"]] = lost
-            for index, tap in enumerate(entry["taps"]):
-                kept = values[:, index : index + 1] if tap["kind"] == "scalar" else values
-                _save(self.folder / f"{tap['key']}.npy", kept)
+                repaired[material] = lost
+            for index, tap in enumerate(taps):
+                kept = values[:, index : index + 1] if tap.kind == "scalar" else values
+                _save(self.folder / f"{tap.key}.npy", kept)
         return {"seconds": time.monotonic() - started, "repaired": repaired}
 
 
-def bake_layer(meshes: Sequence[FrozenMesh], layer: dict[str, list[Tap]], size: int, threads: int) -> np.ndarray:
+def bake_layer(meshes: Sequence[FrozenMesh], layer: Mapping[str, Sequence[Tap]], size: int, threads: int) -> np.ndarray:
     """Bake one emission per material; returns float32 [size², 3], EMPTY where nothing was baked."""
     image = bpy.data.images.new("dnrpipe.bake", size, size, alpha=True, float_buffer=True)
     image.colorspace_settings.name = "Linear Rec.709"
@@ -130,7 +123,7 @@ def _material(name: str) -> bpy.types.Material:
     return found
 
 
-def _looks_around(layer: dict[str, list[Tap]]) -> bool:
+def _looks_around(layer: Iterable[str]) -> bool:
     return any(node.type == "AMBIENT_OCCLUSION" for name in layer for node in walk(_material(name).node_tree))
 
 

@@ -2,8 +2,8 @@
 
 A conversion walks all materials and asks the book for every value that it cannot compute itself. Where the value
 is in the folder (files named by content hash), it comes back as a texture over the material's region of the scene
-atlas. Where it is not, the walk goes on with a placeholder, the value is listed in :attr:`BakeBook.missing`, and the
-whole conversion counts as a rehearsal: bake what is missing (:mod:`.bake`), and convert again.
+atlas. Where it is not, the walk goes on with a placeholder, the book lists the value in ``missing``, and the
+whole conversion counts as a rehearsal: bake what is missing (`bake`), and convert again.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,25 +20,20 @@ from ..findings import Findings
 from ..geometry.frozen import ATLAS_LAYER, FrozenMesh
 from ..shading.sockets import Source
 from ..shading.textures import Placement, Textured
+from ..tasks import MaterialTaps, Tap, ValueKind
 from .graph import AROUND, FROM_CAMERA, PER_OBJECT, VIEW_DEPENDENT, GraphHasher, labels, upstream
 from .mesh import MAX_OWN, is_object_space, object_info
 from .regions import Atlas
 
-Kind = Literal["colour", "scalar", "normal"]
 BAKE_VERSION = 4  # raise when a bake of the same inputs would come out different
 SCALARS_PER_BAKE = 3
 
 
-@dataclass(frozen=True)
-class BakeItem:
-    """One value to bake: see :class:`.trees.Tap`; ``key`` names its file."""
+class BakeItem(NamedTuple):
+    """One value to bake."""
 
     material: str
-    kind: Kind
-    groups: tuple[str, ...]
-    node: str
-    socket: str
-    key: str
+    tap: Tap
 
 
 @dataclass
@@ -63,7 +58,7 @@ class BakeBook:
         """The book of a frozen scene whose bakes have ``size``² texels."""
         return cls(Atlas(meshes, size), folder, frozenset(refused))
 
-    def value(self, material: str, kind: Kind, source: Source, socket: str, findings: Findings) -> Textured | None:
+    def value(self, material: str, kind: ValueKind, source: Source, socket: str, findings: Findings) -> Textured | None:
         """The value at ``source`` over the material's surface; None when it could not be baked.
 
         Colours and normals (n * 0.5 + 0.5, world space) have three channels, scalars one. socket: the name of the
@@ -92,23 +87,24 @@ class BakeBook:
             if values.shape == (len(region.texels), channels):
                 return Textured(values.astype(np.float32)[:, None, :], False, placement)
         groups = tuple(group.name for group in source.scope)
-        self.missing[key] = BakeItem(material, kind, groups, source.node.name, source.socket.identifier, key)
+        tap = Tap(kind=kind, groups=groups, node=source.node.name, socket=source.socket.identifier, key=key)
+        self.missing[key] = BakeItem(material, tap)
         return Textured(np.full((1, 1, channels), 0.5, np.float32), False, placement)
 
-    def layers(self) -> list[list[dict[str, Any]]]:
-        """What is missing as tasks of :class:`.bake.Worker`: each bakes at most one emission per material."""
-        stacks: dict[str, list[list[BakeItem]]] = {}
-        for item in self.missing.values():
-            stack = stacks.setdefault(item.material, [])
-            last = next((group for group in stack if group[0].kind == "scalar" and len(group) < SCALARS_PER_BAKE), None)
-            if item.kind == "scalar" and last is not None:
-                last.append(item)
+    def layers(self) -> list[list[MaterialTaps]]:
+        """What is missing, one bake a layer: it holds at most one emission per material."""
+        stacks: dict[str, list[list[Tap]]] = {}
+        for material, tap in self.missing.values():
+            stack = stacks.setdefault(material, [])
+            last = next((taps for taps in stack if taps[0].kind == "scalar" and len(taps) < SCALARS_PER_BAKE), None)
+            if tap.kind == "scalar" and last is not None:
+                last.append(tap)
             else:
-                stack.append([item])
+                stack.append([tap])
         depth = max((len(stack) for stack in stacks.values()), default=0)
         return [
             [
-                {"material": material, "taps": [_tap(item) for item in stack[level]]}
+                MaterialTaps(material=material, taps=tuple(stack[level]))
                 for material, stack in stacks.items()
                 if level < len(stack)
             ]
@@ -127,7 +123,7 @@ class BakeBook:
             if path.stem not in self.used:
                 path.unlink(missing_ok=True)
 
-    def _warn(self, material: str, kind: Kind, nodes: list[Source], findings: Findings) -> None:
+    def _warn(self, material: str, kind: ValueKind, nodes: list[Source], findings: Findings) -> None:
         for node in (entry.node for entry in nodes):
             if node.type in VIEW_DEPENDENT:
                 note = f"depends on the ray, which a bake has not: {VIEW_DEPENDENT[node.type]} is used"
@@ -154,7 +150,7 @@ class BakeBook:
             note = "baked in the first instance's orientation; the others' bumps are lit as if turned like it"
             findings.add("approximated", "bump on instances", note, object=copied[0], material=material)
 
-    def _key(self, material: str, kind: Kind, source: Source, nodes: list[Source]) -> str:
+    def _key(self, material: str, kind: ValueKind, source: Source, nodes: list[Source]) -> str:
         digest = hashlib.sha256(repr((BAKE_VERSION, self.atlas.size, kind)).encode())
         digest.update(self._graphs.hash(source).encode())
         types = {entry.node.type for entry in nodes}
@@ -183,13 +179,3 @@ class BakeBook:
                     digest.update(np.ascontiguousarray(array).data)
             self._meshes[id(mesh)] = digest.hexdigest()
         return self._meshes[id(mesh)]
-
-
-def _tap(item: BakeItem) -> dict[str, Any]:
-    return {
-        "kind": item.kind,
-        "groups": list(item.groups),
-        "node": item.node,
-        "socket": item.socket,
-        "key": item.key,
-    }

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from dnrpipe.core.scene_files import read_record
+from dnrpipe.core.scene_records import AtlasFacts
 from dnrtrain.atomic import write_json
 
 from ..findings import Findings
@@ -19,22 +18,14 @@ from ..geometry.frozen import FrozenMesh, load_geometry, save_geometry
 from ..reading.names import find_material
 from ..shading.materials import MaterialConverter
 from ..shading.textures import ImageReader, TextureStore
+from ..tasks import BakeOptions, PendingBakes
 from .bakes import BakeBook
 
 PENDING = "pending.json"
 
 
-@dataclass(frozen=True)
-class BakeOptions:
-    """folder: cached bakes (files named by content). size: texels of the atlas' side. refused: keys not to ask for."""
-
-    folder: Path
-    size: int
-    refused: tuple[str, ...] = ()
-
-
-def place_atlas(meshes: Sequence[FrozenMesh], scene_dir: Path) -> dict[str, Any]:
-    """Pack the scene atlas (see :func:`..geometry.atlas.build_atlas`), or take the one that the bakes were made for."""
+def place_atlas(meshes: Sequence[FrozenMesh], scene_dir: Path) -> AtlasFacts:
+    """Pack the scene atlas, or take the one that the bakes were made for."""
     pending = scene_dir / PENDING
     if not pending.is_file():
         return build_atlas(meshes)
@@ -44,13 +35,13 @@ def place_atlas(meshes: Sequence[FrozenMesh], scene_dir: Path) -> dict[str, Any]
         return build_atlas(meshes)  # the file changed in between
     for mesh, before in zip(meshes, kept, strict=True):
         mesh.atlas = before.atlas
-    return json.loads(pending.read_text(encoding="utf-8"))["atlas"]
+    return read_record(pending, AtlasFacts)
 
 
 def convert_materials(
     meshes: Sequence[FrozenMesh], scene_dir: Path, findings: Findings, options: BakeOptions | None
 ) -> MaterialConverter:
-    """A converter that has converted every material in use; see :func:`missing_bakes`."""
+    """A converter that has converted every material in use; `missing_bakes` says what it lacks."""
     book = None if options is None else BakeBook.open(meshes, options.folder, options.size, options.refused)
     converter = MaterialConverter(TextureStore(scene_dir), ImageReader(findings), findings, book)
     for mesh in meshes:
@@ -62,12 +53,11 @@ def convert_materials(
 
 
 def missing_bakes(
-    converter: MaterialConverter, meshes: Sequence[FrozenMesh], atlas: dict[str, Any], scene_dir: Path, frame: int
-) -> dict[str, Any] | None:
+    converter: MaterialConverter, meshes: Sequence[FrozenMesh], atlas: AtlasFacts, scene_dir: Path, frame: int
+) -> PendingBakes | None:
     """What has to be baked before the scene can be exported, or None.
 
-    Leaves geometry.npz for the bake and notes the atlas for the next attempt. Returns {"layers": tasks of
-    :class:`.bake.Worker`, "frame": current frame}.
+    Leaves geometry.npz for the bake, and the atlas' facts for the next attempt.
     """
     pending = scene_dir / PENDING
     if converter.book is None or not converter.book.missing:
@@ -75,5 +65,6 @@ def missing_bakes(
         return None
     shutil.rmtree(scene_dir / "textures", ignore_errors=True)  # made of placeholders
     save_geometry(scene_dir / "geometry.npz", meshes)
-    write_json(pending, {"atlas": atlas})
-    return {"layers": converter.book.layers(), "frame": frame}
+    write_json(pending, atlas.data())
+    layers = tuple(tuple(layer) for layer in converter.book.layers())
+    return PendingBakes(layers=layers, frame=frame)

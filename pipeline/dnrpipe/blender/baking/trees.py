@@ -7,12 +7,13 @@ Object Info, the mesh's own UV layer and colour attribute.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import bpy
 
 from ..shading.sockets import walk
+from ..tasks import Tap
 
 GENERATED, OBJECT, OBJECT_NORMAL = "dnrpipe.generated", "dnrpipe.object", "dnrpipe.object_normal"
 LOCATION, OBJECT_COLOUR, OBJECT_NUMBERS = "dnrpipe.location", "dnrpipe.object_color", "dnrpipe.object_numbers"
@@ -39,19 +40,6 @@ UNKNOWABLE = {"FRESNEL", "LAYER_WEIGHT", "LIGHT_PATH", "PARTICLE_INFO", "HAIR_IN
 SOCKETS = {"RGBA": "NodeSocketColor", "VECTOR": "NodeSocketVector"}
 
 
-@dataclass(frozen=True)
-class Tap:
-    """A value inside a material: output ``socket`` (identifier) of ``node``, inside the group nodes ``groups``.
-
-    kind: colour and normal take a bake of their own; scalars go three to a bake.
-    """
-
-    kind: str
-    groups: tuple[str, ...]
-    node: str
-    socket: str
-
-
 class TreeCopier:
     """Makes the emitting copies; groups are copied once and shared by all of them."""
 
@@ -60,7 +48,7 @@ class TreeCopier:
         self._groups: dict[int, Any] = {}
         self._substituted: set[int] = set()
 
-    def copy(self, material: Any, taps: list[Tap]) -> Any:
+    def copy(self, material: Any, taps: Sequence[Tap]) -> Any:
         """A copy of ``material`` that emits the taps: one colour, one normal, or up to three scalars."""
         made = material.copy()
         made.cycles.emission_sampling = "NONE"

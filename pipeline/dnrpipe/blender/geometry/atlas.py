@@ -11,6 +11,8 @@ from typing import Any
 import bpy
 import numpy as np
 
+from dnrpipe.core.scene_records import AtlasFacts
+
 from .charts import chart_atlas, count_pieces
 from .frozen import ATLAS_LAYER, FrozenMesh
 
@@ -31,11 +33,11 @@ MEASURE_SIZE = 512
 BELOW_ONE = float(np.nextafter(np.float32(1), np.float32(0)))
 
 
-def build_atlas(meshes: Sequence[FrozenMesh], *, smart_limit: int = SMART_LIMIT) -> dict[str, Any]:
-    """Fill ``mesh.atlas`` of every mesh and return the atlas' numbers (see :func:`measure_atlas`).
+def build_atlas(meshes: Sequence[FrozenMesh], *, smart_limit: int = SMART_LIMIT) -> AtlasFacts:
+    """Fill ``mesh.atlas`` of every mesh and measure the atlas.
 
-    Smart UV project, islands scaled to texel densities (see :func:`texel_density`) and packed; planar charts on
-    shelves (see :mod:`~.charts`) when the scene has more than ``smart_limit`` triangles or very many meshes.
+    Smart UV project, islands scaled to texel densities (see `texel_density`) and packed; planar charts on
+    shelves (see `charts`) when the scene has more than ``smart_limit`` triangles or very many meshes.
     """
     started = time.perf_counter()
     total = sum(mesh.triangles for mesh in meshes)
@@ -48,7 +50,7 @@ def build_atlas(meshes: Sequence[FrozenMesh], *, smart_limit: int = SMART_LIMIT)
         chart_atlas(meshes, density)
     _fit(meshes)
     numbers = measure_atlas(meshes, MEASURE_SIZE)
-    return {"method": method, "seconds": time.perf_counter() - started, **numbers}
+    return AtlasFacts(method=method, seconds=time.perf_counter() - started, **numbers)
 
 
 def texel_density(meshes: Sequence[FrozenMesh]) -> np.ndarray:
@@ -177,11 +179,10 @@ def _fit(meshes: Sequence[FrozenMesh]) -> None:
 
 
 def measure_atlas(meshes: Sequence[FrozenMesh], size: int = MEASURE_SIZE) -> dict[str, Any]:
-    """Numbers of the atlas at ``size``² texels.
+    """The numbers of `AtlasFacts` at ``size``² texels.
 
-    occupancy: covered texels / all texels; overlap: covered texels whose centre lies strictly inside more
-    than one triangle / covered texels; triangles_without_texel: fraction of triangles that hold no texel
-    centre; texels_per_unit: median, min and max over objects of sqrt(texel area / world area).
+    Texels are covered where their centre lies strictly inside a triangle. A mesh has sqrt(texel area / world area)
+    texels per unit.
     """
     atlas = np.concatenate([mesh.atlas for mesh in meshes]).astype(np.float64).reshape(-1, 3, 2) * size
     counts, hits = _texel_counts(atlas, size)

@@ -108,8 +108,8 @@ def _node_colour(tree: bpy.types.NodeTree, name: str, findings: Findings) -> np.
     strength = _falloff(source.node.inputs["Strength"], source.scope, name, findings)
     if strength is None:
         strength = evaluator.scalar(source.node.inputs["Strength"], source.scope).scalar
-    for finding in trial.to_list():
-        findings.add(finding["kind"], f"lamp's {finding['feature']}", finding["note"], object=name)
+    for finding in trial:
+        findings.add(finding.kind, f"lamp's {finding.feature}", finding.note, object=name)
     if isinstance(evaluator.colour(source.node.inputs["Color"], source.scope), Textured):
         findings.add("approximated", "textured lamp", "its mean colour shines in all directions", object=name)
     return np.asarray(colour, dtype=np.float64) * strength

@@ -6,6 +6,7 @@ import bpy
 import mathutils
 import numpy as np
 
+from dnrpipe.core.scene_records import Lens, SceneCamera
 from dnrtrain.contract import View
 
 SENSOR = 36.0  # mm; only its ratio to the focal length counts
@@ -56,26 +57,27 @@ def rigid(matrix: mathutils.Matrix) -> list[list[float]]:
     return result.tolist()
 
 
-def describe(camera: bpy.types.Object) -> dict[str, object]:
-    """Pose and lens of a camera object; angles and millimetres as Blender shows them (see summary.json)."""
+def describe(camera: bpy.types.Object) -> SceneCamera:
+    """Pose and lens of a camera object."""
     data = camera.data
-    return {
-        "c2w": rigid(camera.matrix_world),
-        "type": data.type,
-        "lens": data.lens,
-        "sensor_width": data.sensor_width,
-        "sensor_height": data.sensor_height,
-        "sensor_fit": data.sensor_fit,
-        "shift_x": data.shift_x,
-        "shift_y": data.shift_y,
-        "clip_start": data.clip_start,
-        "clip_end": data.clip_end,
-        "ortho_scale": data.ortho_scale,
-        "dof": _depth_of_field(camera),
-    }
+    return SceneCamera(
+        name=camera.name,
+        c2w=tuple(map(tuple, rigid(camera.matrix_world))),
+        type=data.type,
+        lens=data.lens,
+        sensor_width=data.sensor_width,
+        sensor_height=data.sensor_height,
+        sensor_fit=data.sensor_fit,
+        shift_x=data.shift_x,
+        shift_y=data.shift_y,
+        clip_start=data.clip_start,
+        clip_end=data.clip_end,
+        ortho_scale=data.ortho_scale,
+        dof=_depth_of_field(camera),
+    )
 
 
-def _depth_of_field(camera: bpy.types.Object) -> dict[str, float] | None:
+def _depth_of_field(camera: bpy.types.Object) -> Lens | None:
     """Thin lens of a camera with depth of field, scene units: aperture_radius = lens / (2000 fstop), as in Cycles.
 
     The focus object, where there is one, gives the distance along the view axis.

@@ -7,9 +7,11 @@ import json
 import signal
 import subprocess
 import sys
-from typing import Any
+from typing import NamedTuple
 
 from dnrpipe.core.errors import UserError
+
+from ..tasks import RasterTrial
 
 ENGINES = ("eevee", "workbench", "cycles-direct")
 TIMEOUT = 120.0  # seconds
@@ -26,40 +28,43 @@ def choose_raster(requested: str) -> tuple[str, str]:
         return requested, "requested"
     if requested in ENGINES:
         trial = try_engine(requested)
-        if trial["ok"]:
+        if trial.seconds is not None:
             return requested, "requested"
         raise UserError(
-            f"raster engine '{requested}' does not run here: {trial['reason']}; install libegl1 and "
+            f"raster engine '{requested}' does not run here: {trial.reason}; install libegl1 and "
             "libgl1-mesa-dri, or use --set passes.raster=cycles-direct"
         )
     if requested != "auto":
         raise UserError(f"unknown raster engine '{requested}'; choose auto, {', '.join(ENGINES)}")
     trial = try_engine("eevee")
-    if not trial["ok"]:
-        return "cycles-direct", f"EEVEE does not run here: {trial['reason']}"
-    seconds = trial["seconds_next"]
-    if seconds > SLOWEST_FRAME:
-        return "cycles-direct", f"EEVEE takes {seconds:.1f} s per 256x256 frame here"
-    return "eevee", f"EEVEE takes {seconds:.2f} s per 256x256 frame here"
+    if trial.seconds is None:
+        return "cycles-direct", f"EEVEE does not run here: {trial.reason}"
+    if trial.seconds > SLOWEST_FRAME:
+        return "cycles-direct", f"EEVEE takes {trial.seconds:.1f} s per 256x256 frame here"
+    return "eevee", f"EEVEE takes {trial.seconds:.2f} s per 256x256 frame here"
+
+
+class Trial(NamedTuple):
+    """seconds: of a frame; None where the engine does not run, for a reason."""
+
+    seconds: float | None
+    reason: str = ""
 
 
 @functools.cache
-def try_engine(engine: str) -> dict[str, Any]:
-    """Render two small frames with ``engine`` in a subprocess, once per process.
-
-    Returns {"ok": True, "seconds_first", "seconds_next"} or {"ok": False, "reason"}.
-    """
+def try_engine(engine: str) -> Trial:
+    """Render two small frames with ``engine`` in a subprocess, once per process."""
     command = [sys.executable, "-m", "dnrpipe.blender.passes.probe", engine]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, stdin=subprocess.DEVNULL)
     except subprocess.TimeoutExpired:
-        return {"ok": False, "reason": f"no frame within {TIMEOUT:.0f} s"}
+        return Trial(None, f"no frame within {TIMEOUT:.0f} s")
     if done.returncode < 0:
-        return {"ok": False, "reason": f"its trial was killed by {signal.Signals(-done.returncode).name}"}
+        return Trial(None, f"its trial was killed by {signal.Signals(-done.returncode).name}")
     lines = [line for line in done.stdout.splitlines() if line.startswith('{"ok"')]
     if done.returncode == 0 and lines:
-        answer = json.loads(lines[-1])
-        return answer if answer["ok"] else {"ok": False, "reason": "its trial frame is empty"}
+        answer: RasterTrial = json.loads(lines[-1])
+        return Trial(answer["seconds_next"]) if answer["ok"] else Trial(None, "its trial frame is empty")
     errors = [line.strip() for line in done.stderr.splitlines() if line.strip()]
     reason = f"its trial ended with exit code {done.returncode}"
-    return {"ok": False, "reason": f"{reason} ({errors[-1][:200]})" if errors else reason}
+    return Trial(None, f"{reason} ({errors[-1][:200]})" if errors else reason)

@@ -1,4 +1,4 @@
-"""Worker: views of the prepared scene by Cycles as the file has it, at a few samples, raw and with Blender's denoiser.
+"""Worker that renders views by Cycles as the file has it, at a few samples, raw and with Blender's denoiser.
 
 For `dnrpipe frontier`: Cycles is what the artist would render with. Bounces, clamping and caustics stay as in the file;
 adaptive sampling and time limits are off, so that samples are what they say. Persistent data keeps the BVH between
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import bpy
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import View
 
+from ..tasks import CyclesAnswer, CyclesCommon, CyclesTask, PassesCommon
 from .drawing import make_renderer
 
 METHODS: dict[str, tuple[str, str] | None] = {
@@ -30,34 +31,39 @@ REFERENCE = "reference"
 
 
 class Worker:
-    """common: {"threads"}; task: {"scene_dir", "views", "samples", "reference_spp", "folder", "output"}.
-
-    Writes ``folder/NAME/VIEW.exr`` (linear Rec.709, premultiplied RGBA) for every NAME, such as ``4 spp raw``, and the
-    reference, and then ``output``: {"threads", "ms": {NAME: processor time over the threads, per view}}.
-    """
+    """Renders a `CyclesTask`; common: a `CyclesCommon`. Answers and writes a `CyclesAnswer`."""
 
     def __init__(self, common: dict[str, Any]) -> None:
-        self.threads = int(common["threads"]) or os.cpu_count() or 1
+        self.threads = CyclesCommon.model_validate(common).threads or os.cpu_count() or 1
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
-        folder = Path(task["folder"])
-        common = {"scene_dir": task["scene_dir"], "raster_engine": "cycles", "raster_samples": 1}
-        draw = make_renderer("raster", {**common, "threads": self.threads})
-        scene = bpy.context.scene
-        views = [View.model_validate(view) for view in task["views"]]
-        ms: dict[str, list[float]] = {}
-        for spp in task["samples"]:
-            for method, denoiser in METHODS.items():
-                _sampling(scene, int(spp), 1, denoiser)
-                ms[f"{spp} spp {method}"] = self._frames(draw, views, folder / f"{spp} spp {method}")
-        _sampling(scene, int(task["reference_spp"]), 2, None)
-        self._frames(draw, views, folder / REFERENCE, warm=False)
-        made = {"threads": self.threads, "ms": ms}
-        write_json(Path(task["output"]), made)
+        wanted = CyclesTask.model_validate(task)
+        made = self._render(wanted).data()
+        write_json(wanted.output, made)
         return made
 
+    def _render(self, task: CyclesTask) -> CyclesAnswer:
+        scene_settings = PassesCommon(
+            scene_dir=task.scene_dir,
+            raster_engine="cycles",
+            raster_samples=1,
+            coverage_samples=1,
+            threads=self.threads,
+        )
+        draw = make_renderer("raster", scene_settings)
+        scene = bpy.context.scene
+        ms: dict[str, list[float]] = {}
+        for spp in task.samples:
+            for method, denoiser in METHODS.items():
+                _sampling(scene, spp, 1, denoiser)
+                name = f"{spp} spp {method}"
+                ms[name] = self._frames(draw, task.views, task.folder / name)
+        _sampling(scene, task.reference_spp, 2, None)
+        self._frames(draw, task.views, task.folder / REFERENCE, warm=False)
+        return CyclesAnswer(threads=self.threads, ms=ms)
+
     def _frames(
-        self, draw: Callable[[View, Path], None], views: list[View], folder: Path, warm: bool = True
+        self, draw: Callable[[View, Path], None], views: Sequence[View], folder: Path, warm: bool = True
     ) -> list[float]:
         folder.mkdir(parents=True, exist_ok=True)
         if warm:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import bpy
 
@@ -12,37 +11,38 @@ from dnrpipe.core.errors import UserError
 from dnrtrain.contract import View
 
 from ..reading.opening import open_blend
+from ..tasks import PassesCommon
 from .camera import apply_view, clip_range
 from .gbuffer_scene import GBUFFER_SCENE, gbuffer_bounds, set_up_coverage
 from .raster import configure_raster
 from .rendering import output_exr, render_to
 
 
-def make_renderer(kind: str, common: dict[str, Any]) -> Callable[[View, Path], None]:
+def make_renderer(kind: str, common: PassesCommon) -> Callable[[View, Path], None]:
     """Open source.blend and set its scene up for ``kind`` ("gbuffer", "coverage", "raster").
 
     Raises UserError when source.blend is missing, damaged or not one of ours.
     """
-    source = Path(common["scene_dir"]) / "source.blend"
+    source = common.scene_dir / "source.blend"
     if not source.is_file():
         raise UserError(f"{source}: no such file; run `dnrpipe prepare` first")
     if kind == "raster":
         open_blend(source)
         scene = bpy.context.scene
         bounds = gbuffer_bounds(_gbuffer_scene(source))
-        configure_raster(scene, str(common["raster_engine"]), int(common["raster_samples"]))
+        configure_raster(scene, common.raster_engine, common.raster_samples)
     else:
         scene = _append_gbuffer(source)
         bounds = gbuffer_bounds(scene)
         if kind == "coverage":
-            set_up_coverage(scene, int(common["coverage_samples"]))
+            set_up_coverage(scene, common.coverage_samples)
         output_exr(scene, "layers" if kind == "gbuffer" else "image")
     camera = bpy.data.objects.new("dnrpipe.camera", bpy.data.cameras.new("dnrpipe.camera"))
     scene.collection.objects.link(camera)
     scene.camera = camera
-    if threads := int(common.get("threads", 0)):
+    if common.threads:
         scene.render.threads_mode = "FIXED"
-        scene.render.threads = threads
+        scene.render.threads = common.threads
 
     def draw(view: View, path: Path) -> None:
         apply_view(view, camera, scene.render, clip_range(view, *bounds))

@@ -23,6 +23,8 @@ from dnrpipe.core.errors import UserError
 from dnrpipe.workers.processes import die_with_parent
 from dnrtrain.contract import View
 
+from ..tasks import FrameCosts, PassesCommon
+
 Kind = Literal["gbuffer", "coverage", "raster"]
 
 
@@ -31,17 +33,17 @@ class Lane:
 
     Args:
         kind: which scene the process renders.
-        common: the passes worker's ``common`` (see :class:`dnrpipe.blender.passes.worker.Worker`).
+        common: of the passes worker.
     """
 
-    def __init__(self, kind: Kind, common: dict[str, Any]) -> None:
+    def __init__(self, kind: Kind, common: PassesCommon) -> None:
         self.kind = kind
         self.common = common
         self.process: Any = None
         self.connection: Connection | None = None
 
-    def __call__(self, view: View, path: Path) -> dict[str, float]:
-        """Render and return {"seconds", "cpu_seconds", "peak_mb"} of this frame in its process.
+    def __call__(self, view: View, path: Path) -> FrameCosts:
+        """Render a frame and say what it took.
 
         Raises UserError for unusable input, RuntimeError when rendering fails or the process dies; the
         next call starts a new process.
@@ -50,10 +52,10 @@ class Lane:
             self._start()
         assert self.connection is not None
         try:
-            self.connection.send((view.model_dump(mode="json"), str(path)))
+            self.connection.send((view, path))
             answer = self.connection.recv()
         except (EOFError, OSError):
-            raise RuntimeError(f"the {self.kind} renderer {self._bury()}") from None
+            raise RuntimeError(f"the {self.kind} renderer {self._exit_reason()}") from None
         if "error" in answer:
             raise (UserError if answer["input"] else RuntimeError)(answer["error"])
         return answer
@@ -65,7 +67,7 @@ class Lane:
         self.process.start()
         theirs.close()  # so that its end is seen here
 
-    def _bury(self) -> str:
+    def _exit_reason(self) -> str:
         self.process.join(10)
         code = self.process.exitcode
         self.process, self.connection = None, None
@@ -74,7 +76,7 @@ class Lane:
         return f"ended with exit code {code}"
 
 
-def _serve(connection: Connection, kind: Kind, common: dict[str, Any], parent: int) -> None:
+def _serve(connection: Connection, kind: Kind, common: PassesCommon, parent: int) -> None:
     """Body of the process: a renderer is made at the first task, so that its errors reach the parent."""
     die_with_parent(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
@@ -90,9 +92,9 @@ def _serve(connection: Connection, kind: Kind, common: dict[str, Any], parent: i
                 from .drawing import make_renderer
 
                 draw = make_renderer(kind, common)
-            draw(View.model_validate(view), Path(path))
+            draw(view, path)
             peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-            answer: dict[str, Any] = {
+            answer: FrameCosts | dict[str, Any] = {
                 "seconds": time.perf_counter() - started,
                 "cpu_seconds": time.process_time() - cpu,
                 "peak_mb": peak / (1 << 20 if sys.platform == "darwin" else 1 << 10),

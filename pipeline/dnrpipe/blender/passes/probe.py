@@ -1,6 +1,6 @@
 """``python -m dnrpipe.blender.passes.probe ENGINE``: can this machine draw with EEVEE or Workbench, and how fast?
 
-Prints one JSON line {"ok", "seconds_first", "seconds_next"}. It runs in a process of its own: without
+Prints a `RasterTrial` as one JSON line. It runs in a process of its own: without
 EGL Blender aborts the process when it first needs the GPU.
 """
 
@@ -11,11 +11,11 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
 import bpy
 import numpy as np
 
+from ..tasks import RasterTrial
 from .raster import configure_raster
 from .rendering import render_to
 from .scratch import read_channels
@@ -24,7 +24,7 @@ SIZE = 256  # pixels per side
 SAMPLES = 4
 
 
-def probe(engine: str) -> dict[str, Any]:
+def probe(engine: str) -> RasterTrial:
     """Render Blender's default cube twice at 256²; the first frame compiles shaders."""
     bpy.ops.wm.read_factory_settings()
     scene = bpy.context.scene

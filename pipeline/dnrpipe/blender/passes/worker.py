@@ -1,16 +1,16 @@
-"""Worker: one view -> one EXR with G-buffers, coverage and, where asked, rasterised colour."""
+"""Worker that renders a view into one EXR with G-buffers, coverage and, where asked, rasterised colour."""
 
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dnrtrain.contract import GBUFFER_CHANNELS, RASTER_CHANNELS, View
+from dnrtrain.contract import GBUFFER_CHANNELS, RASTER_CHANNELS
 from dnrtrain.exr import write_exr
 
+from ..tasks import PassesAnswer, PassesCommon, PassesHeader, PassesTask
 from .lane import Lane
 from .scratch import read_channels, scratch_folder
 
@@ -19,26 +19,21 @@ LAYER_PREFIX = "G."  # gbuffer_scene.GBUFFER_LAYER
 
 
 class Worker:
-    """Renders views of one prepared scene.
-
-    common: ``scene_dir``, ``raster_engine`` (eevee | workbench | cycles-direct), ``raster_samples``,
-    ``coverage_samples``, and optionally ``threads`` (0 = all cores).
-    task: ``view`` (View as JSON), ``output`` (EXR path), ``raster`` (bool), ``fingerprint``.
-    """
+    """Renders views of one prepared scene. common: a `PassesCommon`, task: a `PassesTask`."""
 
     def __init__(self, common: dict[str, Any]) -> None:
-        self.common = common
-        self.gbuffer = Lane("gbuffer", common)
-        self.coverage = Lane("coverage", common)
-        self.raster = Lane("raster", common)
+        self.common = PassesCommon.model_validate(common)
+        self.gbuffer = Lane("gbuffer", self.common)
+        self.coverage = Lane("coverage", self.common)
+        self.raster = Lane("raster", self.common)
 
-    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
-        """Write the view's EXR and return its numbers: those of its metadata, CPU seconds, peak memory.
+    def __call__(self, task: dict[str, Any]) -> PassesAnswer:
+        return self._render(PassesTask.model_validate(task))
 
-        One frame at a time: lanes working side by side would spoil each other's seconds.
-        """
+    def _render(self, task: PassesTask) -> PassesAnswer:
+        """Write the view's EXR. One frame at a time: lanes side by side would spoil each other's seconds."""
         started, cpu = time.perf_counter(), time.process_time()
-        view, raster = View.model_validate(task["view"]), bool(task["raster"])
+        view = task.view
         with scratch_folder(view.width * view.height) as folder:
             frames = [self.gbuffer(view, folder / "gbuffer.exr")]
             channels, repaired = read_gbuffer(read_channels(folder / "gbuffer.exr", LAYER_PREFIX))
@@ -46,26 +41,27 @@ class Worker:
             frames.append(self.coverage(view, folder / "coverage.exr"))
             channels["coverage"] = np.clip(read_channels(folder / "coverage.exr")["A"], 0, 1)
             geometry_seconds = time.perf_counter() - started
-            if raster:
+            if task.raster:
                 frames.append(self.raster(view, folder / "raster.exr"))
                 picture = read_channels(folder / "raster.exr")
                 colour, bad = finite({name: picture[name] for name in RASTER_CHANNELS})
                 channels |= colour
                 repaired += bad
         seconds = time.perf_counter() - started
-        numbers = {
-            "fingerprint": task["fingerprint"],
+        header: PassesHeader = {
+            "fingerprint": task.fingerprint,
             "view": view.name,
-            "raster_engine": self.common["raster_engine"] if raster else None,
-            "raster_samples": self.common["raster_samples"] if raster else 0,
+            "raster_engine": self.common.raster_engine if task.raster else None,
+            "raster_samples": self.common.raster_samples if task.raster else 0,
             "repaired": repaired,
             "seconds": seconds,
             "gbuffer_seconds": gbuffer_seconds,
             "coverage_seconds": geometry_seconds - gbuffer_seconds,
-            "raster_seconds": seconds - geometry_seconds if raster else 0.0,
+            "raster_seconds": seconds - geometry_seconds if task.raster else 0.0,
         }
-        write_exr(Path(task["output"]), channels, numbers)
-        return numbers | {
+        write_exr(task.output, channels, dict(header))
+        return {
+            **header,
             "seconds": time.perf_counter() - started,
             "cpu_seconds": time.process_time() - cpu + sum(frame["cpu_seconds"] for frame in frames),
             "peak_mb": sum(frame["peak_mb"] for frame in frames),

@@ -10,6 +10,7 @@ import bpy
 import numpy as np
 
 from dnrpipe.core.errors import UserError
+from dnrpipe.core.scene_records import Bounds
 
 from ..findings import Findings
 from ..geometry.freeze import Frozen
@@ -26,14 +27,13 @@ from .scripts import note_drivers
 class Loaded:
     """An open scene with camera and light, and its frozen geometry.
 
-    bounds: see :func:`scene_bounds`. warnings: lines for the user. findings: what is missing or never executed.
-    external: the outside files it was read from. missing: those that were not there. has_light: whether the file
-    brought light of its own.
+    warnings: lines for the user. findings: what is missing or never executed. external: the outside files it was read
+    from. missing: those that were not there. has_light: whether the file brought light of its own.
     """
 
     scene: bpy.types.Scene
     frozen: Frozen
-    bounds: dict[str, Any]
+    bounds: Bounds
     warnings: list[str]
     findings: Findings
     external: list[Path]
@@ -42,7 +42,7 @@ class Loaded:
 
 
 def load_scene(source: Path, *, strict: bool = False) -> Loaded:
-    """Open ``source`` (see :func:`open_scene`) and freeze it; a missing camera or light is added to the open file.
+    """Open ``source`` (see `open_scene`) and freeze it; a missing camera or light is added to the open file.
 
     Raises UserError for unusable input, and with ``strict`` for a scene with missing files; NothingVisible for a file
     without a surface, which stays open.
@@ -57,7 +57,7 @@ def load_scene(source: Path, *, strict: bool = False) -> Loaded:
         raise type(error)(f"{source}: {error}") from None
     bounds = scene_bounds(frozen.meshes)
     warnings += frozen.warnings
-    warnings += ensure_camera(scene, np.array(bounds["center"]), (mesh.extent() for mesh in frozen.meshes))
+    warnings += ensure_camera(scene, np.array(bounds.center), (mesh.extent() for mesh in frozen.meshes))
     lit = has_light(scene, frozen.meshes)
     warnings += ensure_light(scene, frozen.meshes)
     findings = frozen.findings
@@ -66,11 +66,11 @@ def load_scene(source: Path, *, strict: bool = False) -> Loaded:
     return Loaded(scene, frozen, bounds, warnings, findings, external, missing, lit)
 
 
-def scene_bounds(meshes: list[FrozenMesh]) -> dict[str, Any]:
-    """Axis-aligned box, and a sphere about its centre that holds every vertex (of copies: their box); scene units."""
+def scene_bounds(meshes: list[FrozenMesh]) -> Bounds:
+    """The box and the sphere that hold the meshes; of copies, their boxes."""
     extents = [mesh.extent() for mesh in meshes]
     low = np.min([points.min(0) for points in extents], axis=0)
     high = np.max([points.max(0) for points in extents], axis=0)
     center = (low + high) / 2
     radius = max(float(np.linalg.norm(points - center, axis=1).max()) for points in extents)
-    return {"min": low.tolist(), "max": high.tolist(), "center": center.tolist(), "radius": radius}
+    return Bounds(min=low.tolist(), max=high.tolist(), center=center.tolist(), radius=radius)

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from ..baking.bakes import BakeBook, Kind
+from ..baking.bakes import BakeBook
 from ..findings import Findings
 from ..geometry.corner_colours import ACTIVE_COLOUR, colour_corners, is_uv_layer
+from ..tasks import ValueKind
 from .averages import procedural_mean
 from .blackbody import blackbody_colour
 from .color_nodes import OPERATIONS
@@ -88,7 +89,7 @@ class Evaluator:
         self.book.used_atlas = True
         return on_region(self.book.atlas, self.material, value)
 
-    def _evaluated(self, socket: Any, scope: Scope, kind: Kind) -> Value:
+    def _evaluated(self, socket: Any, scope: Scope, kind: ValueKind) -> Value:
         """The value: exactly where that is possible, else baked, else averaged."""
         if self.book is None or self.material is None:
             return self._value(socket, scope)

@@ -12,7 +12,7 @@ from dnrtrain.contract import View
 from ...core.console import Console
 from ...core.errors import UserError
 from ...core.ledger import StageName
-from ...core.scene_files import read_json, split_views
+from ...core.scene_files import read_raster_choice, split_views
 from ...core.settings import Settings
 from ...core.workspace import Source, Workspace, file_sha256
 from ...stages.pipeline import run_stage
@@ -166,13 +166,14 @@ def raster_file(workspace: Workspace, view: str) -> Path:
 
 
 def _raster_test_views(scene: Scene, settings: Settings, console: Console) -> dict[str, str]:
-    engine = read_json(scene.workspace.root / "passes" / "raster.json")["engine"]
+    chosen = read_raster_choice(scene.workspace)
+    assert chosen is not None, "stage prepare has chosen one"
     tasks = draw_passes(
         scene.run(settings, console, "prepare"),
         "rasterised test views",
         list(scene.test.values()),
         [raster_file(scene.workspace, name) for name in scene.test],
-        engine,
+        chosen.engine,
         raster=[True] * len(scene.test),
     )
     return {name: task["fingerprint"] for name, task in zip(scene.test, tasks, strict=True)}

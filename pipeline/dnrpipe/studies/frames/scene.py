@@ -17,6 +17,7 @@ from dnrtrain.display import DisplayTransform
 from ...core.console import Console
 from ...core.errors import UserError
 from ...core.scene_files import read_frame, read_summary, scene_fingerprint, split_views
+from ...core.scene_records import SceneSummary
 from ...core.settings import Settings
 from ...core.workspace import Workspace, digest
 from ...effects.store import lenses, trace_config, variant_for
@@ -50,7 +51,7 @@ class BenchScene:
     name: str
     workspace: Workspace
     settings: Settings
-    summary: dict[str, Any]
+    summary: SceneSummary
     frame: SceneFrame
     display: DisplayTransform
     views: list[View]
@@ -107,7 +108,7 @@ def open_scene(root: Path, views: int | list[View], threads: int, settings: Sett
         name=root.name.removesuffix(".dnr"),
         workspace=workspace,
         settings=settings,
-        summary=read_summary(workspace),
+        summary=read_summary(workspace.scene),
         frame=frame,
         display=DisplayTransform(frame, workspace.scene),
         views=chosen,

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from dnrtrain.atomic import atomic_path, write_json, write_text
 
+from ...blender.tasks import CyclesTask
 from ...core.errors import UserError
 from ...core.scene_files import scene_fingerprint, split_views
 from ...core.settings import Settings
@@ -167,22 +168,23 @@ def _cycles(run: Frontier, settings: Settings, samples: tuple[int, ...], cores: 
         [CYCLES_VERSION, scene_fingerprint(workspace), [v.model_dump() for v in views], samples, reference_spp, cores]
     )
     folder = run.request.out / "rivals" / f"cycles-{key}"
-    task = {
-        "scene_dir": str(workspace.scene),
-        "views": [view.model_dump(mode="json") for view in views],
-        "samples": list(samples),
-        "reference_spp": reference_spp,
-        "folder": str(folder),
-        "output": str(folder / "frames.json"),
-        "label": "Cycles",
-    }
+    frames = folder / "frames.json"
+    task = CyclesTask(
+        scene_dir=workspace.scene,
+        views=tuple(views),
+        samples=samples,
+        reference_spp=reference_spp,
+        folder=folder,
+        output=frames,
+    )
     worker_pool: WorkerPool = replace(run.worker_pool, threads=cores, workers=1)
-    worker_pool.work("Cycles on the test views", "dnrpipe.blender.passes.cycles_frames", [task])
+    rendering = task.data() | {"label": "Cycles"}
+    worker_pool.work("Cycles on the test views", "dnrpipe.blender.passes.cycles_frames", [rendering])
     measured = digest([key, run.perceptual])
     output = run.request.out / "rivals" / f"{measured}.json"
     names = {"workspace": str(workspace.root), "views": [view.name for view in views], "label": "Cycles"}
-    task = {**names, "frames": task["output"], "folder": str(folder), "output": str(output)}
-    worker_pool.work("measuring Cycles", "dnrpipe.studies.frontier.cycles", [task])
+    measuring = {**names, "frames": str(frames), "folder": str(folder), "output": str(output)}
+    worker_pool.work("measuring Cycles", "dnrpipe.studies.frontier.cycles", [measuring])
     return json.loads(output.read_text(encoding="utf-8"))["rungs"]
 
 

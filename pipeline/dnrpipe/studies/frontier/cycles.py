@@ -6,7 +6,6 @@ picture: Cycles by a reference with as many samples as ours, raw, with another s
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,8 @@ import numpy as np
 from dnrtrain.atomic import write_json
 from dnrtrain.display import DisplayTransform
 
-from ...core.scene_files import read_frame
+from ...blender.tasks import CyclesAnswer
+from ...core.scene_files import read_frame, read_record
 from ...core.workspace import Workspace
 from ..frames.scene import shown
 from .rivals import load_lpips, masks_of, quality_of, read_rgba
@@ -25,9 +25,9 @@ PREFIX = "Cycles "
 
 
 class Worker:
-    """task: {"workspace", "views": names, "frames": JSON of :mod:`..blender.passes.cycles_frames`, "folder", "output"}.
+    """task: {"workspace", "views": names, "frames": file of a `CyclesAnswer`, "folder", "output"}.
 
-    Answers and writes to ``output`` {"threads", "rungs"}, each rung as of :mod:`.rivals`, its name beginning with
+    Answers and writes to ``output`` {"threads", "rungs"}, each rung as of `rivals`, its name beginning with
     ``Cycles``.
     """
 
@@ -39,7 +39,7 @@ class Worker:
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
         workspace, folder = Workspace.open(Path(task["workspace"])), Path(task["folder"])
-        frames = json.loads(Path(task["frames"]).read_text(encoding="utf-8"))
+        frames = read_record(Path(task["frames"]), CyclesAnswer)
         display = DisplayTransform(read_frame(workspace), workspace.scene)
         names = list(task["views"])
 
@@ -55,8 +55,8 @@ class Worker:
                 "ms": float(np.median(ms)),
                 **quality_of(pictures(name), truth, masks, lpips),
             }
-            for name, ms in frames["ms"].items()
+            for name, ms in frames.ms.items()
         ]
-        made = {"threads": frames["threads"], "rungs": rungs}
+        made = {"threads": frames.threads, "rungs": rungs}
         write_json(Path(task["output"]), made)
         return made

@@ -88,7 +88,7 @@ def place_pool(source: Path, pool: str, out: Path, settings: Settings, console: 
         settings.cameras.source = pool
     else:
         file = root / "rig.json"
-        summary = read_summary(first)
+        summary = read_summary(first.scene)
         if pool == "path":
             views = walk(summary, settings.cameras)
         else:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from dnrtrain.contract import View
 from ...blender.geometry.frozen import FrozenMesh
 from ...core.cameras import framing, look_at_view
 from ...core.errors import UserError
+from ...core.scene_records import SceneSummary
 from ...core.settings import CameraSettings
 
 STOPS = 5
@@ -35,15 +35,15 @@ SOLID, SHELL = 0.6, 0.95
 SURFACE_POINTS, TRIES, CHUNK = 4000, 40, 200_000
 
 
-def walk(summary: dict[str, Any], settings: CameraSettings) -> dict[str, list[View]]:
+def walk(summary: SceneSummary, settings: CameraSettings) -> dict[str, list[View]]:
     """A walk around the scene, filmed: most frames are near-duplicates at a few stops, some look away.
 
     Candidates are in the order of the film. Test views are spread evenly along the same walk, none of them empty:
     every part of it counts alike, however long the camera stood there.
     """
     rng = np.random.default_rng([settings.seed, 0x5041])
-    center = np.asarray(summary["bounds"]["center"], np.float64)
-    focal, distance = framing(summary, settings, float(summary["bounds"]["radius"]))
+    center = np.asarray(summary.bounds.center, np.float64)
+    focal, distance = framing(summary, settings)
     count = settings.train
     empty = round(EMPTY * count)
     stopped = round(STOPPED * count)
@@ -79,16 +79,15 @@ def walk(summary: dict[str, Any], settings: CameraSettings) -> dict[str, list[Vi
 
 
 def inside(
-    summary: dict[str, Any], settings: CameraSettings, meshes: Sequence[FrozenMesh], name: str
+    summary: SceneSummary, settings: CameraSettings, meshes: Sequence[FrozenMesh], name: str
 ) -> dict[str, list[View]]:
     """Cameras within the bounds of the scene, in free air, each looking at some point of a surface.
 
     Raises UserError: no room for a camera.
     """
     rng = np.random.default_rng([settings.seed, 0x494E])
-    bounds = summary["bounds"]
-    low, high = np.asarray(bounds["min"], np.float64), np.asarray(bounds["max"], np.float64)
-    radius = float(bounds["radius"])
+    bounds = summary.bounds
+    low, high = np.asarray(bounds.min, np.float64), np.asarray(bounds.max, np.float64)
     surface = surface_points(meshes, SURFACE_POINTS, rng)
     # A mesh as large as the scene is a room's shell or its all: to be inside of that is the point.
     solids = [m for m in meshes if (np.ptp(m.positions.astype(np.float64), axis=0) < SHELL * (high - low)).any()]
@@ -100,7 +99,7 @@ def inside(
         # Between a quarter and nine tenths of the height: at eye level and above what lies around.
         spots = low + (high - low) * rng.uniform([0.08, 0.08, 0.25], [0.92, 0.92, 0.9], (wanted, 3))
         near = np.min(np.linalg.norm(spots[:, None] - surface[None], axis=-1), axis=1)
-        spots = spots[near > CLEARANCE * radius]
+        spots = spots[near > CLEARANCE * bounds.radius]
         found += list(spots[winding(spots, triangles) < SOLID])
         if len(found) >= wanted:
             break
@@ -113,7 +112,7 @@ def inside(
         ahead = surface - position
         far = np.linalg.norm(ahead, axis=1)
         level = np.abs(ahead[:, 2]) < 0.7 * far  # people seldom look straight up or down
-        seen = np.flatnonzero((far > REACH * radius) & level)
+        seen = np.flatnonzero((far > REACH * bounds.radius) & level)
         if not len(seen):
             seen = np.flatnonzero(np.linalg.norm(ahead[:, :2], axis=1) > 1e-3 * far)
         target = surface[rng.choice(seen)]
