@@ -18,6 +18,7 @@ from dnrpipe.core.workspace import Source, Workspace
 from dnrpipe.studies.planning.carry_out import steps_that_fit, steps_within
 from dnrpipe.studies.planning.choose import NEAR, Predictor, best_within, budgets, cheapest_reaching
 from dnrpipe.studies.planning.pilot import pilot_path, read_pilot
+from dnrpipe.studies.planning.pilot_worker import without_reference
 from dnrpipe.studies.planning.quality import (
     Gain,
     Measured,
@@ -43,7 +44,6 @@ from dnrpipe.studies.planning.records import (
 )
 from dnrpipe.studies.planning.routes import as_reported, break_even, rival_line, routes, seconds_for
 from dnrpipe.studies.planning.seconds import Costs, Work, noise_at, view_line
-from dnrpipe.studies.planning.worker import without_reference
 
 PRIOR = load_prior()
 POSITIVE = st.floats(1e-8, 1e-5)

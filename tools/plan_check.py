@@ -25,8 +25,8 @@ from tools.plan_prior import read_cells, without
 
 from dnrpipe.core.errors import UserError
 from dnrpipe.studies.cells.provenance import made_by
-from dnrpipe.studies.frames.ladder import crossover, frontier
-from dnrpipe.studies.frontier.command import read_frontier
+from dnrpipe.studies.frames.pareto_front import crossover, frontier
+from dnrpipe.studies.frontier.measure_frontier import read_frontier
 from dnrpipe.studies.planning.choose import VIEWS, Predictor
 from dnrpipe.studies.planning.records import Choice, Interval, Route
 from dnrpipe.studies.planning.routes import as_reported, routes

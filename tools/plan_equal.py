@@ -31,7 +31,7 @@ from dnrpipe.stages.session import Session, resolve_settings
 from dnrpipe.studies.cells.provenance import made_by
 from dnrpipe.studies.planning.carry_out import apply, steps_within
 from dnrpipe.studies.planning.choose import Predictor
-from dnrpipe.studies.planning.command import Wanted, make_plan, make_predictor
+from dnrpipe.studies.planning.make_plan import Wanted, make_plan, make_predictor
 from dnrpipe.studies.planning.pilot import read_pilot
 from dnrpipe.studies.planning.records import Prediction
 from dnrpipe.studies.planning.seconds import TIME_SPREAD

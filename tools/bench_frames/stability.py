@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from dnrpipe.core.cameras import orbit_views
+from dnrpipe.studies.frames.baselines import climb, make_rungs
 from dnrpipe.studies.frames.ours import Ours
-from dnrpipe.studies.frames.rival import climb, make_rungs
 from dnrpipe.studies.frames.scene import BenchScene, Clock
 from dnrtrain.contract import View
 

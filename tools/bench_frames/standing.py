@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from dnrpipe.studies.frames.ladder import Point, crossover, frontier, quality_at
+from dnrpipe.studies.frames.pareto_front import Point, crossover, frontier, quality_at
 
 
 def standing(points: Mapping[str, Point], ours: Point) -> dict[str, Any]:

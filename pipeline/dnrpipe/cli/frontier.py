@@ -56,7 +56,7 @@ def frontier(
       dnrpipe frontier scene.blend --also none --ladder 1,4,16 --json
     """
     from ..core.errors import UserError
-    from ..studies.frontier.command import run_frontier
+    from ..studies.frontier.measure_frontier import run_frontier
 
     if options.pop("force"):
         raise UserError("--force: remove the workspace's folder frontier/ to measure everything anew")

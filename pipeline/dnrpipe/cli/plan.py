@@ -49,9 +49,9 @@ def plan(
         raise UserError("--apply: what shall be carried out? give --time or --target-psnr")
     from ..core.units import parse_seconds
     from ..studies.planning.carry_out import apply
-    from ..studies.planning.command import Wanted, make_plan
+    from ..studies.planning.make_plan import Wanted, make_plan
     from ..studies.planning.pilot import pilot_path
-    from ..studies.planning.words import actual_lines, lines
+    from ..studies.planning.plan_text import actual_lines, lines
     from ..workers.view_tasks import worker_count
 
     wanted = Wanted(amount("--time", duration, parse_seconds), target_psnr, frames)

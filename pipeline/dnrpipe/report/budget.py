@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.units import duration
-from ..studies.frames.ladder import quality_at
+from ..studies.frames.pareto_front import quality_at
 from .data import Budget, FrontierSummary, PlannedRow, Quality
 
 NEXT = 60.0
@@ -114,7 +114,7 @@ def _rows(plan: dict[str, Any] | None) -> list[PlannedRow]:
 def _why(plan: dict[str, Any] | None) -> list[str]:
     if plan is None or plan["chosen"] is None:
         return []
-    from ..studies.planning.words import why
+    from ..studies.planning.plan_text import why
 
     return why(plan)
 
@@ -122,14 +122,14 @@ def _why(plan: dict[str, Any] | None) -> list[str]:
 def _routes(plan: dict[str, Any] | None) -> list[str]:
     if plan is None or "routes" not in plan:
         return []
-    from ..studies.planning.words import route_lines
+    from ..studies.planning.plan_text import route_lines
 
     return [re.sub(r" {2,}", " · ", line.strip()) for line in route_lines(plan)]  # columns are the terminal's
 
 
 def _frontier_summary(root: Path) -> FrontierSummary | None:
-    from ..studies.frontier.command import SCHEMA
-    from ..studies.frontier.words import verdict
+    from ..studies.frontier.frontier_report import verdict
+    from ..studies.frontier.measure_frontier import SCHEMA
 
     results = _read(root / "frontier" / "results.json")
     if results is None or results.get("schema") != SCHEMA:

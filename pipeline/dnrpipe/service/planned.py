@@ -12,7 +12,7 @@ from ..core.errors import UserError
 from ..core.ledger import total
 from ..core.settings import Settings
 from ..core.workspace import Workspace
-from ..studies.planning.command import plan_path
+from ..studies.planning.make_plan import plan_path
 from ..studies.planning.records import Choice, Prediction
 from .models import PlannedStage, PlanState
 

@@ -14,7 +14,7 @@ from ...core.ledger import StageName, total
 from ...core.scene_files import split_views
 from ...core.units import duration
 from .choose import STEPS, Predictor, cheapest_of_the_best
-from .command import make_predictor, plan_path
+from .make_plan import make_predictor, plan_path
 from .pilot import read_pilot
 from .quality import Prior, load_prior
 from .records import Choice, Prediction

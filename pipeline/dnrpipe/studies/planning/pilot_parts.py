@@ -149,7 +149,9 @@ class Piloting:
             "fingerprint": self.run_id,
             "epochs": [max(2, round(steps / self._steps_per_epoch())) for steps in STEPS],
         }
-        ((_, result),) = self._run("pilot: training", "dnrpipe.studies.planning.worker", self._common(), [task], 1, {})
+        ((_, result),) = self._run(
+            "pilot: training", "dnrpipe.studies.planning.pilot_worker", self._common(), [task], 1, {}
+        )
         patch = self.settings.finetune.step2.patch or max(view.width, view.height)
         return TrainingPart(
             views=len(self.train),
@@ -176,7 +178,7 @@ class Piloting:
             "methods": list(METHODS),
         }
         ((_, result),) = self._run(
-            "pilot: frames", "dnrpipe.studies.planning.worker", self._common(), [task], 1, renderer.environment
+            "pilot: frames", "dnrpipe.studies.planning.pilot_worker", self._common(), [task], 1, renderer.environment
         )
         if lost := result.pop("unknown"):
             self.console.warn(f"pilot: {lost} pixels of the held-out views were not finite; they take no part")

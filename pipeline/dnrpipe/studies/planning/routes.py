@@ -14,7 +14,7 @@ import math
 from collections.abc import Sequence
 
 from ...core.ledger import break_even_frames
-from ..frames.ladder import crossover, frontier
+from ..frames.pareto_front import crossover, frontier
 from .quality import with_noise
 from .records import FramePart, FramePoint, Prediction, Route
 

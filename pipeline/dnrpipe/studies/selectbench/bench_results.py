@@ -10,7 +10,7 @@ from typing import Any
 
 from ..cells.measure import METRICS, mean_of
 from ..cells.provenance import made_by, read_made
-from .run import Bench, Place, read_choice
+from .bench import Bench, Place, read_choice
 
 SCHEMA = 1
 

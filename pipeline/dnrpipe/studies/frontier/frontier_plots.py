@@ -8,8 +8,8 @@ from typing import Any
 
 from dnrtrain.atomic import atomic_path
 
-from .account import pareto, total_seconds
-from .cycles import PREFIX
+from .cycles_worker import PREFIX
+from .point_costs import pareto, total_seconds
 
 # Okabe and Ito's palette; filled and hollow shapes differ in grey as well.
 LOOKS: dict[str, dict[str, Any]] = {

@@ -38,9 +38,9 @@ class Worker:
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
         from ...core.scene_files import split_views
+        from ..frames.baselines import METHODS as ALL
+        from ..frames.baselines import climb, make_rungs
         from ..frames.ours import BASE, TIMED, Ours
-        from ..frames.rival import METHODS as ALL
-        from ..frames.rival import climb, make_rungs
         from ..frames.scene import Clock, open_scene
 
         workspace = Workspace.open(Path(task["workspace"]))

@@ -139,8 +139,8 @@ class Worker:
     def _frames(self, task: dict[str, Any], views: list[View]) -> dict[str, Any]:
         from dnrtrain.checkpoint import load_model
 
+        from ..frames.baselines import climb, make_rungs
         from ..frames.ours import BASE, NEURAL, Ours
-        from ..frames.rival import climb, make_rungs
         from ..frames.scene import Clock, open_scene
 
         scene = open_scene(self.workspace.root, views, self.threads, self.settings)

@@ -20,11 +20,11 @@ from ...core.workspace import digest
 from ...workers.view_tasks import worker_count
 from ..cells.provenance import made_by, read_made
 from ..cells.worker_pool import WorkerPool, check_amounts
-from .account import break_evens, pareto, point_of, settle_frames
-from .cycles import PREFIX
-from .plot import plot
-from .run import RIVALS, Frontier, Sweep, make_frontier
-from .words import markdown
+from .cycles_worker import PREFIX
+from .frontier_plots import plot
+from .frontier_report import markdown
+from .point_costs import break_evens, pareto, point_of, settle_frames
+from .sweep import RIVALS, Frontier, Sweep, make_frontier
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -152,7 +152,7 @@ def _rival(run: Frontier, settings: Settings, samples: tuple[int, ...], cores: i
         "label": "path tracing",
     }
     worker_pool: WorkerPool = replace(run.worker_pool, threads=cores, workers=1)
-    worker_pool.work("path tracing of the test views", "dnrpipe.studies.frontier.rivals", [task])
+    worker_pool.work("path tracing of the test views", "dnrpipe.studies.frontier.path_tracing_worker", [task])
     found = json.loads(output.read_text(encoding="utf-8"))
     if lost := sum(rung.get("masked", 0) for rung in found["rungs"] if not rung["denoised"]):
         worker_pool.console.warn(f"repaired: {lost} pixels of the path-traced test views were not finite and are black")
@@ -182,7 +182,7 @@ def _cycles(run: Frontier, settings: Settings, samples: tuple[int, ...], cores: 
     output = run.request.out / "rivals" / f"{measured}.json"
     names = {"workspace": str(workspace.root), "views": [view.name for view in views], "label": "Cycles"}
     task = {**names, "frames": task["output"], "folder": str(folder), "output": str(output)}
-    worker_pool.work("measuring Cycles", "dnrpipe.studies.frontier.cycles", [task])
+    worker_pool.work("measuring Cycles", "dnrpipe.studies.frontier.cycles_worker", [task])
     return json.loads(output.read_text(encoding="utf-8"))["rungs"]
 
 

@@ -16,11 +16,11 @@ from ...core.workspace import locked
 from ..cells.measure import pictured
 from ..cells.scenes import find_scenes
 from ..cells.worker_pool import check_amounts
-from .plot import contact_sheet, plot
-from .results import gather
+from .ablation_plots import contact_sheet, plot
+from .ablation_results import gather
+from .ablation_tables import markdown
+from .cell_loop import Ablation, Request
 from .rows import choose_rows
-from .run import Ablation, Request
-from .tables import markdown
 
 SMOKE: dict[str, Any] = {
     "cameras": {"train": 6, "val": 1, "test": 2, "width": 32, "height": 32},

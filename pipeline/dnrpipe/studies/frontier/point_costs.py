@@ -22,8 +22,8 @@ from ...core.ledger import CostRecord, break_even_frames
 from ..ablation.rows import Row
 from ..cells.measure import METRICS, mean_of
 from ..cells.scenes import base_file, traced_split
-from ..frames.ladder import Point, crossover, frontier
-from .run import Frontier
+from ..frames.pareto_front import Point, crossover, frontier
+from .sweep import Frontier
 
 HIGHER_IS_BETTER = {"psnr": True, "ssim": True, "lpips_vgg": False, "flip": False}
 

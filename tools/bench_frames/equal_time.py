@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from dnrpipe.core.ledger import CostRecord, break_even_frames
-from dnrpipe.studies.frames.ladder import quality_at
 from dnrpipe.studies.frames.ours import NEURAL
+from dnrpipe.studies.frames.pareto_front import quality_at
 
 COUNTS = (200, 2000)
 """Numbers of frames that the tables speak of."""

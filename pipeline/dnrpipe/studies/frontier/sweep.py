@@ -13,8 +13,8 @@ from ...core.console import Console
 from ...core.errors import UserError
 from ...core.settings import Settings
 from ...core.workspace import Workspace
+from ..ablation.cell_loop import Ablation, Request
 from ..ablation.rows import CLASSIC, ROWS, Row
-from ..ablation.run import Ablation, Request
 from ..cells.scenes import Scene, prepared
 
 RIVALS = ("random", "all", "paper")

@@ -18,7 +18,7 @@ from dnrtrain.display import DisplayTransform
 from ...core.scene_files import read_frame
 from ...core.workspace import Workspace
 from ..frames.scene import shown
-from .rivals import load_lpips, masks_of, quality_of, read_rgba
+from .path_tracing_worker import load_lpips, masks_of, quality_of, read_rgba
 
 REFERENCE = "reference"
 PREFIX = "Cycles "

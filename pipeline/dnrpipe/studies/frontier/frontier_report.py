@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ...core.units import duration
-from .account import pareto, total_seconds
+from .point_costs import pareto, total_seconds
 
 
 def markdown(results: Mapping[str, Any]) -> str:

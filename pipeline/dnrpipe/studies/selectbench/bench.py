@@ -121,9 +121,9 @@ class Bench:
                         own = contender.kind == "step1"
                         starts[place] = chosen[place] if own else self._step1(pool, settings, SHARED_COARSE, seed)
         label = f", seed {seed}"
-        self.worker_pool.work(f"selections{label}", "dnrpipe.studies.selectbench.choosing", _once(work["rule"]))
+        self.worker_pool.work(f"selections{label}", "dnrpipe.studies.selectbench.rule_worker", _once(work["rule"]))
         self.worker_pool.work(
-            f"active selections{label}", "dnrpipe.studies.selectbench.active.worker", _once(work["active"])
+            f"active selections{label}", "dnrpipe.studies.selectbench.active.active_worker", _once(work["active"])
         )
         self.worker_pool.work(f"step 1{label}", "dnrpipe.studies.cells.cell", _once([*work["step1"], *starts.values()]))
         for pool in self.pools:

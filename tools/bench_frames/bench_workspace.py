@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from dnrpipe.studies.frames.ladder import frontier
+from dnrpipe.studies.frames.baselines import METHODS, climb, make_rungs
 from dnrpipe.studies.frames.ours import Ours
-from dnrpipe.studies.frames.rival import METHODS, climb, make_rungs
+from dnrpipe.studies.frames.pareto_front import frontier
 from dnrpipe.studies.frames.scene import BenchScene, Clock, open_scene
 from dnrtrain.metrics import image_metrics
 from dnrtrain.perceptual import build_lpips
 from dnrtrain.weights import WeightsMissing, load_weights
 
+from .equal_time import upfront
 from .reference import Reference, make_references
 from .stability import measure
 from .standing import classes, standing
-from .upfront import upfront
 
 CLASSES = (0.03, 0.07, 0.3)
 """Seconds per 128² pixels that the classes are named by; their limits grow with the pixel count."""
