@@ -12,15 +12,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-from dnrtrain.exr import read_metadata
-
-from ...core.errors import UserError
-from ...core.ledger import CostRecord, break_even_frames
+from ...core.ledger import break_even_frames, total, upfront_work
 from ..ablation.rows import Row
-from ..cells.measure import METRICS, mean_of
+from ..cells.measure import METRICS, mean_of, written_seconds
 from ..cells.scenes import base_file, traced_split
 from ..frames.pareto_front import Point, crossover, frontier
 from .sweep import Frontier
@@ -36,17 +32,19 @@ def point_of(run: Frontier, row: Row, seed: int, rivals: Mapping[str, Any], core
         return None
     cell = json.loads(path.read_text(encoding="utf-8"))
     workspace, training, kind = run.scene.workspace, cell["training"], cell["settings"]["model"]["base"]
-    based, records = kind not in ("none", "raster"), workspace.ledger.read()
+    based, work = kind not in ("none", "raster"), upfront_work(workspace.ledger.read())
     split = traced_split(run.request.base, row.spp)
     parts: dict[str, float] = {"passes": 0.0, "tracing": 0.0, "light": 0.0, "base images": 0.0, "training": 0.0}
     if training is not None:
-        parts["passes"] = _passes(records, run.scene.train) / cores
-        parts["tracing"] = _seconds([workspace.raytraced(split, name) for name in cell["views"]]) / cores
+        candidates = {f"train/{name}" for name in run.scene.train}
+        parts["passes"] = total(r for r in work["passes"] if r.name in candidates).cpu_seconds / cores
+        parts["tracing"] = sum(written_seconds(workspace.raytraced(split, name)) for name in cell["views"]) / cores
         parts["training"] = training["cpu_seconds"] / cell["threads"]
         if based:
-            parts["base images"] = _seconds([base_file(workspace, kind, "train", n) for n in cell["views"]]) / cores
+            files = [base_file(workspace, kind, "train", name) for name in cell["views"]]
+            parts["base images"] = sum(written_seconds(file) for file in files) / cores
     if kind == "baked":
-        parts["light"] = _light(records) / cores
+        parts["light"] = total(work["light"]).cpu_seconds / cores
     base_ms = (rivals["base_ms"] or cell["base_ms"] or 0.0) if based else 0.0
     return {
         "name": row.name,
@@ -81,27 +79,6 @@ def _kind(row: Row) -> str:
     if not row.network:
         return "base"
     return "paper" if row.family == "classic" else {"random": "random", "all": "all"}.get(row.views, "ours")
-
-
-def _passes(records: Sequence[CostRecord], names: Mapping[str, Any]) -> float:
-    """Processor seconds of the candidates' passes, each at its last cost."""
-    latest = {r.name: r.cpu_seconds for r in records if r.stage == "prepare" and r.unit == "view" and not r.cache_hit}
-    return sum(value for name, value in latest.items() if name.startswith("train/") and name[6:] in names)
-
-
-def _light(records: Sequence[CostRecord]) -> float:
-    found = [r.cpu_seconds for r in records if r.unit == "scene" and r.name == "light"]
-    return found[-1] if found else 0.0
-
-
-def _seconds(files: Sequence[Path]) -> float:
-    total = 0.0
-    for file in files:
-        metadata = read_metadata(file)
-        if metadata is None:
-            raise UserError(f"{file}: is missing or damaged; run the same command again")
-        total += float(metadata["cpu_seconds"])
-    return total
 
 
 def total_seconds(point: Mapping[str, Any], frames: int) -> float:

@@ -11,22 +11,21 @@
 
 from __future__ import annotations
 
+import functools
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dnrtrain.exr import read_metadata
-
 from ... import __version__
 from ...core.console import Console
-from ...core.errors import UserError
 from ...core.settings import Settings
 from ...core.workspace import digest
 from ...effects.store import plan_of
 from ...stages.trainer import perceptual_weights
 from ..cells.cell import CELL_VERSION
+from ..cells.measure import written_seconds
 from ..cells.provenance import code_state
 from ..cells.scenes import base_file, make_bases, trace_references, trace_train
 from ..cells.worker_pool import WorkerPool
@@ -77,8 +76,7 @@ class Bench:
     references: dict[str, list[str]] = field(default_factory=dict)
     cells: dict[Place, dict[str, Any]] = field(default_factory=dict)
     """Tasks of the cells; places whose policies chose the same views share one key."""
-    seconds: dict[Path, float] = field(default_factory=dict)
-    """What files say that they took."""
+    written_seconds: Callable[..., float] = field(default_factory=lambda: functools.cache(written_seconds))
 
     def run(self) -> Iterator[int]:
         """Prepare all pools, then go seed by seed; yields each seed when its cells are done, a whole table."""
@@ -277,15 +275,7 @@ class Bench:
         files = [workspace.raytraced("train", name) for name in names]
         if kind not in ("none", "raster"):
             files += [base_file(workspace, kind, "train", name) for name in names]
-        return sum(self._seconds(file, clock) for file in files)
-
-    def _seconds(self, file: Path, clock: str) -> float:
-        if file not in self.seconds:
-            metadata = read_metadata(file)
-            if metadata is None:
-                raise UserError(f"{file}: is missing or damaged; run the same command again")
-            self.seconds[file] = metadata[clock]
-        return self.seconds[file]
+        return sum(self.written_seconds(file, clock) for file in files)
 
 
 def read_choice(task: dict[str, Any]) -> dict[str, Any]:
