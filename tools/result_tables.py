@@ -24,7 +24,7 @@ from dnrpipe.studies.ablation.ablation_results import read_results
 from dnrpipe.studies.ablation.ablation_tables import markdown
 from dnrpipe.studies.ablation.rows import GROUPS, ROWS
 from dnrpipe.studies.frontier.frontier_report import markdown as frontier_markdown
-from dnrpipe.studies.frontier.measure_frontier import read_frontier
+from dnrpipe.studies.frontier.records import read_frontier
 from dnrpipe.studies.selectbench.bench_results import read_results as selection_results
 from dnrpipe.studies.selectbench.bench_tables import markdown as selection_markdown
 from dnrpipe.studies.selectbench.bench_tables import together as selections_markdown

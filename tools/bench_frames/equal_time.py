@@ -1,7 +1,7 @@
 """What a workspace cost before its first frame, and what that means for N frames.
 
     total(N) = upfront + N * frame
-    N*       = upfront / (frame of the rival at our PSNR - our frame)
+    N*       = upfront / (frame of path tracing at our PSNR - our frame)
 
 Processor seconds of the ledger (`upfront_work`), which other work on the machine does not stretch. Passes, tracing,
 baked light and base images are divided by the threads, which they keep busy; training is not, as its steps keep hardly
@@ -40,29 +40,35 @@ def upfront(records: Sequence[CostRecord], threads: int) -> dict[str, float]:
 
 
 def at_equal_time(scene: Mapping[str, Any], frames: int) -> dict[str, Any]:
-    """The best of our numbers of rays for so many frames: its name, dB, ms per frame all told, and the rival's dB in
-    that time."""
+    """The best of our numbers of rays for so many frames.
+
+    Its name, dB, ms per frame all told, and as ``rival`` the dB of path tracing in that time.
+    """
     line = _line(scene)
     found = []
     for name in scene["standing"]:
         if name.startswith(NEURAL):
             row = scene["rows"][name]
             ms = row["ms"] + 1000 * scene["upfront"]["total"] / frames
-            rival = quality_at(line, ms)
-            found.append({"name": name, "psnr": row["psnr"], "ms": ms, "rival": line[0][1] if rival is None else rival})
+            traced = quality_at(line, ms)
+            traced = line[0][1] if traced is None else traced
+            found.append({"name": name, "psnr": row["psnr"], "ms": ms, "rival": traced})
     return max(found, key=lambda one: one["psnr"] - one["rival"])
 
 
 def break_even(scene: Mapping[str, Any]) -> tuple[str, int, bool] | None:
-    """(our number of rays, frames from which on ours is cheaper than the rival at equal PSNR, whether the ladder ends
-    below us, so that it is that many at most); the fewest frames of all numbers of rays. None: never."""
+    """From how many frames on ours is cheaper than path tracing at equal PSNR; None: never.
+
+    (our number of rays, frames, whether path tracing ends below us, so that it is that many at most): the fewest frames
+    of all numbers of rays.
+    """
     found = []
     for name, standing in scene["standing"].items():
         if not name.startswith(NEURAL):
             continue
         level = standing["crossover_ms"]
-        rival = standing["ladder_end_ms"] if level is None else level
-        frames = break_even_frames(scene["upfront"]["total"], rival / 1000, scene["rows"][name]["ms"] / 1000)
+        traced = standing["ladder_end_ms"] if level is None else level
+        frames = break_even_frames(scene["upfront"]["total"], traced / 1000, scene["rows"][name]["ms"] / 1000)
         if frames is not None:
             found.append((name, frames, level is None))
     return min(found, key=lambda one: one[1]) if found else None

@@ -6,10 +6,8 @@ Reads `plan/plan.json` (`dnrpipe plan`) and `frontier/results.json` (`dnrpipe fr
 from __future__ import annotations
 
 import base64
-import json
 import re
 from pathlib import Path
-from typing import Any
 
 from ..core.errors import UserError
 from ..core.units import duration
@@ -117,25 +115,18 @@ def _rows(plan: Plan) -> list[PlannedRow]:
 
 
 def _frontier_summary(root: Path) -> FrontierSummary | None:
+    """What `dnrpipe frontier` measured; None where it is missing or damaged, which that command reports."""
     from ..studies.frontier.frontier_report import verdict
-    from ..studies.frontier.measure_frontier import SCHEMA
+    from ..studies.frontier.records import read_frontier
 
-    results = _read(root / "frontier" / "results.json")
-    if results is None or results.get("schema") != SCHEMA:
+    try:
+        results = read_frontier(root / "frontier" / "results.json")
+    except UserError:
         return None
     pictures = []
-    for frames in results["frames"]:
+    for frames in results.frames:
         path = root / "frontier" / f"frontier-{frames}.png"
         if path.exists():
             uri = "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
             pictures.append((verdict(results, frames), uri))
     return FrontierSummary(pictures=pictures)
-
-
-def _read(path: Path) -> dict[str, Any] | None:
-    """A file of an optional part; None if it is missing or damaged, which its own command reports."""
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return value if isinstance(value, dict) else None

@@ -1,4 +1,4 @@
-"""`dnrpipe frontier` behind its options: the sweep, the rivals, and what it writes into ``frontier/``.
+"""`dnrpipe frontier` behind its options: the sweep, the baselines, and what it writes into ``frontier/``.
 
 results.json  results.csv  frontier-<N>.png (one per number of frames)  report.md
 """
@@ -6,10 +6,9 @@ results.json  results.csv  frontier-<N>.png (one per number of frames)  report.m
 from __future__ import annotations
 
 import csv
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
 
 from dnrtrain.atomic import atomic_path, write_json, write_text
 
@@ -17,32 +16,38 @@ from ...core.errors import UserError
 from ...core.scene_files import scene_fingerprint, split_views
 from ...core.settings import Settings
 from ...core.workspace import digest
+from ...stages.stage import Run
 from ...workers.view_tasks import worker_count
-from ..cells.provenance import made_by, read_made
-from ..cells.worker_pool import WorkerPool, check_amounts
-from .cycles_worker import PREFIX
+from ..cells.provenance import made_by
+from ..cells.worker_pool import check_amounts
 from .frontier_plots import plot
 from .frontier_report import markdown
 from .point_costs import break_evens, pareto, point_of, settle_frames
-from .sweep import RIVALS, Frontier, Sweep, make_frontier
+from .records import (
+    SCHEMA,
+    BaselineFile,
+    BaselinePoint,
+    CyclesFramesTask,
+    CyclesMeasureTask,
+    FrontierResults,
+    PathTracingTask,
+)
+from .sweep import OTHERS, Frontier, Sweep, make_frontier
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from ...stages.session import Session
-
-SCHEMA, RIVAL_VERSION, CYCLES_VERSION = 1, 1, 1
+BASELINE_VERSION, CYCLES_VERSION = 1, 1
 CYCLES = "cycles"
-LADDER = (1, 2, 4, 8, 16, 64)
-COLUMNS = (
+SAMPLE_COUNTS = (1, 2, 4, 8, 16, 64)
+COLUMNS: tuple[str, ...] = (
     "name", "kind", "seed", "views", "spp", "steps", "upfront", "frame_ms", "psnr", "ssim", "lpips_vgg", "flip",
     "rival_ms", "break_even",
 )  # fmt: skip
 
 
 def numbers(text: str | None, option: str, default: Sequence[int], most: int | None = None) -> tuple[int, ...]:
-    """``"6,12,25"`` in rising order; the default where not given. Raises UserError: not positive whole numbers, or
-    more than ``most``."""
+    """``"6,12,25"`` in rising order; the default where not given.
+
+    Raises UserError: not positive whole numbers, or more than ``most``.
+    """
     if text is None:
         return tuple(sorted({n if most is None else min(n, most) for n in default}))
     found = set()
@@ -55,7 +60,7 @@ def numbers(text: str | None, option: str, default: Sequence[int], most: int | N
 
 
 def run_frontier(
-    session: Session,
+    run: Run,
     *,
     budgets: str | None,
     spp: str | None,
@@ -65,138 +70,155 @@ def run_frontier(
     ladder: str | None,
     seeds: int,
     jobs: int,
-) -> dict[str, Any]:
+) -> FrontierResults:
     """Measure what is due and write it -> the results.
+
+    Args:
+        run: workspace, settings and console.
+        budgets, spp, iterations: views, samples and optimiser steps of our points, as the options have them.
+        frames: numbers of frames to compare for.
+        also: names of other ways to train, and Cycles.
+        ladder: samples of the baselines.
+        seeds: trainings of every point.
+        jobs: cells side by side; 0: one per core.
 
     Raises:
         UserError: unknown names, numbers that do not fit. TasksFailed: some cells failed; the others are written.
     """
-    workspace, settings, console = session.workspace, session.settings, session.console
+    workspace, settings = run.workspace, run.settings
     check_amounts(None, seeds, jobs)
     candidates = len(split_views(workspace)["train"])
     counts = numbers(frames, "--frames", (200, 2000))
-    also_names = _rivals(also)
+    others = _others(also)
     sweep = Sweep(
         budgets=numbers(budgets, "--budgets", (6, 12, settings.select.budget), candidates),
         samples=numbers(spp, "--spp", (16, settings.raytrace.spp)),
         steps=numbers(iterations, "--iterations", (150, 600)),
-        also=tuple(name for name in also_names if name != CYCLES),
+        also=tuple(name for name in others if name != CYCLES),
     )
-    rungs = numbers(ladder, "--ladder", LADDER)
+    samples = numbers(ladder, "--ladder", SAMPLE_COUNTS)
     rows = sweep.rows(settings)
     out = workspace.root / "frontier"
-    run = make_frontier(workspace, settings, rows, out, jobs, seeds, console)
-    run.check()
-    run.run()
+    swept = make_frontier(run, rows, out, jobs, seeds)
+    swept.check()
+    swept.run()
     cores = worker_count(0)
-    rivals = _rival(run, settings, rungs, cores)
-    if CYCLES in also_names:
-        rivals["rungs"] += _cycles(run, settings, rungs, cores)
+    traced = _trace_baselines(swept, settings, samples, cores)
+    baselines = traced.baselines
+    if CYCLES in others:
+        baselines = [*baselines, *_cycles_baselines(swept, settings, samples, cores)]
     points = [
         point
         for seed in range(seeds)
         for row in rows
-        if (row.network or seed == 0) and (point := point_of(run, row, seed, rivals, cores))
+        if (row.network or seed == 0) and (point := point_of(swept, row, seed, traced.base_ms, cores))
     ]
-    for point in points:
-        point["name"] += f", seed {point['seed']}" if seeds > 1 and point["kind"] != "base" else ""
-    settle_frames(points)
-    break_evens(points, rivals["rungs"])
-    results: dict[str, Any] = {
-        "schema": SCHEMA,
+    if seeds > 1:
+        points = [
+            point if point.kind == "base" else point.model_copy(update={"name": f"{point.name}, seed {point.seed}"})
+            for point in points
+        ]
+    points = break_evens(settle_frames(points), baselines)
+    results = FrontierResults(
+        schema_version=SCHEMA,
         **made_by(),
-        "scene": workspace.root.name.removesuffix(".dnr"),
-        "preset": settings.preset,
-        "resolution": f"{settings.cameras.width}x{settings.cameras.height}",
-        "sweep": asdict(sweep),
-        "frames": list(counts),
-        "cores": cores,
-        "test_views": len(run.scene.test),
-        "evaluation_spp": settings.raytrace.evaluation_spp,
-        "threads": run.threads,
-        "rival_threads": rivals["threads"],
-        "points": points,
-        "rungs": rivals["rungs"],
-    }
-    results["pareto"] = {str(count): pareto(results, count) for count in counts}
+        scene=workspace.root.name.removesuffix(".dnr"),
+        preset=settings.preset,
+        resolution=f"{settings.cameras.width}x{settings.cameras.height}",
+        sweep=asdict(sweep),
+        frames=list(counts),
+        cores=cores,
+        test_views=len(swept.scene.test),
+        evaluation_spp=settings.raytrace.evaluation_spp,
+        threads=swept.threads,
+        baseline_threads=traced.threads,
+        points=points,
+        baselines=baselines,
+        pareto={str(count): pareto([*points, *baselines], count) for count in counts},
+    )
     _write(results, out)
     return results
 
 
-def read_frontier(path: Path) -> dict[str, Any]:
-    """``frontier/results.json``. Raises UserError: missing, damaged or of another schema."""
-    return read_made(path, "frontier", SCHEMA, "points")
-
-
-def _rivals(text: str) -> tuple[str, ...]:
+def _others(text: str) -> tuple[str, ...]:
+    """Names of other ways to train, and Cycles."""
     names = tuple(filter(None, (part.strip() for part in text.split(","))))
     if text.strip() == "none":
         return ()
-    if unknown := set(names) - {*RIVALS, CYCLES}:
-        raise UserError(f"--also {', '.join(sorted(unknown))}: choose of {', '.join((*RIVALS, CYCLES))}, or none")
+    if unknown := set(names) - {*OTHERS, CYCLES}:
+        raise UserError(f"--also {', '.join(sorted(unknown))}: choose of {', '.join((*OTHERS, CYCLES))}, or none")
     return names
 
 
-def _rival(run: Frontier, settings: Settings, samples: tuple[int, ...], cores: int) -> dict[str, Any]:
+def _trace_baselines(swept: Frontier, settings: Settings, samples: tuple[int, ...], cores: int) -> BaselineFile:
     """Path tracing of the test views, rendered where it is not on disk."""
-    references = sorted(run.references[run.scene.name].values())
-    base = settings.model_copy(update={"model": run._settings(run.request.rows[0], run.scene).model})
-    key = digest([RIVAL_VERSION, references, samples, base.model.base, base.base.model_dump(), cores, run.perceptual])
-    output = run.request.out / "rivals" / f"{key}.json"
-    task = {
-        "key": key,
-        "workspace": str(run.scene.workspace.root),
-        "settings": base.model_dump(mode="json"),
-        "samples": list(samples),
-        "output": str(output),
-        "label": "path tracing",
-    }
-    worker_pool: WorkerPool = replace(run.worker_pool, threads=cores, workers=1)
+    references = sorted(swept.references[swept.scene.name].values())
+    model = swept.settings_of(swept.request.rows[0], swept.scene).model
+    base = settings.base.model_dump()
+    fingerprint = digest([BASELINE_VERSION, references, samples, model.base, base, cores, swept.perceptual])
+    task = PathTracingTask(
+        fingerprint=fingerprint,
+        workspace=swept.scene.workspace.root,
+        settings=settings.model_copy(update={"model": model}),
+        samples=list(samples),
+        output=swept.request.out / "rivals" / f"{fingerprint}.json",
+        label="path tracing",
+    )
+    worker_pool = replace(swept.worker_pool, threads=cores, workers=1)
     worker_pool.work("path tracing of the test views", "dnrpipe.studies.frontier.path_tracing_worker", [task])
-    found = json.loads(output.read_text(encoding="utf-8"))
-    if lost := sum(rung.get("masked", 0) for rung in found["rungs"] if not rung["denoised"]):
+    found = BaselineFile.model_validate_json(task.output.read_bytes())
+    if lost := sum(one.masked for one in found.baselines if not one.denoised):
         worker_pool.console.warn(f"repaired: {lost} pixels of the path-traced test views were not finite and are black")
     return found
 
 
-def _cycles(run: Frontier, settings: Settings, samples: tuple[int, ...], cores: int) -> list[dict[str, Any]]:
-    """Rungs of Cycles on the test views, rendered where they are not on disk."""
-    workspace, views = run.scene.workspace, split_views(run.scene.workspace)["test"]
-    reference_spp = settings.raytrace.evaluation_spp
-    key = digest(
+def _cycles_baselines(
+    swept: Frontier,
+    settings: Settings,
+    samples: tuple[int, ...],
+    cores: int,
+) -> list[BaselinePoint]:
+    """Cycles on the test views, rendered and measured where that is not on disk."""
+    workspace, views = swept.scene.workspace, split_views(swept.scene.workspace)["test"]
+    reference_spp, folder = settings.raytrace.evaluation_spp, swept.request.out / "rivals"
+    fingerprint = digest(
         [CYCLES_VERSION, scene_fingerprint(workspace), [v.model_dump() for v in views], samples, reference_spp, cores]
     )
-    folder = run.request.out / "rivals" / f"cycles-{key}"
-    task = {
-        "scene_dir": str(workspace.scene),
-        "views": [view.model_dump(mode="json") for view in views],
-        "samples": list(samples),
-        "reference_spp": reference_spp,
-        "folder": str(folder),
-        "output": str(folder / "frames.json"),
-        "label": "Cycles",
-    }
-    worker_pool: WorkerPool = replace(run.worker_pool, threads=cores, workers=1)
-    worker_pool.work("Cycles on the test views", "dnrpipe.blender.passes.cycles_frames", [task])
-    measured = digest([key, run.perceptual])
-    output = run.request.out / "rivals" / f"{measured}.json"
-    names = {"workspace": str(workspace.root), "views": [view.name for view in views], "label": "Cycles"}
-    task = {**names, "frames": task["output"], "folder": str(folder), "output": str(output)}
-    worker_pool.work("measuring Cycles", "dnrpipe.studies.frontier.cycles_worker", [task])
-    return json.loads(output.read_text(encoding="utf-8"))["rungs"]
+    pictures = folder / f"cycles-{fingerprint}"
+    render = CyclesFramesTask(
+        scene_dir=workspace.scene,
+        views=views,
+        samples=list(samples),
+        reference_spp=reference_spp,
+        folder=pictures,
+        output=pictures / "frames.json",
+        label="Cycles",
+    )
+    worker_pool = replace(swept.worker_pool, threads=cores, workers=1)
+    worker_pool.work("Cycles on the test views", "dnrpipe.blender.passes.cycles_frames", [render])
+    measure = CyclesMeasureTask(
+        workspace=workspace.root,
+        views=[view.name for view in views],
+        frames=render.output,
+        folder=pictures,
+        output=folder / f"{digest([fingerprint, swept.perceptual])}.json",
+        label="Cycles",
+    )
+    worker_pool.work("measuring Cycles", "dnrpipe.studies.frontier.cycles_worker", [measure])
+    return BaselineFile.model_validate_json(measure.output.read_bytes()).baselines
 
 
-def _write(results: dict[str, Any], out: Path) -> None:
-    write_json(out / "results.json", results)
+def _write(results: FrontierResults, out: Path) -> None:
+    data = results.data()
+    write_json(out / "results.json", data)
     with atomic_path(out / "results.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, COLUMNS, extrasaction="ignore", restval="")
         writer.writeheader()
-        for one in results["points"]:
-            writer.writerow(one)
-        for rung in results["rungs"]:
-            tracer = "Cycles" if rung["name"].startswith(PREFIX) else "path tracing"
-            kind = f"{tracer} + denoiser" if rung["denoised"] else tracer
-            writer.writerow({**rung, "kind": kind, "frame_ms": rung["ms"], "upfront": 0.0})
-    for count in results["frames"]:
+        writer.writerows(data["points"])
+        for baseline in results.baselines:
+            tracer = "Cycles" if baseline.by_cycles else "path tracing"
+            kind = f"{tracer} + denoiser" if baseline.denoised else tracer
+            writer.writerow({**baseline.data(), "kind": kind, "frame_ms": baseline.ms, "upfront": baseline.upfront})
+    for count in results.frames:
         plot(results, count, out / f"frontier-{count}.png")
     write_text(out / "report.md", markdown(results))

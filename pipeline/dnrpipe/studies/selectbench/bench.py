@@ -3,20 +3,21 @@
 <out>/
   scenes/<scene>.dnr                 the scene converted, once
   scenes/<scene>-<pool>.dnr          its candidates and test views: passes; ray tracing as far as somebody chose them
-  selections/<scene>-<pool>/<key>.json   the views that a rule, or active learning, chose, why, and what that took
-  step1/<scene>-<pool>/<key>.json    the same of a trained policy, and coarse models (weights beside them)
-  cells/<scene>-<pool>/<key>.json    one cell each; the key is a hash of all that decides it
+  selections/<scene>-<pool>/<fingerprint>.json   the views that a rule, or active learning, chose, why, at what cost
+  step1/<scene>-<pool>/<fingerprint>.json   the same of a trained policy, and coarse models (weights beside them)
+  cells/<scene>-<pool>/<fingerprint>.json   one cell each; the fingerprint is a hash of all that decides it
   results.json  report.md  views.png  seconds.png
 """
 
 from __future__ import annotations
 
 import functools
-import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Literal
+
+from pydantic import AliasChoices, BaseModel, Field
 
 from ... import __version__
 from ...core.console import Console
@@ -28,10 +29,12 @@ from ..cells.cell import CELL_VERSION
 from ..cells.measure import written_seconds
 from ..cells.provenance import code_state
 from ..cells.scenes import base_file, make_bases, trace_references, trace_train
+from ..cells.tasks import CellTask, Step1Result, Step1Task, StudyTask, once
 from ..cells.worker_pool import WorkerPool
-from .active.settings import ActiveSettings
-from .policies import Contender, Kind, rules_fingerprint, settings_of
+from .active.settings import ActiveSettings, ActiveTask
+from .policies import Contender, rules_fingerprint, settings_of
 from .pools import Placed, Pool, place_pool, share_light
+from .rule_worker import RuleTask
 
 CHOICE_VERSION = 1  # raise when what a selection's file holds changes
 SHARED_COARSE = "farthest"
@@ -64,6 +67,17 @@ class Place:
     seed: int
 
 
+ChoiceTask = RuleTask | ActiveTask | Step1Task
+
+
+@dataclass(frozen=True)
+class PlannedCell:
+    """A cell's task, and the file of the selection that its views come from."""
+
+    task: CellTask
+    choice: Path
+
+
 @dataclass
 class Bench:
     """The state of one run: pools, workers, and the cells known so far."""
@@ -74,8 +88,8 @@ class Bench:
     perceptual: bool = False
     pools: list[Pool] = field(default_factory=list)
     references: dict[str, list[str]] = field(default_factory=dict)
-    cells: dict[Place, dict[str, Any]] = field(default_factory=dict)
-    """Tasks of the cells; places whose policies chose the same views share one key."""
+    cells: dict[Place, PlannedCell] = field(default_factory=dict)
+    """Places whose policies chose the same views share one fingerprint."""
     written_seconds: Callable[..., float] = field(default_factory=lambda: functools.cache(written_seconds))
 
     def run(self) -> Iterator[int]:
@@ -91,7 +105,7 @@ class Bench:
         with self.console.bar("pools", len(placed)) as bar:
             for one in placed:
                 pool = one.prepare(self.console)
-                traced = trace_references(pool.data, self._settings(pool), self.console)
+                traced = trace_references(pool.data, self._settings(pool))
                 self.references[pool.folder] = sorted(traced.values())
                 self.pools.append(pool)
                 bar.advance(note=pool.folder)
@@ -100,165 +114,182 @@ class Bench:
             yield seed
 
     def _seed(self, seed: int) -> None:
-        work: dict[Kind, list[dict[str, Any]]] = {"rule": [], "active": [], "step1": []}
-        chosen: dict[Place, dict[str, Any]] = {}
-        starts: dict[Place, dict[str, Any]] = {}
+        chosen: dict[Place, ChoiceTask] = {}
+        starts: dict[Place, Step1Task] = {}
         for pool in self.pools:
             for budget in self.request.budgets:
                 for contender in self.request.policies:
                     place = Place(pool.scene, pool.name, budget, contender.name, seed)
                     settings = settings_of(contender, self._settings(pool), budget)
                     if contender.kind == "rule":
-                        chosen[place] = self._choice(pool, contender, budget, seed)
+                        task = self._rule_task(pool, contender, budget, seed)
                     elif contender.kind == "active":
-                        chosen[place] = self._active(pool, settings, contender.policy, seed)
+                        task = self._active_task(pool, settings, contender.policy, seed)
                     else:
-                        chosen[place] = self._step1(pool, settings, contender.policy, seed)
-                    work[contender.kind].append(chosen[place])
+                        task = self._step1_task(pool, settings, contender.policy, seed)
+                    chosen[place] = task
                     if settings.starts_coarse:
-                        own = contender.kind == "step1"
-                        starts[place] = chosen[place] if own else self._step1(pool, settings, SHARED_COARSE, seed)
-        label = f", seed {seed}"
-        self.worker_pool.work(f"selections{label}", "dnrpipe.studies.selectbench.rule_worker", _once(work["rule"]))
-        self.worker_pool.work(
-            f"active selections{label}", "dnrpipe.studies.selectbench.active.active_worker", _once(work["active"])
-        )
-        self.worker_pool.work(f"step 1{label}", "dnrpipe.studies.cells.cell", _once([*work["step1"], *starts.values()]))
+                        if not isinstance(task, Step1Task):
+                            task = self._step1_task(pool, settings, SHARED_COARSE, seed)
+                        starts[place] = task
+        tasks = [*chosen.values(), *starts.values()]
+        self._work(f"selections, seed {seed}", "selectbench.rule_worker", tasks, RuleTask)
+        self._work(f"active selections, seed {seed}", "selectbench.active.active_worker", tasks, ActiveTask)
+        self._work(f"step 1, seed {seed}", "cells.cell", tasks, Step1Task)
         for pool in self.pools:
             places = [place for place in chosen if (place.scene, place.pool) == (pool.scene, pool.name)]
             self._trace_and_plan(pool, {place: chosen[place] for place in places}, starts)
-        self.worker_pool.work(
-            f"cells{label}",
-            "dnrpipe.studies.cells.cell",
-            _once([task for place, task in self.cells.items() if place.seed == seed]),
-        )
+        cells = [cell.task for place, cell in self.cells.items() if place.seed == seed]
+        self._work(f"cells, seed {seed}", "cells.cell", cells, CellTask)
+
+    def _work(self, label: str, module: str, tasks: Sequence[StudyTask], kind: type[StudyTask]) -> None:
+        """Run the tasks of a kind."""
+        due = once(task for task in tasks if isinstance(task, kind))
+        self.worker_pool.work(label, f"dnrpipe.studies.{module}", due)
 
     # -- selections ------------------------------------------------------------------------------------
 
-    def _choice(self, pool: Pool, contender: Contender, budget: int, seed: int) -> dict[str, Any]:
-        """The task of a rule's selection."""
-        key = digest([CHOICE_VERSION, rules_fingerprint(), pool.data.inputs, contender.policy, budget, seed])
-        return {
-            "key": key,
-            "workspace": str(pool.data.workspace.root),
-            "policy": contender.policy,
-            "budget": budget,
-            "seed": seed,
-            "output": str(self.request.out / "selections" / pool.folder / f"{key}.json"),
-            "label": f"{pool.folder} {contender.name} {budget}",
-        }
+    def _rule_task(self, pool: Pool, contender: Contender, budget: int, seed: int) -> RuleTask:
+        """A rule's selection."""
+        fingerprint = digest([CHOICE_VERSION, rules_fingerprint(), pool.data.inputs, contender.policy, budget, seed])
+        return RuleTask(
+            fingerprint=fingerprint,
+            workspace=pool.data.workspace.root,
+            policy=contender.policy,
+            budget=budget,
+            seed=seed,
+            output=self.request.out / "selections" / pool.folder / f"{fingerprint}.json",
+            label=f"{pool.folder} {contender.name} {budget}",
+        )
 
-    def _active(self, pool: Pool, settings: Settings, policy: str, seed: int) -> dict[str, Any]:
-        """The task of a selection by active learning."""
+    def _active_task(self, pool: Pool, settings: Settings, policy: str, seed: int) -> ActiveTask:
+        """A selection by active learning."""
         model, step1, budget = settings.model.coarse(), settings.select.step1, settings.select.budget
-        key = digest(
+        fingerprint = digest(
             [
                 *(CHOICE_VERSION, CELL_VERSION, __version__, pool.data.inputs, model.model_dump(), step1.model_dump()),
                 *(asdict(ActiveSettings()), policy, budget, seed, self.worker_pool.device, self.worker_pool.threads),
             ]
         )
-        folder = self.request.out / "selections" / pool.folder / key
-        return {
-            "key": key,
-            "workspace": str(pool.data.workspace.root),
-            "settings": settings.model_dump(mode="json"),
-            "policy": policy,
-            "seed": seed,
-            "folder": str(folder),
-            "output": f"{folder}.json",
-            "label": f"{pool.folder} {policy} {budget}",
-        }
+        folder = self.request.out / "selections" / pool.folder
+        return ActiveTask(
+            fingerprint=fingerprint,
+            workspace=pool.data.workspace.root,
+            settings=settings,
+            policy=policy,
+            seed=seed,
+            folder=folder / fingerprint,
+            output=folder / f"{fingerprint}.json",
+            label=f"{pool.folder} {policy} {budget}",
+        )
 
-    def _step1(self, pool: Pool, settings: Settings, policy: str, seed: int) -> dict[str, Any]:
-        """The task of a step 1: a trained policy's selection, or the coarse model that all others share."""
+    def _step1_task(self, pool: Pool, settings: Settings, policy: str, seed: int) -> Step1Task:
+        """Step 1: a trained policy's selection, or the coarse model that all others share."""
         model, step1, budget = settings.model.coarse(), settings.select.step1, settings.select.budget
-        key = digest(
+        fingerprint = digest(
             [
                 *(CELL_VERSION, __version__, pool.data.inputs, model.model_dump(), step1.model_dump()),
                 *(policy, budget, seed, self.worker_pool.device, self.worker_pool.threads),
             ]
         )
-        folder = self.request.out / "step1" / pool.folder / key
-        return {
-            "kind": "step1",
-            "key": key,
-            "workspace": str(pool.data.workspace.root),
-            "settings": settings.model_dump(mode="json"),
-            "policy": policy,
-            "seconds": None,  # the preset's epochs: what step 1 takes is part of what its policy costs
-            "pace": "",
-            "seed": seed,
-            "folder": str(folder),
-            "output": f"{folder}.json",
-            "label": f"{pool.folder} step 1",
-        }
+        folder = self.request.out / "step1" / pool.folder
+        return Step1Task(
+            fingerprint=fingerprint,
+            workspace=pool.data.workspace.root,
+            settings=settings,
+            policy=policy,
+            seconds=None,  # the preset's epochs: what step 1 takes is part of what its policy costs
+            seed=seed,
+            folder=folder / fingerprint,
+            output=folder / f"{fingerprint}.json",
+            label=f"{pool.folder} step 1",
+        )
 
     def _trace(self, pool: Pool, names: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
         """Ray-trace candidates and render base images; -> fingerprints, see ``trace_train`` and ``make_bases``."""
         settings = self._settings(pool)
-        traced = trace_train(pool.data, settings, self.console, names)
+        traced = trace_train(pool.data, settings, names)
         if settings.model.base == "none":
             return traced, {}
         share_light([other for other in self.pools if other.scene == pool.scene])
-        return traced, make_bases(pool.data, settings, self.console, names)
+        return traced, make_bases(pool.data, settings, names)
 
     # -- cells -----------------------------------------------------------------------------------------
 
     def _trace_and_plan(
-        self, pool: Pool, chosen: dict[Place, dict[str, Any]], starts: dict[Place, dict[str, Any]]
+        self,
+        pool: Pool,
+        chosen: Mapping[Place, ChoiceTask],
+        starts: Mapping[Place, Step1Task],
     ) -> None:
         """Trace what anybody chose in this pool, and note the tasks of its cells."""
         settings = self._settings(pool)
         order = {name: index for index, name in enumerate(pool.data.train)}
         # In the pool's order: two policies that choose the same views in another order are the same cell.
-        views = {place: sorted(read_choice(task)["views"], key=order.__getitem__) for place, task in chosen.items()}
+        views = {place: sorted(read_choice(task.output).views, key=order.__getitem__) for place, task in chosen.items()}
         everything = sorted({name for names in views.values() for name in names})
         traced, bases = self._trace(pool, everything)
         for place, names in views.items():
-            self.cells[place] = self._cell(pool, settings, place, names, traced, bases, starts.get(place))
-            self.cells[place]["choice"] = chosen[place]["output"]
+            task = self._cell_task(
+                pool,
+                settings,
+                place,
+                {name: traced[name] for name in names},
+                starts.get(place),
+                bases,
+            )
+            self.cells[place] = PlannedCell(task, chosen[place].output)
 
-    def _cell(
+    def _cell_task(
         self,
         pool: Pool,
         settings: Settings,
         place: Place,
-        views: list[str],
         traced: dict[str, str],
+        coarse: Step1Task | None,
         bases: dict[str, str],
-        coarse: dict[str, Any] | None,
-    ) -> dict[str, Any]:
-        """The cell's task (`ablation.cells.Worker`); its key is a hash of all that decides what comes out."""
+    ) -> CellTask:
+        """Train on the views and measure.
+
+        Args:
+            pool: of the candidates.
+            settings: of the pool.
+            place: in the tables.
+            traced: fingerprints of the training views' pictures.
+            coarse: the model that step 2 starts from.
+            bases: fingerprints of base images by split and view; {} where the model reads none.
+        """
+        views = list(traced)
         model, step2 = settings.model.model_dump(mode="json"), settings.finetune.step2.model_dump(mode="json")
         worker_pool, data = self.worker_pool, pool.data
         used = [f"train/{name}" for name in views] + [f"test/{name}" for name in data.test]
         shown = [CELL_VERSION, __version__, data.inputs, self.references[pool.folder], model]
         shown.append([bases[name] for name in used] if bases else None)
-        train = [place.seed, [traced[name] for name in views], step2, coarse and coarse["key"], self.request.seconds]
-        key = digest([*shown, train, worker_pool.device, worker_pool.threads, self.perceptual])
+        start = coarse and coarse.fingerprint
+        train = [place.seed, list(traced.values()), step2, start, self.request.seconds]
+        fingerprint = digest([*shown, train, worker_pool.device, worker_pool.threads, self.perceptual])
         pace = [*shown[:5], len(views), step2, worker_pool.device, worker_pool.threads]
         folder = self.request.out / "cells" / pool.folder
-        return {
-            "kind": "cell",
-            "key": key,
-            "scene": pool.scene,
-            "seed": place.seed,
-            "workspace": str(data.workspace.root),
-            "settings": settings.model_dump(mode="json"),
-            "network": True,
-            "views": views,
-            "coarse": coarse and coarse["folder"],
-            "coarse_cost": coarse and json.loads(Path(coarse["output"]).read_text(encoding="utf-8")),
-            "seconds": self.request.seconds,
+        return CellTask(
+            fingerprint=fingerprint,
+            scene=pool.scene,
+            seed=place.seed,
+            workspace=data.workspace.root,
+            settings=settings,
+            network=True,
+            views=views,
+            coarse=coarse and coarse.folder,
+            coarse_cost=coarse and Step1Result.model_validate_json(coarse.output.read_bytes()),
+            seconds=self.request.seconds,
             # Where step 2 starts from a coarse model, all policies give step 1 the same share of their time.
-            "full_step1": coarse is not None,
-            "pace": str(self.request.out / "pace" / pool.folder / f"{digest(pace)}.json"),
-            "folder": str(folder / key),
-            "output": str(folder / f"{key}.json"),
-            "picture": None,
-            "code": code_state(),
-            "label": f"{pool.folder} {place.policy} {place.budget}",
-        }
+            full_step1=coarse is not None,
+            pace=self.request.out / "pace" / pool.folder / f"{digest(pace)}.json",
+            folder=folder / fingerprint,
+            output=folder / f"{fingerprint}.json",
+            picture=None,
+            code=code_state(),
+            label=f"{pool.folder} {place.policy} {place.budget}",
+        )
 
     def _settings(self, pool: Pool) -> Settings:
         """The run's settings without what the scene's effect plan leaves off."""
@@ -268,22 +299,30 @@ class Bench:
 
     # -- what views cost -------------------------------------------------------------------------------
 
+    @property
+    def clock(self) -> Literal["seconds", "cpu_seconds"]:
+        """What costs are counted in: processor time where the model trains on a CPU."""
+        return "cpu_seconds" if self.worker_pool.device == "cpu" else "seconds"
+
     def view_seconds(self, pool: Pool, names: Sequence[str]) -> float:
-        """Seconds of ray tracing the views and their base images, by the files: processor time on a CPU."""
+        """Seconds of ray tracing the views and their base images, by the files."""
         kind, workspace = self._settings(pool).model.base, pool.data.workspace
-        clock = "cpu_seconds" if self.worker_pool.device == "cpu" else "seconds"
         files = [workspace.raytraced("train", name) for name in names]
         if kind not in ("none", "raster"):
             files += [base_file(workspace, kind, "train", name) for name in names]
-        return sum(self.written_seconds(file, clock) for file in files)
+        return sum(self.written_seconds(file, self.clock) for file in files)
 
 
-def read_choice(task: dict[str, Any]) -> dict[str, Any]:
-    """A selection's file, a rule's or a trained policy's alike: "views", "seconds", "cpu_seconds"."""
-    made = json.loads(Path(task["output"]).read_text(encoding="utf-8"))
-    return made if "views" in made else made | {"views": made["selected"]}
+class ChoiceFile(BaseModel):
+    """What a rule's selection, an active one and a step 1 have in common. views: in order. key: its fingerprint."""
+
+    key: str
+    views: list[str] = Field(validation_alias=AliasChoices("views", "selected"))
+    seconds: float
+    cpu_seconds: float
+    peak_mb: float | None = None
 
 
-def _once(tasks: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Tasks of different keys."""
-    return list({task["key"]: task for task in tasks}.values())
+def read_choice(path: Path) -> ChoiceFile:
+    """The file of a selection, of whichever kind."""
+    return ChoiceFile.model_validate_json(path.read_bytes())
