@@ -25,6 +25,7 @@ from dnrpipe.core.ledger import (
     traced_views,
     tracing_all_would_cost,
     upfront_seconds,
+    upfront_work,
 )
 
 
@@ -248,3 +249,27 @@ def test_upfront_cost_is_training_once() -> None:
     ]
     assert upfront_seconds(records, only={"train/1"}) == 5.0
     assert upfront_seconds(records) == 55.0
+
+
+def test_what_comes_before_the_first_frame_is_one_list_by_kind() -> None:
+    """Light that the plan's pilot baked is that of ray tracing; epochs of both steps count; names tell the rest."""
+    records = [
+        record(stage="prepare", unit="scene", name="convert", seconds=3.0, spp=None),
+        record(stage="prepare", name="train/1", seconds=1.0, spp=None),
+        record(stage="plan", unit="scene", name="light", seconds=9.0, spp=32),
+        record(stage="plan", unit="scene", name="pilot: trace", seconds=8.0, spp=None),
+        record(stage="raytrace", unit="scene", name="light", seconds=7.0, cpu_seconds=14.0, spp=64),
+        record(name="train/1", seconds=4.0),
+        record(stage="finetune", name="base/train/1", seconds=0.5, spp=None),
+        record(stage="select", unit="epoch", name="epoch 1", seconds=2.0, spp=None),
+        record(stage="finetune", unit="epoch", name="epoch 1", seconds=5.0, spp=None),
+    ]
+    work = upfront_work(records)
+    seconds = {part: total(units).seconds for part, units in work.items()}
+    assert seconds == {
+        "conversion": 3.0, "passes": 1.0, "pilot": 8.0, "selection": 0.0, "tracing": 4.0, "light": 7.0,
+        "base images": 0.5, "training": 7.0,
+    }  # fmt: skip
+    assert total(work["light"]).cpu_seconds == 14.0
+    assert sum(seconds.values()) == upfront_seconds(records)
+    assert not upfront_work(records, only=set())["base images"]

@@ -25,6 +25,7 @@ from .errors import UserError
 StageName = Literal["prepare", "plan", "select", "raytrace", "finetune", "evaluate", "render"]
 Purpose = Literal["training", "evaluation", "inference"]
 Unit = Literal["scene", "view", "epoch"]
+UpfrontPart = Literal["conversion", "passes", "pilot", "selection", "tracing", "light", "base images", "training"]
 
 STAGE_ORDER: tuple[str, ...] = get_args(StageName)
 PURPOSE_ORDER: tuple[str, ...] = get_args(Purpose)
@@ -236,21 +237,48 @@ def selection_cost(records: Sequence[CostRecord]) -> CostSum:
     return total(latest_epochs(records, "select"))
 
 
-def upfront_seconds(records: Sequence[CostRecord], only: Collection[str] | None = None) -> float:
-    """Wall seconds until the renderer exists: all training work once, at its latest cost.
+def upfront_work(
+    records: Iterable[CostRecord], only: Collection[str] | None = None
+) -> dict[UpfrontPart, list[CostRecord]]:
+    """What comes before the first neural frame, by kind: each unit of training work once, at its latest cost.
 
-    Conversion, passes, both training steps and tracing of the training views. Left out: repeated runs, evaluation, and
-    views that are no longer chosen (``only``, see `traced_views`).
+    Repeated runs, cache hits and evaluation are left out, and so are traced views and base images that are no longer
+    chosen (``only``, see `traced_views`). A caller that does not count a kind of work leaves its part out; `total` sums
+    a part by either clock.
     """
-    latest: dict[tuple[str, str, str], CostRecord] = {}
+    latest: dict[tuple[UpfrontPart, str, str], CostRecord] = {}
     for record in records:
         if record.purpose != "training" or record.cache_hit:
             continue
-        unwanted = only is not None and record.name.removeprefix("base/") not in only
-        if record.stage == "raytrace" and record.unit == "view" and unwanted:
+        part = _upfront_part(record)
+        traced = record.unit == "view" and part in ("tracing", "base images")
+        if only is not None and traced and record.name.removeprefix("base/") not in only:
             continue
-        latest[(record.stage, record.unit, record.name)] = _whole(record)
-    return total(latest.values()).wall_seconds
+        step = record.stage if record.unit == "epoch" else ""  # step 1 and step 2 count their epochs alike
+        latest[part, step, record.name] = _whole(record)
+    work: dict[UpfrontPart, list[CostRecord]] = {part: [] for part in get_args(UpfrontPart)}
+    for (part, _, _), record in latest.items():
+        work[part].append(record)
+    return work
+
+
+def _upfront_part(record: CostRecord) -> UpfrontPart:
+    if record.unit == "epoch":
+        return "training"
+    if record.unit == "scene" and record.name == "light":  # whichever stage baked it
+        return "light"
+    if record.stage == "prepare":
+        return "passes" if record.unit == "view" else "conversion"
+    if record.stage == "plan":
+        return "pilot"
+    if record.stage == "select":
+        return "selection"
+    return "base images" if record.name.startswith("base/") else "tracing"
+
+
+def upfront_seconds(records: Iterable[CostRecord], only: Collection[str] | None = None) -> float:
+    """Wall seconds of all `upfront_work`: how long it took until the renderer was there."""
+    return total(record for part in upfront_work(records, only).values() for record in part).wall_seconds
 
 
 class TracingComparison(BaseModel):
