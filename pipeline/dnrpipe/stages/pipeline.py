@@ -26,6 +26,7 @@ from ..core.scene_files import scene_fingerprint
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest
 from . import evaluate, finetune, prepare, raytrace, select
+from .records import PREPARED
 from .stage import Outcome, Run, Stage
 
 State = Literal["missing", "partial", "stale", "done"]
@@ -247,7 +248,7 @@ def discard(path: Path, owner: Stage, workspace: Workspace) -> None:
     """Remove a damaged file such that its stage is due. Without its last file a converted scene is none."""
     path.unlink(missing_ok=True)
     if path.resolve().is_relative_to(workspace.scene.resolve()):
-        (workspace.scene / "prepared.json").unlink(missing_ok=True)
+        (workspace.scene / PREPARED).unlink(missing_ok=True)
     record = workspace.manifest.stages.get(owner.name)
     if record is not None:
         record.fingerprint = ""

@@ -10,6 +10,7 @@ from typing import Any
 
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import SPLITS, View, write_cameras
+from dnrtrain.records import read, write
 
 from ..blender.finding_lines import finding_lines
 from ..core.cameras import depth_range, make_cameras
@@ -17,11 +18,12 @@ from ..core.console import Console
 from ..core.errors import UserError
 from ..core.scene_files import read_frame, read_json, read_summary, scene_fingerprint
 from ..core.settings import Settings
-from ..core.workspace import Workspace, digest, file_sha256
+from ..core.workspace import Prepared, Workspace, digest, file_sha256
 from ..effects.store import keep_plan
 from ..workers.view_tasks import warn_of_repairs, worker_count
 from .baking import FOLDER, bake
 from .opening import open_scene
+from .records import PREPARED, RASTER, PreparedScene, RasterEngine
 from .stage import Outcome, Run
 
 MAX_BAKE_ROUNDS = 4
@@ -36,7 +38,7 @@ def prepare(run: Run) -> Outcome:
     workspace = run.workspace
     summary, views = scene_and_views(run)
     _plan_effects(run)
-    engine, reason = _raster_engine(run)
+    chosen = _raster_engine(run)
     raster = run.settings.model.base == "raster"  # then test views need it, too
     wanted = [(split, view) for split in SPLITS for view in views[split]]
     tasks = draw_passes(
@@ -44,19 +46,19 @@ def prepare(run: Run) -> Outcome:
         "passes",
         [view for _, view in wanted],
         [workspace.passes(split, view.name) for split, view in wanted],
-        engine,
+        chosen.engine,
         raster=[split in RASTERISED or raster for split, _ in wanted],
     )
     warn_of_repairs(tasks, run.console)
     return Outcome(
         # Views, scene and engine are all in the tasks' fingerprints.
         digest([[Path(task["output"]).parent.name, task["fingerprint"]] for task in tasks]),
-        {
-            "raster_engine": engine,
-            "raster_reason": reason,
-            "views": {split: len(views[split]) for split in SPLITS},
-            "triangles": summary["triangles"],
-        },
+        Prepared(
+            raster_engine=chosen.engine,
+            raster_reason=chosen.reason,
+            views={split: len(views[split]) for split in SPLITS},
+            triangles=summary["triangles"],
+        ).model_dump(),
     )
 
 
@@ -77,8 +79,8 @@ def scene_and_views(run: Run) -> tuple[dict[str, Any], dict[str, list[View]]]:
 def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
     """(passes on disk, passes wanted)."""
     wanted = settings.cameras.train + settings.cameras.val + settings.cameras.test
-    if "prepare" in workspace.manifest.stages:
-        wanted = sum(workspace.manifest.stages["prepare"].detail["views"].values())
+    if prepared := workspace.manifest.prepared:
+        wanted = sum(prepared.views.values())
     present = sum(1 for split in SPLITS for _ in (workspace.root / "passes" / split).glob("[!.]*.exr"))
     return min(present, wanted), wanted
 
@@ -126,8 +128,8 @@ def draw_passes(
 def _convert(run: Run) -> dict[str, Any]:
     """Open the scene in a worker and write ``scene/``, whole or not at all."""
     workspace, settings, console = run.workspace, run.settings, run.console
-    marker = workspace.scene / "prepared.json"
-    if marker.exists() and read_json(marker)["fingerprint"] == scene_fingerprint(workspace):
+    marker = workspace.scene / PREPARED
+    if marker.exists() and read(marker, PreparedScene).fingerprint == scene_fingerprint(workspace):
         summary = read_summary(workspace)
         if summary["bake_size"] in (None, settings.passes.bake_size):
             _refuse_if_strict(Path(workspace.manifest.source.path), workspace.scene, settings)
@@ -157,7 +159,7 @@ def _convert(run: Run) -> dict[str, Any]:
         for path in sorted(workspace.scene.rglob("[!.]*"))
         if path.is_file() and path.name != "frame.json"
     }
-    write_json(marker, {"fingerprint": scene_fingerprint(workspace), "files": files})
+    write(marker, PreparedScene(fingerprint=scene_fingerprint(workspace), files=files))
     return summary
 
 
@@ -223,16 +225,15 @@ def _place_cameras(workspace: Workspace, settings: Settings, summary: dict[str, 
     return views
 
 
-def _raster_engine(run: Run) -> tuple[str, str]:
+def _raster_engine(run: Run) -> RasterEngine:
     """The engine for rasterised colour, probed once per workspace: a busy machine must not change it midway."""
     from ..blender.passes.choice import choose_raster
 
-    record = run.workspace.root / "passes" / "raster.json"
-    if record.exists():
-        chosen = read_json(record)
-        if chosen["requested"] == run.settings.passes.raster:
-            return chosen["engine"], chosen["reason"]
-    engine, reason = choose_raster(run.settings.passes.raster)
+    path, requested = run.workspace.root / "passes" / RASTER, run.settings.passes.raster
+    if path.exists() and (known := read(path, RasterEngine)).requested == requested:
+        return known
+    engine, reason = choose_raster(requested)
     run.console.say(f"raster colour by {engine}: {reason}")
-    write_json(record, {"requested": run.settings.passes.raster, "engine": engine, "reason": reason})
-    return engine, reason
+    chosen = RasterEngine(requested=requested, engine=engine, reason=reason)
+    write(path, chosen)
+    return chosen

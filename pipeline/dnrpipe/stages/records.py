@@ -1,7 +1,9 @@
 """JSON files that stages write, as typed records. `dnrtrain.records` writes and reads them.
 
-evaluation/metrics.json   Metrics
+scene/prepared.json       PreparedScene
+passes/raster.json        RasterEngine
 preview/preview.json      PreviewState
+evaluation/metrics.json   Metrics
 """
 
 from __future__ import annotations
@@ -12,8 +14,22 @@ from pydantic import ConfigDict, Field
 
 from dnrtrain.records import Record
 
-METRICS = "metrics.json"
-PREVIEW = "preview.json"
+PREPARED, RASTER, PREVIEW, METRICS = "prepared.json", "raster.json", "preview.json", "metrics.json"
+
+
+class PreparedScene(Record):
+    """A whole conversion. fingerprint: of what it was made from. files: SHA-256 by path below ``scene/``."""
+
+    fingerprint: str
+    files: dict[str, str] = Field(default_factory=dict)
+
+
+class RasterEngine(Record):
+    """What draws rasterised colour. requested: the setting. reason: why this engine, in a sentence."""
+
+    requested: str
+    engine: str
+    reason: str
 
 
 class ViewMetrics(Record):

@@ -6,18 +6,18 @@ and archives must read. Nothing is rendered and nothing is executed.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from dnrtrain.contract import SPLITS, ContractError, DamagedFile
+from dnrtrain.records import read
 
 from ..core.console import Console
 from ..core.errors import UserError
 from ..core.workspace import Workspace, file_sha256
 from .pipeline import discard, owner_of
+from .records import PREPARED, PreparedScene
 
 
 @dataclass(frozen=True)
@@ -97,23 +97,23 @@ def _checks(workspace: Workspace) -> Iterator[tuple[Path, Callable[[Path], None]
 
 
 def _scene(workspace: Workspace) -> Iterator[tuple[Path, Callable[[Path], None]]]:
-    marker = workspace.scene / "prepared.json"
+    marker = workspace.scene / PREPARED
     if not workspace.scene.exists():
         return
-    yield marker, _json
+    yield marker, _prepared
     frame = workspace.scene / "frame.json"
     yield frame, lambda _: _frame(workspace)
     try:
-        files = json.loads(marker.read_text(encoding="utf-8")).get("files", {})
-    except (OSError, ValueError, AttributeError, RecursionError):
+        files = read(marker, PreparedScene).files
+    except (OSError, DamagedFile):
         return  # said by the check of the marker itself
-    for name, wanted in files.items() if isinstance(files, dict) else ():
-        path = workspace.scene / str(name)
+    for name, wanted in files.items():
+        path = workspace.scene / name
         if path.resolve().is_relative_to(workspace.scene.resolve()):
             yield path, lambda path, wanted=wanted: _same(path, wanted)
 
 
-def _same(path: Path, wanted: Any) -> None:
+def _same(path: Path, wanted: str) -> None:
     if not path.is_file():
         raise DamagedFile(path, "is gone")
     if file_sha256(path) != wanted:
@@ -144,6 +144,12 @@ def _json(path: Path) -> None:
     from ..core.scene_files import read_json
 
     read_json(path)
+
+
+def _prepared(path: Path) -> None:
+    if not path.exists():
+        raise UserError(f"{path}: is missing; run `dnrpipe prepare --force`")
+    read(path, PreparedScene)
 
 
 def _frame(workspace: Workspace) -> None:
@@ -188,5 +194,5 @@ def _ledger(workspace: Workspace, path: Path) -> None:
 
 
 def _leftovers(root: Path) -> list[Path]:
-    """Temporary names of :func:`dnrtrain.atomic.atomic_path` whose process has gone."""
+    """Temporary names of `dnrtrain.atomic.atomic_path` whose process has gone."""
     return sorted(path for path in root.rglob(".*.tmp*") if path.is_file())
