@@ -8,7 +8,7 @@ import bpy
 
 from dnrpipe.core.errors import NothingVisible
 
-from .baking.rehearsal import convert_materials, place_atlas
+from .baking.pending import convert_materials, place_atlas
 from .bundle.export import export_bundle
 from .census import take_census, with_findings
 from .findings import Findings

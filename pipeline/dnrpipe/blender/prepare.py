@@ -12,7 +12,7 @@ from dnrpipe.core.workspace import file_sha256
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import SceneFrame
 
-from .baking.rehearsal import convert_materials, missing_bakes, place_atlas
+from .baking.pending import convert_materials, missing_bakes, place_atlas
 from .bundle.display import export_display
 from .bundle.export import export_bundle
 from .cameras import camera_animation, scene_cameras
@@ -87,8 +87,8 @@ def prepare(
     write_json(scene_dir / "census.json", census.data())
     write_json(scene_dir / "frame.json", frame.model_dump(mode="json"))
     write_json(scene_dir / "summary.json", summary.data())
-    if converter.book is not None:
-        converter.book.prune()
+    if converter.bakes is not None:
+        converter.bakes.prune()
     return summary
 
 

@@ -27,7 +27,7 @@ class Task(BaseModel):
         return self.model_dump(mode="json")
 
 
-# -- prepare, inspection: a scene file -> scene/, or what can be said of it ----------------------------------
+# -- prepare, inspection: a scene file -> scene/, or what is in it ----------------------------------------------
 
 
 class BakeOptions(Task):
@@ -98,7 +98,7 @@ class InspectAnswer(SceneRecord):
     warnings: list[str]
 
 
-# -- bake: values of sockets over the atlas --------------------------------------------------------------------
+# -- baking.bake: values of sockets over the atlas --------------------------------------------------------------
 
 
 class BakeCommon(Task):
@@ -133,7 +133,7 @@ class BakeAnswer(TypedDict):
     repaired: dict[str, int]
 
 
-# -- passes.worker, passes.lane: G-buffers and rasterised colour ------------------------------------------------
+# -- passes: G-buffers and rasterised colour -------------------------------------------------------------------
 
 
 class PassesCommon(Task):
@@ -198,7 +198,7 @@ class RasterTrial(TypedDict):
     seconds_next: float
 
 
-# -- passes.cycles_frames: frames of Cycles as the file has it ------------------------------------------------------
+# -- passes.cycles_frames: frames of Cycles as the file has it --------------------------------------------------
 
 
 class CyclesCommon(Task):

@@ -17,7 +17,7 @@ HUGE = 1e7
 
 
 def freeze_visible(scene: bpy.types.Scene) -> Frozen:
-    """:func:`freeze_scene`; when nothing is visible, the first later frame of the range that shows something.
+    """`freeze_scene`; when nothing is visible, the first later frame of the range that shows something.
 
     The scene stays at the frame that was frozen; a warning names it. Raises NothingVisible when all frames are empty.
     """

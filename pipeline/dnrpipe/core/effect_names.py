@@ -58,5 +58,5 @@ REMOVABLE: frozenset[str] = frozenset(
         "hair",
     }
 )
-"""Effects that are left out by editing the bundle (:mod:`.bundle`)."""
+"""Effects that are left out by editing the bundle (`bundle`)."""
 LAMPS: tuple[EffectName, ...] = ("area-lights", "point-lights", "glow")

@@ -194,5 +194,5 @@ def _ledger(workspace: Workspace, path: Path) -> None:
 
 
 def _leftovers(root: Path) -> list[Path]:
-    """Temporary names of :func:`dnrtrain.atomic.atomic_path` whose process has gone."""
+    """Temporary names of `dnrtrain.atomic.atomic_path` whose process has gone."""
     return sorted(path for path in root.rglob(".*.tmp*") if path.is_file())

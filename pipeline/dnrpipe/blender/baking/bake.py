@@ -18,6 +18,7 @@ from dnrtrain.atomic import atomic_path
 from ..geometry.frozen import ATLAS_LAYER, FrozenMesh, load_geometry
 from ..reading.names import find_material
 from ..reading.opening import open_scene
+from ..shading.image_files import HALF_MAX
 from ..shading.sockets import walk
 from ..tasks import BakeAnswer, BakeCommon, BakeTask, Tap
 from .mesh import MAX_OWN, add_object, needs_own_space
@@ -28,7 +29,6 @@ EMPTY = -12345.0
 """What the image holds before the bake: texels that Cycles did not reach keep it."""
 SAMPLES = 8
 """Points in each texel: a feature finer than a texel is averaged instead of turning into blocks."""
-HALF_MAX = 65504.0
 
 
 class Worker:

@@ -2,7 +2,7 @@
 
 A *region* is the set of texels of the ``size``² atlas whose centres lie in a material's triangles. Baked values are
 kept as one row per texel of the region ([N, 1, C]): materials share the atlas without sharing memory. Texels count
-from the bottom left, row by row, as in :mod:`..shading.textures`.
+from the bottom left, row by row, as in `shading.textures`.
 """
 
 from __future__ import annotations

@@ -13,6 +13,8 @@ import numpy as np
 
 from dnrtrain.atomic import atomic_path
 
+from ..shading.colour_spaces import read_pixels
+
 LUT_SIZE = 49
 """Nodes per axis. With LUT_MAX and LUT_K node 30 of 48 falls on x = 1, where clipping transforms have their kink."""
 LUT_MAX = 64.0
@@ -82,7 +84,7 @@ def display_values(scene: bpy.types.Scene, linear: np.ndarray) -> np.ndarray:
         with _png_output(scene), tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "display.png"
             image.save_render(str(path), scene=scene)
-            return _read_codes(path)
+            return np.clip(read_pixels(path, "Non-Color"), 0, 1)
     finally:
         bpy.data.images.remove(image)
 
@@ -105,16 +107,3 @@ def _png_output(scene: bpy.types.Scene) -> Iterator[None]:
         render.dither_intensity = dither
         for name in names:
             setattr(settings, name, kept[name])
-
-
-def _read_codes(path: Path) -> np.ndarray:
-    """Code values of a 16-bit PNG in [0, 1], float32 [H, W, 3], in the order of ``image.pixels``."""
-    image = bpy.data.images.load(str(path))
-    try:
-        image.colorspace_settings.name = "Non-Color"
-        width, height = image.size
-        flat = np.empty(width * height * image.channels, dtype=np.float32)
-        image.pixels.foreach_get(flat)
-        return np.clip(flat.reshape(height, width, -1)[..., :3], 0, 1)
-    finally:
-        bpy.data.images.remove(image)

@@ -21,6 +21,7 @@ from ..geometry.frozen import FrozenMesh
 from ..lighting.lights import export_lights
 from ..lighting.ray_visibility import report_ray_visibility
 from ..lighting.world import export_world
+from ..reading.framing import framing_pose
 from ..reading.names import find_material
 from ..shading.materials import Converted, MaterialConverter
 from ..shading.textures import ImageReader, TextureStore
@@ -38,7 +39,7 @@ def export_bundle(
 ) -> dict[str | None, Converted]:
     """Write the open scene (``bpy.context.scene``) as a bundle into ``scene_dir``; return its materials by name.
 
-    meshes: the frozen geometry, world space. converter: brings the baked textures (see :mod:`..baking.bakes`); without
+    meshes: the frozen geometry, world space. converter: brings the baked textures (see `baking.cache`); without
     one, averages stand for them. Every deviation from Blender goes into ``findings``.
     """
     scene = bpy.context.scene
@@ -101,20 +102,7 @@ def _integrator(kind: str) -> ET.Element:
 
 def _sensor(center: np.ndarray, radius: float) -> ET.Element:
     """``perspective`` sensor that sees the bounding sphere from the front right, 25 degrees above."""
-    distance = 1.05 * radius / math.sin(math.radians(DEFAULT_FOV / 2))
-    azimuth, elevation = math.radians(-60), math.radians(25)
-    back = np.array(
-        [
-            math.cos(elevation) * math.cos(azimuth),
-            math.cos(elevation) * math.sin(azimuth),
-            math.sin(elevation),
-        ]
-    )
-    right = np.cross([0.0, 0.0, 1.0], back)
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
-    pose[:3, 3] = center + distance * back
+    pose = framing_pose(center, 1.05 * radius / math.sin(math.radians(DEFAULT_FOV / 2)))
     sensor = xmltree.plugin("sensor", "perspective", id="sensor")
     xmltree.number(sensor, "fov", DEFAULT_FOV)
     xmltree.number(sensor, "near_clip", 0.01 * radius)

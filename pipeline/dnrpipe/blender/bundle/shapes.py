@@ -3,7 +3,7 @@
 Dr.Jit traces every shape of a scene separately, for each kernel: 2,000 Mitsuba instances took 86 s a picture where
 the same triangles in one mesh take 0.04 s (llvm; 100 instances 0.25 s). So copies are written out as triangles, and
 meshes with the same material are joined when there are many. ``instance`` elements are for few copies of heavy meshes
-that do not glow (a shapegroup holds no emitters); see :mod:`~.simplify` for many.
+that do not glow (a shapegroup holds no emitters); see `simplify` for many.
 """
 
 from __future__ import annotations

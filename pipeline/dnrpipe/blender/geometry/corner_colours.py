@@ -6,28 +6,28 @@ import hashlib
 
 import numpy as np
 
-from ..baking.bakes import BakeBook
+from ..baking.cache import BakeCache
 from ..baking.regions import Atlas
 from ..shading.textures import Textured
 
 ACTIVE_COLOUR = "dnrpipe.color"
-"""Name of 'the active colour attribute', whichever a mesh has, among :attr:`FrozenMesh.colors`."""
+"""Name of 'the active colour attribute', whichever a mesh has, among `FrozenMesh.colors`."""
 OWN = "dnrpipe."
 
 
-def colour_corners(book: BakeBook, material: str, name: str) -> np.ndarray | None:
+def colour_corners(bakes: BakeCache, material: str, name: str) -> np.ndarray | None:
     """RGBA [M, 4], linear, of colour attribute ``name`` ('' for each mesh's active one); None where no mesh has it."""
     found = {}
-    for part in book.atlas.parts(material):
+    for part in bakes.atlas.parts(material):
         colour = part.mesh.colors.get(name or part.mesh.active_color or "")
         if colour is not None:
             found[id(part.mesh)] = colour
-    return book.atlas.stacked(material, found, 4) if found else None
+    return bakes.atlas.stacked(material, found, 4) if found else None
 
 
-def is_uv_layer(book: BakeBook, material: str, name: str) -> bool:
+def is_uv_layer(bakes: BakeCache, material: str, name: str) -> bool:
     """Whether ``name`` is a UV layer of a mesh with this material."""
-    return any(name in part.mesh.uv_layers for part in book.atlas.parts(material))
+    return any(name in part.mesh.uv_layers for part in bakes.atlas.parts(material))
 
 
 def as_attribute(atlas: Atlas, material: str, value: Textured) -> str:

@@ -27,7 +27,7 @@ MOST_IDS = 32_767  # Object.pass_index, which carries ids through Cycles, is a 1
 
 @dataclass
 class Frozen:
-    """What :func:`freeze` found. ``repairs`` counts dropped triangles and replaced normals, UVs and colours."""
+    """What `freeze` found. ``repairs`` counts dropped triangles and replaced normals, UVs and colours."""
 
     meshes: list[FrozenMesh]
     repairs: dict[str, int]
@@ -59,7 +59,7 @@ def render_layer(scene: bpy.types.Scene) -> bpy.types.ViewLayer:
 
 
 def freeze_scene(scene: bpy.types.Scene) -> Frozen:
-    """:func:`freeze` the scene at its current frame with render visibility; the scene stays as it was.
+    """`freeze` the scene at its current frame with render visibility; the scene stays as it was.
 
     Raises:
         UserError: nothing in the scene is visible in renders.
@@ -122,7 +122,7 @@ def freeze(depsgraph: bpy.types.Depsgraph) -> Frozen:
 
     Normals go through the inverse transpose; mirrored transforms keep counter-clockwise winding.
     Triangles without area or with non-finite corners are dropped and counted. Every evaluated mesh is read once;
-    beyond a budget instances share it (see :mod:`~.instances`).
+    beyond a budget instances share it (see `instances`).
     """
     cache: dict[tuple[object, ...], tuple[LocalMesh, bytes] | None] = {}
     unique: dict[bytes, LocalMesh] = {}

@@ -137,7 +137,7 @@ def save_geometry(path: Path, meshes: Sequence[FrozenMesh]) -> None:
 
 
 def load_geometry(path: Path) -> list[FrozenMesh]:
-    """Read what :func:`save_geometry` wrote.
+    """Read what `save_geometry` wrote.
 
     Raises UserError when the file is missing, damaged or of another version.
     """

@@ -18,7 +18,7 @@ TextureSpace = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 @dataclass
 class LocalMesh:
-    """Unindexed triangles in object space; arrays as in :class:`~.frozen.FrozenMesh`."""
+    """Unindexed triangles in object space; arrays as in `frozen.FrozenMesh`."""
 
     positions: np.ndarray
     normals: np.ndarray

@@ -1,4 +1,4 @@
-"""Hair and point clouds as triangles: particle hair, Curves objects, PointCloud objects -> :class:`LocalMesh`.
+"""Hair and point clouds as triangles: particle hair, Curves objects, PointCloud objects -> `LocalMesh`.
 
 Every part of the pipeline then sees the same surface: strands are three-sided tubes with round normals, points are
 small spheres. Beyond a budget strands and points are thinned out evenly and thickened to keep their area.

@@ -108,7 +108,7 @@ def _envmap(
     """``envmap`` from an equirectangular image in Blender's row order (Mitsuba's wants the zenith first).
 
     Both centre column i at (i + 0.5) / width; row j lies at (j + 0.5) / height in Blender and at j / (height - 1)
-    in Mitsuba 3.9.1 (measured): see :func:`rows_to_nodes`.
+    in Mitsuba 3.9.1 (measured): see `rows_to_nodes`.
     """
     radiance = rows_to_nodes(np.maximum(bottom_up[::-1].astype(np.float32), 0))
     element = xmltree.plugin("emitter", "envmap", id="world")

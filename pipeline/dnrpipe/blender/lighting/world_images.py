@@ -12,6 +12,8 @@ import bpy
 import numpy as np
 from mathutils import Vector
 
+from ..shading.colour_spaces import read_pixels
+
 SIZE = (1024, 512)
 SAMPLES = 16
 """Per pixel: a world has no noise of its own, so they only smooth edges."""
@@ -75,20 +77,8 @@ def _render(world: Any, place: Callable[[Any, Any], None], size: tuple[int, int]
         with tempfile.TemporaryDirectory() as folder:
             render.filepath = str(Path(folder) / "world.exr")
             bpy.ops.render.render(scene=scene.name, write_still=True)
-            return _read_pixels(Path(render.filepath))
+            return read_pixels(Path(render.filepath), "Linear Rec.709")
     finally:
         bpy.data.objects.remove(body)
         bpy.data.cameras.remove(camera)
         bpy.data.scenes.remove(scene)
-
-
-def _read_pixels(path: Path) -> np.ndarray:
-    image = bpy.data.images.load(str(path))
-    try:
-        image.colorspace_settings.name = "Linear Rec.709"
-        width, height = image.size
-        flat = np.empty(width * height * image.channels, dtype=np.float32)
-        image.pixels.foreach_get(flat)
-        return flat.reshape(height, width, -1)[..., :3]
-    finally:
-        bpy.data.images.remove(image)

@@ -50,7 +50,7 @@ def emission_material(name: str) -> bpy.types.Material:
 
 
 def cutout_material(name: str, opacity: Value) -> bpy.types.Material:
-    """Mix of transparent and emission by ``opacity``, above one half until :func:`soften` is called."""
+    """Mix of transparent and emission by ``opacity``, above one half until `soften` is called."""
     material, emission, output = _emission(f"{MATERIAL_PREFIX}{name}")
     tree = material.node_tree
     mix, clear = tree.nodes.new("ShaderNodeMixShader"), tree.nodes.new("ShaderNodeBsdfTransparent")

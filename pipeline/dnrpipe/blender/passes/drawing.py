@@ -1,4 +1,4 @@
-"""What each lane draws: a function (view, path) that renders one scene of source.blend to an EXR file."""
+"""What a render process draws: a function (view, path) that renders one scene of source.blend to an EXR file."""
 
 from __future__ import annotations
 

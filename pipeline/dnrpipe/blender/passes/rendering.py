@@ -30,7 +30,7 @@ def output_exr(scene: bpy.types.Scene, kind: Literal["layers", "image"]) -> None
 
 
 def render_to(scene: bpy.types.Scene, path: Path) -> None:
-    """Render ``scene`` to ``path`` (.exr, see :func:`output_exr`). Raises RuntimeError without a picture."""
+    """Render ``scene`` to ``path`` (.exr, see `output_exr`). Raises RuntimeError without a picture."""
     path.unlink(missing_ok=True)
     scene.render.filepath = str(path)
     layers = scene.view_layers

@@ -11,7 +11,7 @@ from dnrtrain.contract import GBUFFER_CHANNELS, RASTER_CHANNELS
 from dnrtrain.exr import write_exr
 
 from ..tasks import PassesAnswer, PassesCommon, PassesHeader, PassesTask
-from .lane import Lane
+from .render_process import RenderProcess
 from .scratch import read_channels, scratch_folder
 
 FAR_AWAY = 9e9  # Cycles writes depth 1e10 where a ray hits nothing
@@ -23,15 +23,15 @@ class Worker:
 
     def __init__(self, common: dict[str, Any]) -> None:
         self.common = PassesCommon.model_validate(common)
-        self.gbuffer = Lane("gbuffer", self.common)
-        self.coverage = Lane("coverage", self.common)
-        self.raster = Lane("raster", self.common)
+        self.gbuffer = RenderProcess("gbuffer", self.common)
+        self.coverage = RenderProcess("coverage", self.common)
+        self.raster = RenderProcess("raster", self.common)
 
     def __call__(self, task: dict[str, Any]) -> PassesAnswer:
         return self._render(PassesTask.model_validate(task))
 
     def _render(self, task: PassesTask) -> PassesAnswer:
-        """Write the view's EXR. One frame at a time: lanes side by side would spoil each other's seconds."""
+        """Write the view's EXR. One frame at a time: processes side by side would spoil each other's seconds."""
         started, cpu = time.perf_counter(), time.process_time()
         view = task.view
         with scratch_folder(view.width * view.height) as folder:

@@ -41,7 +41,7 @@ def has_light(scene: bpy.types.Scene, meshes: Sequence[FrozenMesh]) -> bool:
 
 
 def studio_world() -> bpy.types.World:
-    """A world whose environment image is :func:`studio_radiance`, packed into the file."""
+    """A world whose environment image is `studio_radiance`, packed into the file."""
     width, height = STUDIO_SIZE
     image = bpy.data.images.new(STUDIO, width, height, alpha=False, float_buffer=True)
     image.colorspace_settings.name = "Linear Rec.709"

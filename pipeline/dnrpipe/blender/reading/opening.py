@@ -10,9 +10,9 @@ import bpy
 
 from dnrpipe.core.errors import NothingVisible, UserError
 
-from .mending import mend_shaders
 from .missing import missing_files, missing_warnings, strict_refusal
 from .names import repair_names
+from .repairing import repair_shaders
 from .scripts import script_warnings
 
 BLEND_MAGIC = (b"BLENDER", b"\x28\xb5\x2f\xfd", b"\x1f\x8b")  # plain, zstd, gzip
@@ -66,7 +66,7 @@ def open_scene(path: str | Path, *, strict: bool = False) -> list[str]:
         known = ", ".join([".blend", *IMPORTERS])
         raise UserError(f"{path}: cannot read '{suffix or path.name}' files; known are {known}")
     warnings += repair_names()
-    warnings += mend_shaders()
+    warnings += repair_shaders()
     warnings += _choose_scene(path)
     missing = missing_files()
     if strict and missing:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..baking.bakes import BakeBook
+from ..baking.cache import BakeCache
 from ..bundle import xmltree
 from ..findings import Findings
 from ..geometry.corner_colours import as_attribute
@@ -23,7 +23,7 @@ from .values import Evaluator
 TANGENT_MAPS = {"normalmap", "texture"}
 """Parameters of ``dnr_normal`` (tangent space) and ``bumpmap``, which use the tangents of the shape's own UV layer."""
 ACTIVE = ""
-"""Stands in :attr:`Converted.layers` for each mesh's own active UV layer."""
+"""Stands in `Converted.layers` for each mesh's own active UV layer."""
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,14 @@ class ShaderBase:
         store: TextureStore,
         images: ImageReader,
         findings: Findings,
-        book: BakeBook | None = None,
+        bakes: BakeCache | None = None,
         sheets: AtlasSheets | None = None,
     ) -> None:
         self.blender = material
         self.store = store
         self.sheets = sheets
-        self.book = book
-        self.values = Evaluator(material.name_full, images, findings, book)
+        self.bakes = bakes
+        self.values = Evaluator(material.name_full, images, findings, bakes)
         self.colors: list[str] = []
         self._lookups: list[_Lookup] = []
 
@@ -68,13 +68,13 @@ class ShaderBase:
         self.values.note(kind, feature, text)
 
     def share(self, value: Value | None, factor: Value) -> Value | None:
-        """``value`` times ``factor``; see :func:`.algebra.product`."""
+        """``value`` times ``factor``; see `algebra.product`."""
         value, weight = self._alike(value, factor)
         assert weight is not None
         return product(value, weight, lambda feature, text: self.note("approximated", feature, text))
 
     def sum(self, a: Value | None, b: Value | None) -> Value | None:
-        """``a`` + ``b``; see :func:`.algebra.total`."""
+        """``a`` + ``b``; see `algebra.total`."""
         a, b = self._alike(a, b)
         return total(a, b, lambda feature, text: self.note("approximated", feature, text))
 
@@ -117,7 +117,7 @@ class ShaderBase:
 
     def _alike(self, a: Value | None, b: Value | None) -> tuple[Value | None, Value | None]:
         """Two textures that do not lie alike, both taken to the material's region of the scene atlas."""
-        if not (isinstance(a, Textured) and isinstance(b, Textured)) or self.book is None:
+        if not (isinstance(a, Textured) and isinstance(b, Textured)) or self.bakes is None:
             return a, b
         if a.placement == b.placement and a.texels.shape[:2] == b.texels.shape[:2]:
             return a, b
@@ -128,7 +128,7 @@ class ShaderBase:
     def _texture(self, value: Textured, name: str, label: str, *, raw: bool) -> ET.Element:
         """Texture element: a bitmap, a place on a sheet of the scene atlas, or a mesh attribute.
 
-        One that needs another UV layer than the shape's own is wrapped in ``dnr_uv_layer`` by :meth:`settle`.
+        One that needs another UV layer than the shape's own is wrapped in ``dnr_uv_layer`` by `settle`.
         """
         layer = value.placement.uv
         if layer == view_dependent.VIEW_LAYER:
@@ -157,8 +157,8 @@ class ShaderBase:
 
         Mitsuba names PLY properties ``color0_r``, ``_g``, ``_b`` ``vertex_color0_color``.
         """
-        assert self.book is not None
-        attribute = as_attribute(self.book.atlas, self.blender.name_full, value)
+        assert self.bakes is not None
+        attribute = as_attribute(self.bakes.atlas, self.blender.name_full, value)
         if attribute not in self.colors:
             self.colors.append(attribute)
         element = xmltree.plugin("texture", "mesh_attribute", name=name)

@@ -1,4 +1,4 @@
-"""Image colour spaces other than sRGB and linear Rec.709: decoded by Blender's own OpenColorIO."""
+"""Images that Blender loads for us, and decodes from their colour space by its own OpenColorIO."""
 
 from __future__ import annotations
 
@@ -21,15 +21,21 @@ def decode(texels: np.ndarray, space: str) -> np.ndarray:
     with tempfile.TemporaryDirectory(prefix="dnrpipe-") as folder:
         path = Path(folder) / "codes.exr"
         write_colour_exr(path, rgb)
-        image = bpy.data.images.load(str(path))
-        try:
-            image.colorspace_settings.name = space
-            flat = np.empty(len(image.pixels), np.float32)
-            image.pixels.foreach_get(flat)
-        finally:
-            bpy.data.images.remove(image)
-    height, width = texels.shape[:2]
+        decoded = read_pixels(path, space)
     # Files are written in array order, bottom row first; Blender takes the first row of a file for the top.
-    decoded = flat.reshape(height, width, -1)[::-1, :, :3]
+    decoded = decoded[::-1]
     alpha = texels[..., 3:].astype(np.float32) / 255
     return np.concatenate([decoded, alpha], axis=2)
+
+
+def read_pixels(path: Path, space: str) -> np.ndarray:
+    """Pixels of an image file, decoded from colour space ``space``: float32 [H, W, 3], bottom row first."""
+    image = bpy.data.images.load(str(path))
+    try:
+        image.colorspace_settings.name = space
+        width, height = image.size
+        flat = np.empty(width * height * image.channels, dtype=np.float32)
+        image.pixels.foreach_get(flat)
+        return flat.reshape(height, width, -1)[..., :3]
+    finally:
+        bpy.data.images.remove(image)

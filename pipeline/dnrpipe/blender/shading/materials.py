@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..baking.bakes import BakeBook
+from ..baking.cache import BakeCache
 from ..bundle import xmltree
 from ..findings import Findings
 from .shaders import ShaderWalker, default_grey, twosided
@@ -43,17 +43,17 @@ class Converted:
 class MaterialConverter:
     """Converts materials once each; textures go through one store.
 
-    book: where baked values come from and where missing ones are listed; None: averages instead of bakes.
+    bakes: where baked values come from and where missing ones are listed; None: averages instead of bakes.
     """
 
     def __init__(
-        self, store: TextureStore, images: ImageReader, findings: Findings, book: BakeBook | None = None
+        self, store: TextureStore, images: ImageReader, findings: Findings, bakes: BakeCache | None = None
     ) -> None:
         self.store = store
         self.images = images
         self.findings = findings
-        self.book = book
-        self.sheets = None if book is None else AtlasSheets(book.atlas)
+        self.bakes = bakes
+        self.sheets = None if bakes is None else AtlasSheets(bakes.atlas)
         self.ids = xmltree.Ids()
         self._done: dict[str | None, Converted] = {}
 
@@ -68,7 +68,7 @@ class MaterialConverter:
         identity = self.ids.take("mat", "default" if material is None else material.name)
         if material is None:
             return Converted(identity, _with_id(twosided(default_grey()), identity), None, None, False, None)
-        walker = ShaderWalker(material, self.store, self.images, self.findings, self.book, self.sheets)
+        walker = ShaderWalker(material, self.store, self.images, self.findings, self.bakes, self.sheets)
         surface = walker.material()
         bsdf = _with_id(walker.finish(surface), identity)
         emission = self._image(walker, self._sampleable(walker, surface.emission))
@@ -88,25 +88,25 @@ class MaterialConverter:
         It picks a texel and looks for *the* surface point there, without ``to_uv``: where the UVs are mapped,
         overlap or leave the unit square, light would be lost, so the texture moves to the scene atlas.
         """
-        if not isinstance(emission, Textured) or not emission.placement.plain or self.book is None:
+        if not isinstance(emission, Textured) or not emission.placement.plain or self.bakes is None:
             return emission
         place, name = emission.placement, walker.blender.name_full
-        if place.to_uv == Placement().to_uv and self.book.atlas.is_unfolded(name, place.uv):
+        if place.to_uv == Placement().to_uv and self.bakes.atlas.is_unfolded(name, place.uv):
             return emission
-        note = f"its UVs overlap or repeat: resampled into the atlas of {self.book.atlas.size}² texels, to be sampled"
+        note = f"its UVs overlap or repeat: resampled into the atlas of {self.bakes.atlas.size}² texels, to be sampled"
         walker.note("baked", "textured emission", note)
         return walker.values.flat(emission)
 
     def _image(self, walker: ShaderWalker, value: Value | None) -> Value | None:
         """``value``, as an image of its own where it is textured: what lies at corners or in a region is spread out."""
-        if not isinstance(value, Textured) or value.placement.plain or self.book is None:
+        if not isinstance(value, Textured) or value.placement.plain or self.bakes is None:
             return value
-        return self.book.image(walker.values.flat(value))
+        return self.bakes.image(walker.values.flat(value))
 
     def baked_size(self) -> int | None:
         """Side of the atlas that values were baked into, in texels; None when nothing was."""
-        book = self.book
-        return book.atlas.size if book is not None and (book.used or book.used_atlas) else None
+        bakes = self.bakes
+        return bakes.atlas.size if bakes is not None and (bakes.used or bakes.used_atlas) else None
 
     def sheets_elements(self) -> list[ET.Element]:
         """The shared textures of all materials converted so far; they belong before the materials."""

@@ -21,7 +21,7 @@ class PrincipledShader(LobeShaders, InterfaceShaders):
     """The Principled BSDF, and the material without nodes, which is one."""
 
     def _principled(self, node: Any, scope: Scope) -> Surface:
-        """Principled BSDF; radiometry in :mod:`.calibration`."""
+        """Principled BSDF; radiometry in `calibration`."""
         base = self._colour(node, scope, "Base Color")
         roughness = self._scalar(node, scope, "Roughness")
         metallic = self._scalar(node, scope, "Metallic")

@@ -1,9 +1,9 @@
 """Blender's shader nodes -> Mitsuba BSDFs: the walk over a material's shader tree.
 
-One method per node, by family: :mod:`.lobes` (what reflects), :mod:`.interfaces` (what transmits),
-:mod:`.principled`, :mod:`.mixing`, :mod:`.volumes` (what fills a mesh);
-:mod:`.normals` bends their normals. Calibration:
-shared/FACTS.md, re-measured in :mod:`.calibration`. Whatever is not converted exactly is recorded as a finding with
+One method per node, by family: `lobes` (what reflects), `interfaces` (what transmits),
+`principled`, `mixing`, `volumes` (what fills a mesh);
+`normals` bends their normals. Calibration:
+shared/FACTS.md, re-measured in `calibration`. Whatever is not converted exactly is recorded as a finding with
 the material's name.
 """
 

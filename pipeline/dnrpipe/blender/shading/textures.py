@@ -48,7 +48,7 @@ class Placement:
 
     uv: name of the UV layer, None for the mesh's render-active one.
     to_uv: 3x3 affine map from that layer's coordinates to image coordinates, row-major.
-    region: the texels are those of this material's region of the scene atlas, [N, 1, C] (see :mod:`..baking.regions`).
+    region: the texels are those of this material's region of the scene atlas, [N, 1, C] (see `baking.regions`).
     corners: the texels are a colour attribute's values at the material's stacked corners, [M, 1, C].
     """
 

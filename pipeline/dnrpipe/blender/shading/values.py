@@ -1,7 +1,7 @@
 """Values of shader sockets: constants, image textures, and colour arithmetic on them.
 
 Nodes that only depend on images of one placement are evaluated texel by texel, exactly; a plain colour attribute is
-kept at the corners. Everything else is baked by Cycles over the scene atlas (:mod:`..baking.bakes`). What cannot be
+kept at the corners. Everything else is baked by Cycles over the scene atlas (`baking.cache`). What cannot be
 baked becomes its average. Both with a finding: never silently.
 """
 
@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..baking.bakes import BakeBook
+from ..baking.cache import BakeCache
 from ..findings import Findings
 from ..geometry.corner_colours import ACTIVE_COLOUR, colour_corners, is_uv_layer
 from ..tasks import ValueKind
@@ -38,14 +38,14 @@ class Inexact(Exception):
 class Evaluator:
     """Evaluates sockets of one material.
 
-    material: its full name, None outside of materials. book: where baked values come from; None: averages only.
+    material: its full name, None outside of materials. bakes: where baked values come from; None: averages only.
     exact: raise Inexact rather than taking an average (used inside).
     """
 
     material: str | None
     images: ImageReader
     findings: Findings
-    book: BakeBook | None = None
+    bakes: BakeCache | None = None
     exact: bool = False
 
     def colour(self, socket: Any, scope: Scope = ()) -> Value:
@@ -70,9 +70,9 @@ class Evaluator:
     def normal(self, socket: Any, scope: Scope = ()) -> Textured | None:
         """World-space normals that a Normal input receives, n * 0.5 + 0.5, baked; None where that cannot be."""
         source = resolve(socket, scope)
-        if self.book is None or self.material is None or not source.linked:
+        if self.bakes is None or self.material is None or not source.linked:
             return None
-        return self.book.value(self.material, "normal", source, socket.name, self.findings)
+        return self.bakes.value(self.material, "normal", source, socket.name, self.findings)
 
     def plain(self, socket: Any, scope: Scope = ()) -> Value | None:
         """Value of a socket that plain images and constants hold exactly; None for any other: nothing is baked."""
@@ -83,15 +83,15 @@ class Evaluator:
         return None if isinstance(value, Textured) and not value.placement.plain else value
 
     def flat(self, value: Textured) -> Textured:
-        """The same value over the material's region of the scene atlas (see :func:`.sheets.on_region`)."""
-        if self.book is None or self.material is None:
+        """The same value over the material's region of the scene atlas (see `sheets.on_region`)."""
+        if self.bakes is None or self.material is None:
             return value
-        self.book.used_atlas = True
-        return on_region(self.book.atlas, self.material, value)
+        self.bakes.used_atlas = True
+        return on_region(self.bakes.atlas, self.material, value)
 
     def _evaluated(self, socket: Any, scope: Scope, kind: ValueKind) -> Value:
         """The value: exactly where that is possible, else baked, else averaged."""
-        if self.book is None or self.material is None:
+        if self.bakes is None or self.material is None:
             return self._value(socket, scope)
         trial = replace(self, findings=Findings(), exact=True)
         try:
@@ -99,7 +99,7 @@ class Evaluator:
             if kind == "scalar" and isinstance(value, Textured) and value.placement.corners is not None:
                 raise Inexact("colour attribute as a number", "its mean over the mesh is used")
         except Inexact:
-            baked = self.book.value(self.material, kind, resolve(socket, scope), socket.name, self.findings)
+            baked = self.bakes.value(self.material, kind, resolve(socket, scope), socket.name, self.findings)
             return self._value(socket, scope) if baked is None else baked
         self.findings.merge(trial.findings)
         return value
@@ -149,7 +149,7 @@ class Evaluator:
         return average
 
     def _view_dependent(self, source: Source) -> Value:
-        """Fresnel or Layer Weight node as a table over the angle of view (:mod:`.view_dependent`)."""
+        """Fresnel or Layer Weight node as a table over the angle of view (`view_dependent`)."""
         node = source.node
         normal = find_input(node, "Normal")
         if normal is not None and resolve(normal, source.scope).linked:
@@ -247,12 +247,12 @@ class Evaluator:
 
     def _is_active(self, layer: str) -> bool:
         """Whether a named UV layer is the active one on all of the material's surface."""
-        parts = [] if self.book is None or self.material is None else self.book.atlas.parts(self.material)
+        parts = [] if self.bakes is None or self.material is None else self.bakes.atlas.parts(self.material)
         return bool(parts) and all(part.mesh.active_uv == layer for part in parts)
 
     def _is_other_attribute(self, name: str) -> bool:
         """Whether ``name`` is a mesh attribute, but no UV layer."""
-        parts = [] if self.book is None or self.material is None else self.book.atlas.parts(self.material)
+        parts = [] if self.bakes is None or self.material is None else self.bakes.atlas.parts(self.material)
         layers = any(name in part.mesh.uv_layers for part in parts)
         return not layers and any(name in part.mesh.colors for part in parts)
 
@@ -265,10 +265,10 @@ class Evaluator:
 
     def _stays_inside(self, placement: Placement) -> bool:
         """Whether the material's surface uses nothing beyond the image's edges."""
-        if self.book is None or self.material is None:
+        if self.bakes is None or self.material is None:
             return False
         affine = np.asarray(placement.to_uv)
-        for part in self.book.atlas.parts(self.material):
+        for part in self.bakes.atlas.parts(self.material):
             layer = part.mesh.uv_layers.get(placement.uv or part.mesh.active_uv or "")
             if layer is not None:
                 uv = layer[part.corners] @ affine[:2, :2].T + affine[:2, 2]
@@ -286,9 +286,9 @@ class Evaluator:
         if not named and node.attribute_type != "GEOMETRY":
             self._inexact(f"attribute '{name}' of the {node.attribute_type.lower()}", "black is used")
             return constant(0.0)
-        values = None if self.book is None or self.material is None else colour_corners(self.book, self.material, name)
+        values = colour_corners(self.bakes, self.material, name) if self.bakes and self.material else None
         if values is None:
-            if self.exact and self.book is not None and is_uv_layer(self.book, self.material or "", name):
+            if self.exact and self.bakes is not None and is_uv_layer(self.bakes, self.material or "", name):
                 raise Inexact(f"UV layer '{name}' as a colour", "black is used")
             self.note("missing", f"attribute '{name}'", "not found on the mesh: black, as Cycles renders it")
             return constant(0.0)

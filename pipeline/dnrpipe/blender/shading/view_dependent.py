@@ -4,7 +4,7 @@ Notation
     c    cosine between the view direction and the shading normal, in [0, 1]
     f(c) the node's output; one row for the front of the surface, one for its back
 
-A table is a :class:`Textured` of its own placement, so that arithmetic on it (Math, ColorRamp, Mix, ...) is exact;
+A table is a `Textured` of its own placement, so that arithmetic on it (Math, ColorRamp, Mix, ...) is exact;
 texture plugin ``dnr_view`` (dnrpipe/raytrace/plugins/views.py) looks it up while rendering.
 """
 
@@ -18,13 +18,13 @@ from ..bundle import xmltree
 from .textures import Placement, Textured, Value, constant
 
 VIEW_LAYER = "dnrpipe.view"
-"""Name of the layer of coordinates (c, side) in :class:`Placement`."""
+"""Name of the layer of coordinates (c, side) in `Placement`."""
 COSINES = 256
 PLACEMENT = Placement(uv=VIEW_LAYER, wrap="clamp")
 
 
 def table(front: np.ndarray, back: np.ndarray) -> Textured:
-    """Table from f at the cosines of :func:`cosines`, [COSINES] or [COSINES, 3] for each side."""
+    """Table from f at the cosines of `cosines`, [COSINES] or [COSINES, 3] for each side."""
     rows = np.stack([front, back]).astype(np.float32)
     return Textured(rows.reshape(2, COSINES, -1), False, PLACEMENT)
 

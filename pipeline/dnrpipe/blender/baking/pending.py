@@ -1,4 +1,4 @@
-"""Convert all materials before anything is exported, to learn which of their values have to be baked first."""
+"""All materials are converted before anything is exported, to find the values that have to be baked first."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ..reading.names import find_material
 from ..shading.materials import MaterialConverter
 from ..shading.textures import ImageReader, TextureStore
 from ..tasks import BakeOptions, PendingBakes
-from .bakes import BakeBook
+from .cache import BakeCache
 
 PENDING = "pending.json"
 
@@ -42,8 +42,8 @@ def convert_materials(
     meshes: Sequence[FrozenMesh], scene_dir: Path, findings: Findings, options: BakeOptions | None
 ) -> MaterialConverter:
     """A converter that has converted every material in use; `missing_bakes` says what it lacks."""
-    book = None if options is None else BakeBook.open(meshes, options.folder, options.size, options.refused)
-    converter = MaterialConverter(TextureStore(scene_dir), ImageReader(findings), findings, book)
+    bakes = None if options is None else BakeCache.open(meshes, options.folder, options.size, options.refused)
+    converter = MaterialConverter(TextureStore(scene_dir), ImageReader(findings), findings, bakes)
     for mesh in meshes:
         for slot in np.unique(mesh.material_index):
             name = mesh.materials[slot]
@@ -60,11 +60,11 @@ def missing_bakes(
     Leaves geometry.npz for the bake, and the atlas' facts for the next attempt.
     """
     pending = scene_dir / PENDING
-    if converter.book is None or not converter.book.missing:
+    if converter.bakes is None or not converter.bakes.missing:
         pending.unlink(missing_ok=True)
         return None
     shutil.rmtree(scene_dir / "textures", ignore_errors=True)  # made of placeholders
     save_geometry(scene_dir / "geometry.npz", meshes)
     write_json(pending, atlas.data())
-    layers = tuple(tuple(layer) for layer in converter.book.layers())
+    layers = tuple(tuple(layer) for layer in converter.bakes.layers())
     return PendingBakes(layers=layers, frame=frame)

@@ -1,9 +1,9 @@
-"""The book of baked socket values: what is asked for, what is on disk, and what has still to be baked.
+"""The cache of baked socket values: what is asked for, what is on disk, and what has still to be baked.
 
-A conversion walks all materials and asks the book for every value that it cannot compute itself. Where the value
-is in the folder (files named by content hash), it comes back as a texture over the material's region of the scene
-atlas. Where it is not, the walk goes on with a placeholder, the book lists the value in ``missing``, and the
-whole conversion counts as a rehearsal: bake what is missing (`bake`), and convert again.
+A conversion walks all materials and asks the cache for every value that it cannot compute itself. Where the value
+is in the folder (files named by content hash), the cache returns it as a texture over the material's region of the
+scene atlas. Where it is not, the cache returns a placeholder and lists the value in ``missing``. Then the conversion
+does not count: `bake` bakes what is missing, and the scene is converted again.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class BakeItem(NamedTuple):
 
 
 @dataclass
-class BakeBook:
+class BakeCache:
     """Baked values of one conversion.
 
     folder: the cache. refused: keys that could not be baked; they are approximated instead. used: keys that were
@@ -54,8 +54,8 @@ class BakeBook:
     _meshes: dict[int, str] = field(default_factory=dict)
 
     @classmethod
-    def open(cls, meshes: Sequence[FrozenMesh], folder: Path, size: int, refused: Iterable[str] = ()) -> BakeBook:
-        """The book of a frozen scene whose bakes have ``size``² texels."""
+    def open(cls, meshes: Sequence[FrozenMesh], folder: Path, size: int, refused: Iterable[str] = ()) -> BakeCache:
+        """The cache of a frozen scene whose bakes have ``size``² texels."""
         return cls(Atlas(meshes, size), folder, frozenset(refused))
 
     def value(self, material: str, kind: ValueKind, source: Source, socket: str, findings: Findings) -> Textured | None:

@@ -14,7 +14,7 @@ LARGEST = 1e30  # Blender stores an infinite number as the largest float, 3.4e38
 LAMP_NUMBERS = ("energy", "shadow_soft_size", "size", "size_y", "angle", "spot_size", "spot_blend", "exposure")
 
 
-def mend_shaders() -> list[str]:
+def repair_shaders() -> list[str]:
     """Cut links that close a circle, make numbers finite, in the open file; one warning line for each kind.
 
     As Cycles does: a circle is cut at the link that closes it, seen from the output. NaN and infinite numbers become
@@ -98,7 +98,7 @@ def _bad_sockets(tree: bpy.types.NodeTree) -> Iterator[tuple[Any, Any]]:
 
 def _replace(node: Any, socket: Any) -> None:
     """Give a socket what a new node of this kind has there; 0 where it has no such socket (groups)."""
-    scratch: Any = bpy.data.node_groups.new("dnrpipe.mending", "ShaderNodeTree")
+    scratch: Any = bpy.data.node_groups.new("dnrpipe.repairing", "ShaderNodeTree")
     try:
         fresh = scratch.nodes.new(node.bl_idname)
         kind = "outputs" if socket.is_output else "inputs"

@@ -28,8 +28,8 @@ from ..tasks import FrameCosts, PassesCommon
 Kind = Literal["gbuffer", "coverage", "raster"]
 
 
-class Lane:
-    """The parent's end. ``lane(view, path)`` renders one view to an EXR file.
+class RenderProcess:
+    """The parent's end. ``process(view, path)`` renders one view to an EXR file.
 
     Args:
         kind: which scene the process renders.
