@@ -2,8 +2,8 @@
 
 One method per node, by family: `lobes` (what reflects), `interfaces` (what transmits),
 `principled`, `mixing`, `volumes` (what fills a mesh);
-`normals` bends their normals. Calibration:
-shared/FACTS.md, re-measured in `calibration`. Whatever is not converted exactly is recorded as a finding with
+`normals` bends their normals. Constants are
+measured against Cycles, see `calibration`. Whatever is not converted exactly is recorded as a finding with
 the material's name.
 """
 
