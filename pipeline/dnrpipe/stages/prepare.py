@@ -179,14 +179,13 @@ def _run_conversion(run: Run, source: Path, folder: Path) -> None:
         bakes = BakeOptions(folder=workspace.root / FOLDER, size=size, refused=tuple(refused))
         task = PrepareTask(source=source, scene_dir=folder, strict=settings.strict, bakes=bakes)
         with run.console.bar("scene", 1) as bar:
-            answer, first_failure = open_scene("dnrpipe.blender.prepare", task, run.log)
+            answer, first_failure = open_scene("dnrpipe.blender.prepare", task, PrepareAnswer, run.log)
             bar.advance()
         if first_failure:
             run.console.warn(f"scene: {first_failure}; opening it once more went well")
-        pending = PrepareAnswer.model_validate(answer).bakes
-        if pending is None:
+        if answer.bakes is None:
             return
-        refused += bake(run, source, folder / "geometry.npz", pending)
+        refused += bake(run, source, folder / "geometry.npz", answer.bakes)
     raise RuntimeError(f"{source}: the same textures are to be baked again and again")
 
 
