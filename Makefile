@@ -7,6 +7,7 @@ DEMO    := demo-output
 # The LLVM that Mitsuba needs, X11/GL that Blender links, and a browser for the report's screenshot test.
 APT     := libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1 libatomic1 libllvm19 libegl1 libgl1-mesa-dri
 APT_DEV := chromium
+PYTEST  := $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 
 # Pages with tables made from docs/results.
 RESULTS := $(addprefix docs/,ablation.md bench-select.md cost.md frames.md noise.md)
@@ -34,8 +35,8 @@ demo: setup  ## the demo scene from .blend to report; prints the report's path
 	@$(BIN)/dnrpipe render -w $(DEMO)/demo.dnr --orbit 60
 	@$(BIN)/dnrpipe report -w $(DEMO)/demo.dnr
 
-test: setup browser lint types imports docs-check  ## lint, types, import rules, documentation, all tests
-	$(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder --durations 15
+test: setup browser lint types imports docs-check  ## lint, types, import rules, documentation, the quick tests
+	$(PYTEST) -m "not robustness" --durations 15
 
 browser:
 	@sh tools/system-libraries.sh $(APT_DEV)
@@ -65,9 +66,10 @@ audit:  ## known vulnerabilities of the pinned dependencies, by pip-audit; needs
 	.cache/audit/bin/pip install --quiet --disable-pip-version-check pip-audit
 	.cache/audit/bin/pip-audit -r constraints.txt --no-deps --disable-pip --strict
 
-robustness: setup  ## every case of docs/robustness.md, 2,000 damaged files of each format, 50 kills; an hour or more
+robustness: setup  ## the slow tests, every case of docs/robustness.md, 2,000 damaged files of each format, 50 kills; an hour or more
 	$(BIN)/python -m tools.robustness_table --check docs/robustness.md
-	$(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder $$($(BIN)/python -m tools.robustness_table --tests docs/robustness.md)
+	$(PYTEST) -m robustness
+	$(PYTEST) -m "not robustness" $$($(BIN)/python -m tools.robustness_table --tests docs/robustness.md)
 	$(BIN)/python -m tools.faults.fuzz --count 2000
 	$(BIN)/python -m tools.faults.inject --kills 50
 	$(BIN)/python -m tools.faults.memory

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import gc
 import os
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from filelock import FileLock
 
 # As the command line does, before anything loads torch: tests run side by side, and waiting threads that spin take the
 # processor from those that work.
@@ -16,15 +18,36 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 REPO = Path(__file__).resolve().parents[1]
 SHARED = REPO.parent / "shared" / "assets"
-TOGETHER = ("tests/e2e", "tests/service")
-ALONE = ("test_demo.py", "test_queue.py")
+TOGETHER = ("tests/service",)
+ALONE = ("test_queue.py",)
+LONG = (
+    "tests/e2e/test_demo.py",
+    "tests/e2e/test_pipeline.py",
+    "tests/service/",
+    "tests/test_bench_select.py",
+    "tests/test_export.py",
+    "tests/test_planning.py",
+    "tests/e2e/test_damage.py",
+    "tests/test_frontier.py",
+    "tests/e2e/test_targets.py",
+)
+"""What takes longest begins first, so that no process is left with it when the others have ended."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Long files first; the others stay as they are."""
+
+    def place(item: pytest.Item) -> int:
+        return next((i for i, name in enumerate(LONG) if item.nodeid.startswith(name)), len(LONG))
+
+    items.sort(key=place)
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Side by side go whole files, so that what a file's tests share is made once.
 
-    Some folders share a finished workspace, or a server, between files, and stay together. (pytest-xdist 3.8's own
+    Some folders share a server between files, and stay together. (pytest-xdist 3.8's own
     ``--dist loadgroup`` overlooks its marks under pytest 9.)
     """
     from xdist.scheduler import LoadScopeScheduling
@@ -59,6 +82,29 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
             return folder if folder in TOGETHER and name not in ALONE else file
 
     return ByFile(config, log)
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], object]], Path]:
+    """``made_once(name, build)``: a folder that ``build(folder)`` fills once, for all processes of this run.
+
+    Whoever comes first builds, the others wait. Tests only read it; those that write copy it.
+    """
+    root = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        root = root.parent
+
+    def make(name: str, build: Callable[[Path], object]) -> Path:
+        folder, done = root / name, root / f"{name}.done"
+        with FileLock(root / f"{name}.lock"):
+            if not done.exists():
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+                build(folder)
+                done.touch()
+        return folder
+
+    return make
 
 
 @pytest.fixture(scope="session")

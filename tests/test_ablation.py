@@ -18,11 +18,11 @@ from tools import result_tables
 
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import Settings, resolve
+from dnrpipe.studies.ablation.ablation_tables import Figures, markdown
 from dnrpipe.studies.ablation.rows import CLASSIC as CLASSIC_SIZES
 from dnrpipe.studies.ablation.rows import GROUPS, ROWS, choose_rows, needs_coarse, settings_of
-from dnrpipe.studies.ablation.tables import Figures, markdown
+from dnrpipe.studies.cells.markdown import spread
 from dnrpipe.studies.cells.scenes import BENCHMARK, find_scenes
-from dnrpipe.studies.cells.tables import spread
 
 CLASSIC = [row for row in ROWS.values() if row.family == "classic"]
 
@@ -262,6 +262,7 @@ def test_a_second_run_does_nothing_and_a_lost_cell_is_made_again_the_same(smoke:
 
 
 @pytest.mark.slow
+@pytest.mark.robustness
 def test_rows_train_about_the_seconds_asked_for(smoke: tuple[Path, dict[str, Any]]) -> None:
     out, answer = smoke
     done = ablate(out, "--rows", "vanilla,paper", "--seconds", "4")

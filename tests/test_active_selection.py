@@ -16,13 +16,13 @@ from torch import Tensor
 
 from dnrpipe.core.settings import resolve
 from dnrpipe.core.workspace import Source, Workspace
-from dnrpipe.studies.selectbench.active import worker
+from dnrpipe.studies.selectbench.active import active_worker
+from dnrpipe.studies.selectbench.active.active_worker import Members
 from dnrpipe.studies.selectbench.active.batches import KINDS, choose_actively, sizes
 from dnrpipe.studies.selectbench.active.ensemble import Disagreement, Spread
 from dnrpipe.studies.selectbench.active.pieces import COUNT, Pieces, cells_of, pieces_of, seen_cells
 from dnrpipe.studies.selectbench.active.settings import ActiveSettings
 from dnrpipe.studies.selectbench.active.variance import UNKNOWN, PredictedVariance, Reduction, features_of, train_head
-from dnrpipe.studies.selectbench.active.worker import Members
 from dnrtrain.checkpoint import read_record
 from dnrtrain.contract import View, write_cameras
 from dnrtrain.dataset import ViewSet, load_views
@@ -141,7 +141,7 @@ def test_an_interrupted_run_goes_on(
                     if len(trained) == count:
                         raise KeyboardInterrupt
 
-        monkeypatch.setattr(worker, "run_step1", run)
+        monkeypatch.setattr(active_worker, "run_step1", run)
 
     stop_after(3)
     with pytest.raises(KeyboardInterrupt):
@@ -209,7 +209,7 @@ def test_the_worker_writes_a_selection(tmp_path: Path) -> None:
         "key": "k", "workspace": str(workspace.root), "settings": settings.model_dump(mode="json"),
         "policy": "variance", "seed": 0, "folder": str(tmp_path / "models"), "output": str(tmp_path / "k.json"),
     }  # fmt: skip
-    made = worker.Worker({"threads": 1, "device": "cpu"})(task)
+    made = active_worker.Worker({"threads": 1, "device": "cpu"})(task)
     assert json.loads((tmp_path / "k.json").read_text()) == made
     assert len(set(made["views"])) == 3 and set(made["views"]) <= {view.name for view in views}
     assert made["key"] == "k" and made["seconds"] > 0 and made["cpu_seconds"] > 0

@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.scene_records import sphere_summary
+from tools.bench_frames.equal_time import at_equal_time, break_even, lines, upfront
 from tools.bench_frames.motion import Surface, changes, flicker, project, reproject
 from tools.bench_frames.standing import classes, standing
-from tools.bench_frames.upfront import at_equal_time, break_even, lines, upfront
 
 from dnrpipe.core.cameras import orbit_views
 from dnrpipe.core.ledger import CostRecord
 from dnrpipe.core.settings import CameraSettings
-from dnrpipe.studies.frames.ladder import crossover, frontier, quality_at
+from dnrpipe.studies.frames.pareto_front import crossover, frontier, quality_at
 from dnrtrain.contract import View
 
 LADDER = {"1": (10.0, 20.0), "1 dear": (30.0, 19.0), "4": (40.0, 26.0), "16": (160.0, 30.0), "dull": (200.0, 30.0)}

@@ -22,13 +22,13 @@ from dnrpipe.core.cameras import make_cameras
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import CameraSettings, resolve
 from dnrpipe.studies.selectbench.active.batches import KINDS
-from dnrpipe.studies.selectbench.command import choose_budgets
+from dnrpipe.studies.selectbench.bench_select import choose_budgets
+from dnrpipe.studies.selectbench.bench_tables import difference, markdown, together
 from dnrpipe.studies.selectbench.figures import Figures
 from dnrpipe.studies.selectbench.intervals import half_width, summarise, t_distribution, t_quantile
 from dnrpipe.studies.selectbench.policies import CONTENDERS, GROUPS, SIMPLE, choose_policies, settings_of
 from dnrpipe.studies.selectbench.pools import POOLS, choose_pools, write_rig
 from dnrpipe.studies.selectbench.rigs import inside, surface_points, walk, winding
-from dnrpipe.studies.selectbench.tables import difference, markdown, together
 from dnrtrain.contract import View
 from dnrtrain.selector.names import TRAINED_NAMES, UNTRAINED_NAMES
 

@@ -133,7 +133,9 @@ def test_each_scene_has_the_effects_it_is_there_for() -> None:
     assert np.abs(path[:, 0, 3]).max() < 1.05 and path[:, 1, 3].max() < 0.6
 
 
-@pytest.mark.parametrize("name", ["foliage", *(pytest.param(name, marks=pytest.mark.slow) for name in SLOW_TO_BUILD)])
+@pytest.mark.parametrize(
+    "name", ["foliage", *(pytest.param(name, marks=pytest.mark.robustness) for name in SLOW_TO_BUILD)]
+)
 def test_script_builds_the_committed_scene(name: str, tmp_path: Path) -> None:
     built = tmp_path / f"{name}.blend"
     script = FOLDER / f"build_{name}.py"

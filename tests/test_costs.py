@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.ledger import (
     CostRecord,
+    CostSummary,
     Ledger,
     break_even_frames,
     by_purpose,
@@ -24,6 +25,7 @@ from dnrpipe.core.ledger import (
     traced_views,
     tracing_all_would_cost,
     upfront_seconds,
+    upfront_work,
 )
 
 
@@ -55,7 +57,7 @@ def test_append_and_read_round_trip(tmp_path: Path) -> None:
     for each in written:
         ledger.append(each)
     assert ledger.read() == written
-    assert ledger.torn_lines() == 0
+    assert ledger.truncated_records() == 0
     assert len(ledger.path.read_bytes().splitlines()) == len(written)
 
 
@@ -67,10 +69,10 @@ def test_torn_last_line_is_tolerated_then_closed_by_the_next_append(tmp_path: Pa
     for cut in (1, 40, len(whole.splitlines()[1]) - 3):  # anywhere inside the second line
         ledger.path.write_bytes(whole.splitlines(keepends=True)[0] + whole.splitlines()[1][:cut])
         assert [r.name for r in ledger.read()] == ["a"]
-        assert ledger.torn_lines() == 1
+        assert ledger.truncated_records() == 1
         ledger.append(record(name="c"))
         assert [r.name for r in ledger.read()] == ["a", "c"]
-        assert ledger.torn_lines() == 1
+        assert ledger.truncated_records() == 1
 
 
 def test_a_whole_last_line_without_newline_is_kept(tmp_path: Path) -> None:
@@ -79,7 +81,7 @@ def test_a_whole_last_line_without_newline_is_kept(tmp_path: Path) -> None:
     ledger.path.write_bytes(ledger.path.read_bytes().rstrip(b"\n"))
     ledger.append(record(name="b"))
     assert [r.name for r in ledger.read()] == ["a", "b"]
-    assert ledger.torn_lines() == 0
+    assert ledger.truncated_records() == 0
 
 
 def test_blocks_of_zeros_and_noise_count_as_torn(tmp_path: Path) -> None:
@@ -89,7 +91,7 @@ def test_blocks_of_zeros_and_noise_count_as_torn(tmp_path: Path) -> None:
         file.write(b"\0" * 64 + b"\n" + b"\xff\xfe\x80\n")
     ledger.append(record(name="b"))
     assert [r.name for r in ledger.read()] == ["a", "b"]
-    assert ledger.torn_lines() == 2
+    assert ledger.truncated_records() == 2
 
 
 def test_a_foreign_line_is_refused_with_its_place(tmp_path: Path) -> None:
@@ -133,7 +135,7 @@ def test_concurrent_appends_lose_nothing(tmp_path: Path) -> None:
     assert [p.wait(timeout=60) for p in processes] == [0, 0, 0]
     ledger = Ledger(path)
     assert {r.name for r in ledger.read()} == {f"{p}/{i}" for p in range(3) for i in range(50)}
-    assert ledger.torn_lines() == 0
+    assert ledger.truncated_records() == 0
 
 
 def test_sums_by_stage_and_purpose_and_wall_clock() -> None:
@@ -226,14 +228,14 @@ def test_break_even() -> None:
 
 def test_summary_is_json_and_empty_ledgers_have_one() -> None:
     records = [record(spp=64, noise=0.1), record(name="train/1", spp=128, noise=0.3)]
-    summary = summarise(records, n_candidates=8, torn_lines=1)
-    assert json.loads(json.dumps(summary, allow_nan=False)) == summary
-    assert summary["raytraced"]["training"]["spp"] == [64, 128]
-    assert summary["raytraced"]["training"]["noise"] == pytest.approx(0.2)
-    assert summary["tracing_all"]["all_seconds"] == 16.0
-    assert summary["torn_lines"] == 1
+    summary = summarise(records, n_candidates=8, truncated_records=1)
+    assert CostSummary.model_validate_json(json.dumps(summary.model_dump(), allow_nan=False)) == summary
+    assert summary.raytraced["training"].spp == [64, 128]
+    assert summary.raytraced["training"].noise == pytest.approx(0.2)
+    assert summary.tracing_all is not None and summary.tracing_all.all_seconds == 16.0
+    assert summary.torn_lines == 1
     empty = summarise([])
-    assert empty["total"]["seconds"] == 0.0 and empty["tracing_all"] is None
+    assert empty.total.seconds == 0.0 and empty.tracing_all is None
 
 
 def test_upfront_cost_is_training_once() -> None:
@@ -247,3 +249,27 @@ def test_upfront_cost_is_training_once() -> None:
     ]
     assert upfront_seconds(records, only={"train/1"}) == 5.0
     assert upfront_seconds(records) == 55.0
+
+
+def test_what_comes_before_the_first_frame_is_one_list_by_kind() -> None:
+    """Light that the plan's pilot baked is that of ray tracing; epochs of both steps count; names tell the rest."""
+    records = [
+        record(stage="prepare", unit="scene", name="convert", seconds=3.0, spp=None),
+        record(stage="prepare", name="train/1", seconds=1.0, spp=None),
+        record(stage="plan", unit="scene", name="light", seconds=9.0, spp=32),
+        record(stage="plan", unit="scene", name="pilot: trace", seconds=8.0, spp=None),
+        record(stage="raytrace", unit="scene", name="light", seconds=7.0, cpu_seconds=14.0, spp=64),
+        record(name="train/1", seconds=4.0),
+        record(stage="finetune", name="base/train/1", seconds=0.5, spp=None),
+        record(stage="select", unit="epoch", name="epoch 1", seconds=2.0, spp=None),
+        record(stage="finetune", unit="epoch", name="epoch 1", seconds=5.0, spp=None),
+    ]
+    work = upfront_work(records)
+    seconds = {part: total(units).seconds for part, units in work.items()}
+    assert seconds == {
+        "conversion": 3.0, "passes": 1.0, "pilot": 8.0, "selection": 0.0, "tracing": 4.0, "light": 7.0,
+        "base images": 0.5, "training": 7.0,
+    }  # fmt: skip
+    assert total(work["light"]).cpu_seconds == 14.0
+    assert sum(seconds.values()) == upfront_seconds(records)
+    assert not upfront_work(records, only=set())["base images"]

@@ -482,11 +482,18 @@ CASES: list[tuple[Callable[[], None], float, float]] = [
     (mixed_shaders, 0.03, 0.06),
     (emissive_ball, 0.03, 0.05),
 ]
+QUICK = (textured_plane, metal, lacquer, glass_node, area_light, sun, point, turned_sky, normal_map, alpha_cutout,
+         mixed_shaders)  # fmt: skip
+
+
+def halves(cases: list[tuple[Any, ...]], quick: tuple[Any, ...]) -> list[Any]:
+    """The cases, all but the quick ones marked for the slow half."""
+    return [case if case[0] in quick else pytest.param(*case, marks=pytest.mark.robustness) for case in cases]
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("mitsuba_variant")
-@pytest.mark.parametrize(("build", "energy", "rmse"), CASES, ids=lambda v: getattr(v, "__name__", None))
+@pytest.mark.parametrize(("build", "energy", "rmse"), halves(CASES, QUICK), ids=lambda v: getattr(v, "__name__", None))
 def test_matches_cycles(build: Callable[[], None], energy: float, rmse: float, tmp_path: Path) -> None:
     build()
     ratio, error, _ = compare(tmp_path)

@@ -50,6 +50,12 @@ def test_the_weakest_finding_is_the_claim(measure: Any) -> None:
     assert measure.claim_of([{"kind": "baked"}, {"kind": "ignored"}]) == "approximated"
 
 
+def test_the_code_that_renders_hang_on_is_there() -> None:
+    from tools.fidelity import ours
+
+    assert len({ours.code_hash(part) for part in (ours.CONVERSION, ours.TRACING, ours.PLUGINS)}) == 3
+
+
 @pytest.mark.slow
 def test_three_scenes_hold_what_the_conversion_claims(tmp_path: Path) -> None:
     pytest.importorskip("bpy")

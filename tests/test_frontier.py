@@ -14,51 +14,75 @@ from hypothesis import strategies as st
 
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import resolve
-from dnrpipe.studies.frontier.account import break_evens, pareto, settle_frames, total_seconds
-from dnrpipe.studies.frontier.command import numbers
-from dnrpipe.studies.frontier.run import Sweep
-from dnrpipe.studies.frontier.words import markdown, verdict
+from dnrpipe.studies.frontier.frontier_report import markdown, verdict
+from dnrpipe.studies.frontier.measure_frontier import numbers
+from dnrpipe.studies.frontier.point_costs import break_evens, pareto, settle_frames, total_seconds
+from dnrpipe.studies.frontier.records import BaselinePoint, FrontierResults, Point, read_frontier
+from dnrpipe.studies.frontier.sweep import Sweep
 
 
-def point(name: str, upfront: float, frame_ms: float, psnr: float, kind: str = "ours") -> dict[str, Any]:
-    return {
-        "name": name,
-        "kind": kind,
-        "views": 6,
-        "spp": 16,
-        "steps": 150,
-        "upfront": upfront,
-        "frame_ms": frame_ms,
-        "psnr": psnr,
-        "ssim": psnr / 40,
-        "lpips_vgg": 1 / psnr,
-        "flip": None,
-    }
+def point(name: str, upfront: float, frame_ms: float, psnr: float, kind: Any = "ours") -> Point:
+    return Point(
+        name=name,
+        kind=kind,
+        views=6,
+        spp=16,
+        steps=150,
+        upfront=upfront,
+        frame_ms=frame_ms,
+        psnr=psnr,
+        ssim=psnr / 40,
+        lpips_vgg=1 / psnr,
+        flip=None,
+    )
 
 
-def rung(spp: int, ms: float, psnr: float, denoised: bool) -> dict[str, Any]:
+def baseline(spp: int, ms: float, psnr: float, denoised: bool) -> BaselinePoint:
     name = f"{spp} spp {'clean16' if denoised else 'raw'}"
-    metrics = {"psnr": psnr, "ssim": psnr / 40, "lpips_vgg": 1 / psnr, "flip": None}
-    return {"name": name, "spp": spp, "denoised": denoised, "ms": ms, **metrics}
+    metrics: dict[str, Any] = {"psnr": psnr, "ssim": psnr / 40, "lpips_vgg": 1 / psnr, "flip": None}
+    return BaselinePoint(name=name, spp=spp, denoised=denoised, ms=ms, **metrics)
 
 
-def results() -> dict[str, Any]:
+BASELINES = [
+    baseline(1, 10, 18, False),
+    baseline(4, 100, 28, True),
+    baseline(16, 200, 30, True),
+    baseline(64, 800, 33, True),
+]
+
+
+def results() -> FrontierResults:
     points = [point("small", 30.0, 50.0, 29.0), point("large", 90.0, 50.0, 31.0), point("poor", 95.0, 50.0, 28.0)]
     points.append(point("base image alone", 10.0, 40.0, 27.0, "base"))
-    rungs = [rung(1, 10, 18, False), rung(4, 100, 28, True), rung(16, 200, 30, True), rung(64, 800, 33, True)]
-    break_evens(points, rungs)
-    return {
-        "scene": "toy", "resolution": "64x64", "command": "dnrpipe frontier", "commit": None, "date": "2026-11-22",
-        "machine": {"processor": "x"}, "cores": 2, "test_views": 3, "evaluation_spp": 64, "frames": [1, 2000],
-        "points": points, "rungs": rungs,
-    }  # fmt: skip
+    return FrontierResults(
+        schema_version=1, scene="toy", resolution="64x64", command="dnrpipe frontier", commit=None, date="2026-11-22",
+        machine={"processor": "x"}, cores=2, test_views=3, evaluation_spp=64, frames=[1, 2000],
+        points=break_evens(points, BASELINES), baselines=BASELINES,
+    )  # fmt: skip
+
+
+def front(found: FrontierResults, frames: int, metric: Any = "psnr") -> list[str]:
+    return pareto(found.everything.values(), frames, metric)
+
+
+def test_a_file_has_the_keys_that_it_always_had_and_reads_back(tmp_path: Path) -> None:
+    found = results()
+    data = found.data()
+    assert {"schema", "points", "rungs"} <= data.keys() and "baselines" not in data
+    assert {"rival_ms", "break_even", "upfront", "frame_ms"} <= data["points"][0].keys()
+    assert data["rungs"][0]["ms"] == 10 and "masked" not in data["rungs"][0]
+    (tmp_path / "results.json").write_text(json.dumps(data))
+    assert read_frontier(tmp_path / "results.json") == found
+    (tmp_path / "results.json").write_text(json.dumps(data | {"points": [{"name": "x"}]}))
+    with pytest.raises(UserError, match="damaged"):
+        read_frontier(tmp_path / "results.json")
 
 
 def test_few_frames_are_path_traced_and_many_are_neural() -> None:
     found = results()
-    assert not {"small", "large"} & set(pareto(found, 1)[:3])
-    assert "small" in pareto(found, 2000)
-    assert "poor" not in pareto(found, 2000)
+    assert not {"small", "large"} & set(front(found, 1)[:3])
+    assert "small" in front(found, 2000)
+    assert "poor" not in front(found, 2000)
     assert "Do not train" in verdict(found, 1)
     assert "Do not train" not in verdict(found, 2000)
 
@@ -66,20 +90,20 @@ def test_few_frames_are_path_traced_and_many_are_neural() -> None:
 @given(st.floats(1.0, 500.0), st.floats(1.0, 300.0), st.floats(18.0, 33.0))
 def test_from_the_break_even_on_training_is_cheaper_at_equal_quality(upfront: float, ms: float, psnr: float) -> None:
     one = point("x", upfront, ms, psnr)
-    break_evens([one], results()["rungs"])
-    rival, even = one["rival_ms"], one["break_even"]
-    assert rival is not None
+    (one,) = break_evens([one], BASELINES)
+    traced, even = one.baseline_ms, one.break_even
+    assert traced is not None
     if even is None:
-        assert rival <= ms
+        assert traced <= ms
         return
-    assert total_seconds(one, even) <= even * rival / 1000 + 1e-6
+    assert total_seconds(one, even) <= even * traced / 1000 + 1e-6
     if even > 1:
-        assert total_seconds(one, even - 1) > (even - 1) * rival / 1000 - 1e-6
+        assert total_seconds(one, even - 1) > (even - 1) * traced / 1000 - 1e-6
 
 
 def test_points_of_one_model_share_its_least_disturbed_frame() -> None:
     points = [
-        {"kind": kind, "network_ms": network, "base_ms": base}
+        point(kind, 1.0, 0.0, 30.0, kind).model_copy(update={"network_ms": network, "base_ms": base})
         for kind, network, base in (
             ("ours", 14.0, 50.0),
             ("all", 90.0, 50.0),
@@ -87,21 +111,19 @@ def test_points_of_one_model_share_its_least_disturbed_frame() -> None:
             ("base", 0.0, 50.0),
         )
     ]
-    settle_frames(points)
-    assert [point["frame_ms"] for point in points] == [64.0, 64.0, 20.0, 50.0]
+    assert [point.frame_ms for point in settle_frames(points)] == [64.0, 64.0, 20.0, 50.0]
 
 
-def test_a_point_beyond_the_ladder_has_no_break_even() -> None:
-    one = point("x", 1.0, 1.0, 40.0)
-    break_evens([one], results()["rungs"])
-    assert one["rival_ms"] is None
-    assert one["break_even"] is None
+def test_a_point_beyond_all_baselines_has_no_break_even() -> None:
+    (one,) = break_evens([point("x", 1.0, 1.0, 40.0)], BASELINES)
+    assert one.baseline_ms is None
+    assert one.break_even is None
 
 
 def test_the_front_of_a_metric_where_lower_is_better_is_turned_round() -> None:
     found = results()
-    assert pareto(found, 2000, "lpips_vgg") == pareto(found, 2000, "psnr")
-    assert pareto(found, 2000, "flip") == []
+    assert front(found, 2000, "lpips_vgg") == front(found, 2000, "psnr")
+    assert front(found, 2000, "flip") == []
 
 
 def test_the_report_names_front_rivals_and_break_even() -> None:

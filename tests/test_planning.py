@@ -13,11 +13,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.plan_record import plan_record
 
 from dnrpipe.core.workspace import Source, Workspace
 from dnrpipe.studies.planning.carry_out import steps_that_fit, steps_within
 from dnrpipe.studies.planning.choose import NEAR, Predictor, best_within, budgets, cheapest_reaching
 from dnrpipe.studies.planning.pilot import pilot_path, read_pilot
+from dnrpipe.studies.planning.pilot_worker import without_reference
 from dnrpipe.studies.planning.quality import (
     Gain,
     Measured,
@@ -36,14 +38,14 @@ from dnrpipe.studies.planning.records import (
     LightPart,
     LightPoint,
     Pilot,
+    Plan,
     Prediction,
     Traced,
     TracePart,
     TrainingPart,
 )
-from dnrpipe.studies.planning.routes import as_reported, break_even, rival_line, routes, seconds_for
+from dnrpipe.studies.planning.routes import as_reported, baseline_front, break_even, routes, seconds_for
 from dnrpipe.studies.planning.seconds import Costs, Work, noise_at, view_line
-from dnrpipe.studies.planning.worker import without_reference
 
 PRIOR = load_prior()
 POSITIVE = st.floats(1e-8, 1e-5)
@@ -59,7 +61,7 @@ def trace_part(per_sample: float, per_pixel: float, noise: float = 0.2, power: f
     return TracePart(points=points, workers=2, startup=3.0)
 
 
-RUNGS = (
+BASELINES = (
     ("1 spp raw", 10.0, 20.0),
     ("4 spp clean16", 60.0, 30.0),
     ("64 spp clean16", 400.0, 35.0),
@@ -93,7 +95,7 @@ def pilot() -> Pilot:
         frames=FramePart(
             base=FramePoint(name="base", ms=40, psnr=28.0),
             neural=[FramePoint(name="neural", ms=55, psnr=29.0), FramePoint(name="neural", ms=55, psnr=29.8)],
-            rival=[FramePoint(name=name, ms=ms, psnr=psnr) for name, ms, psnr in RUNGS],
+            rival=[FramePoint(name=name, ms=ms, psnr=psnr) for name, ms, psnr in BASELINES],
             views=3,
             deviation=2.0,
         ),
@@ -280,19 +282,19 @@ def workspace_with_pilot(folder: Path) -> Workspace:
 def test_a_wanted_psnr_keeps_its_steps(tmp_path: Path) -> None:
     workspace = workspace_with_pilot(tmp_path)
     session = SimpleNamespace(workspace=workspace, answers={"raytrace": {"ran": True, "seconds": 1.0}})
-    record = {"wanted": {"seconds": 3600.0, "psnr": 29.0, "frames": None}}
-    assert steps_that_fit(session, record, PRIOR) is record  # type: ignore[arg-type]
+    plan = Plan.model_validate(plan_record(wanted={"seconds": 3600.0, "psnr": 29.0, "frames": None}))
+    assert steps_that_fit(session, plan, PRIOR) is plan  # type: ignore[arg-type]
 
 
-def test_a_torn_pilot_counts_as_none(tmp_path: Path) -> None:
+def test_a_truncated_pilot_counts_as_none(tmp_path: Path) -> None:
     workspace = workspace_with_pilot(tmp_path)
     assert read_pilot(workspace) == pilot()
     pilot_path(workspace).write_text(pilot().model_dump_json()[:-100])
     assert read_pilot(workspace) is None
 
 
-def test_the_ladder_is_followed_beyond_its_end_and_says_so() -> None:
-    line = rival_line(pilot().frames)  # type: ignore[arg-type]
+def test_the_baselines_are_followed_beyond_their_end_and_the_route_says_so() -> None:
+    line = baseline_front(pilot().frames)  # type: ignore[arg-type]
     assert [name for name, _, _ in line] == ["1 spp raw", "4 spp clean16", "64 spp clean16"]
     assert seconds_for(line, 30.0) == pytest.approx((0.06, False))
     beyond = seconds_for(line, 37.0)
@@ -356,7 +358,7 @@ def test_a_scene_is_planned_and_the_plan_carried_out(
         (pilot, "REFERENCE_SPP", 16),
         (pilot, "SPP", 4),
         (pilot, "STEPS", (6, 12)),
-        (pilot, "RUNGS", (1, 4)),
+        (pilot, "SAMPLE_COUNTS", (1, 4)),
         (pilot, "METHODS", ("raw", "clean16-fast")),
         (choose, "STEPS", (12, 24)),
         (choose, "SAMPLES", (4, 8)),
@@ -368,7 +370,10 @@ def test_a_scene_is_planned_and_the_plan_carried_out(
     assert _main(["plan", str(demo_blend), "--frames", "3", "--json"]) == 0
     record = json.loads(capsys.readouterr().out)
     root = tmp_path / "demo.dnr"
-    assert json.loads((root / "plan" / "plan.json").read_text())["table"] == record["table"]
+    assert json.loads((root / "plan" / "plan.json").read_text()) == {
+        k: v for k, v in record.items() if k != "workspace"
+    }
+    assert not {"carried_out", "actual"} & record.keys()
     assert record["chosen"] is None
     assert not (root / "plan" / "pilot").exists()
     names = {route["name"] for route in record["routes"]}
@@ -379,6 +384,7 @@ def test_a_scene_is_planned_and_the_plan_carried_out(
     assert _main(["plan", "--time", "1h", "--apply", "-q"]) == 0
     assert (root / "plan" / "pilot.json").stat().st_mtime_ns == stamp  # the pilot is not run twice
     done = json.loads((root / "plan" / "plan.json").read_text())
+    assert "routes" not in done  # nobody asked
     choice, carried_out = done["chosen"]["choice"], done["carried_out"]["choice"]
     assert {key: choice[key] for key in ("views", "spp")} == {key: carried_out[key] for key in ("views", "spp")}
     remembered = json.loads((root / "manifest.json").read_text())["overrides"]

@@ -206,10 +206,10 @@ BAD_EPOCH = json.dumps(
 @pytest.mark.parametrize(
     ("file", "text", "message"),
     [
-        ("evaluation/metrics.json", '{"views": [', r"metrics\.json: damaged JSON.*dnrpipe evaluate"),
-        ("evaluation/metrics.json", '{"views": []}', r"metrics\.json: views: .*dnrpipe evaluate"),
+        ("evaluation/metrics.json", '{"views": [', r"metrics\.json: damaged \(Invalid JSON.*dnrpipe evaluate"),
+        ("evaluation/metrics.json", '{"views": []}', r"metrics\.json: damaged \(views: .*dnrpipe evaluate"),
         ("evaluation/metrics.json", '{"views": [{"name": "../../etc/x"}]}', r"views\.0\.name"),
-        ("selection.json", "[]", r"selection\.json: not a JSON object.*dnrpipe select"),
+        ("selection.json", "[]", r"selection\.json: damaged \(Input should be an object.*dnrpipe select"),
         ("checkpoints/step1/model.json", BAD_EPOCH, r"history\.0\.epoch"),
         ("cameras/test.json", '{"frames": [{}]}', r"test\.json: damaged \(frame 0"),
         ("evaluation/0003.truth.png", "not a picture", r"0003\.truth\.png: damaged image"),

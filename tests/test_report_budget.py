@@ -2,39 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
+
+from tests.plan_record import prediction, write_plan
 
 from dnrpipe.report.budget import build_budget
 
 
-def prediction(seconds: float, psnr: float) -> dict[str, Any]:
-    return {
-        "choice": {"views": 6, "spp": 16, "epochs": 25, "steps": 150},
-        "seconds": {
-            "select": 1.0,
-            "raytrace": seconds / 2,
-            "finetune": seconds / 2 - 1,
-            "evaluate": 5.0,
-            "total": {"expected": seconds, "low": seconds / 2, "high": seconds * 2},
-        },
-        "cpu_seconds": seconds,
-        "psnr": {"expected": psnr, "low": psnr - 1, "high": psnr + 1},
-    }
-
-
 def planned(root: Path, **more: Any) -> Path:
-    record: dict[str, Any] = {
-        "chosen": prediction(60, 30.0),
-        "settings_default": prediction(200, 30.5),
-        "table": [prediction(60, 30.0), prediction(120, 31.0), prediction(240, 31.5)],
-        "base_psnr": 28.0,
-        "gain": 4.0,
-        **more,
-    }
-    (root / "plan").mkdir(parents=True)
-    (root / "plan" / "plan.json").write_text(json.dumps(record))
+    write_plan(root, **more)
     return root
 
 
@@ -77,9 +54,33 @@ def test_predicted_and_actual_stand_side_by_side(tmp_path: Path) -> None:
     assert "64.0 s" in found.cost
 
 
-def test_a_torn_plan_is_as_if_there_were_none(tmp_path: Path) -> None:
+def test_a_truncated_plan_is_as_if_there_were_none(tmp_path: Path) -> None:
     (tmp_path / "plan").mkdir()
     (tmp_path / "plan" / "plan.json").write_text('{"chosen": ')
     found = build_budget(tmp_path, None, 5.0)
     assert found is not None
     assert found.rows == []
+
+
+def test_sentences_say_why_and_whether_to_train(tmp_path: Path) -> None:
+    route = {
+        "name": "path tracing + denoiser",
+        "what": "about 4 spp raw",
+        "upfront": 0.0,
+        "frame": 0.1,
+        "reaches": True,
+    }
+    asked = {"routes": [route | {"total": 20.0, "psnr": 30.0}], "routes_psnr": 30.0, "break_even": None, "train": False}
+    wanted = {"seconds": None, "psnr": None, "frames": 200}
+    found = build_budget(planned(tmp_path, wanted=wanted, **asked), None, None)
+    assert found is not None
+    assert "The base image alone gives 28.0 dB; the network is expected to add 2.0, of at most 4.0" in found.why[0]
+    assert "60.0 s more would buy 1.0 dB." in found.why
+    assert found.routes[0] == "200 frames at 30.0 dB:"
+    assert found.routes[1].startswith("path tracing + denoiser · 20.0 s ·")
+    assert found.routes[2:] == [
+        "Do not train: path tracing + denoiser is cheaper.",
+        "The neural renderer never pays for itself against path tracing at that PSNR.",
+    ]
+    table = build_budget(planned(tmp_path / "table", chosen=None), None, None)
+    assert table is not None and table.why == table.routes == []

@@ -142,7 +142,7 @@ def test_jewels_are_lit_by_small_lamps_through_flat_shaded_glass() -> None:
 
 @pytest.mark.parametrize(
     "name",
-    ["materials", *(pytest.param(n, marks=pytest.mark.slow) for n in ("bricks", "microphone", "ship", "jewels"))],
+    ["materials", *(pytest.param(n, marks=pytest.mark.robustness) for n in ("bricks", "microphone", "ship", "jewels"))],
 )
 def test_script_builds_the_committed_scene(name: str, tmp_path: Path) -> None:
     built = tmp_path / f"{name}.blend"

@@ -226,11 +226,15 @@ CASES: list[tuple[Callable[[], None], float, float]] = [
     (soft_point_not_normalised, 0.02, 0.02),
     (hidden_from_the_camera, 0.02, 0.04),
 ]
+QUICK = (fresnel_mix, own_glass, translucent_sheet, coat, bump, scattering_volume, area_spread,
+         soft_point_not_normalised, hidden_from_the_camera)  # fmt: skip
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("mitsuba_variant")
-@pytest.mark.parametrize(("build", "energy", "rmse"), CASES, ids=lambda v: getattr(v, "__name__", None))
+@pytest.mark.parametrize(
+    ("build", "energy", "rmse"), T.halves(CASES, QUICK), ids=lambda v: getattr(v, "__name__", None)
+)
 def test_matches_cycles(
     build: Callable[[], None], energy: float, rmse: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -7,7 +7,7 @@ Seconds are processor seconds of a stage, which other work on the machine does n
 the prior refitted without the scene (``tools.plan_prior``), so that it has not seen what it predicts.
 
 Whether to train at all is asked for each scene at the PSNR of its best measured neural point. What each route really
-costs is read off the frontier: path tracing on its measured ladder, the base image where it is good enough, the
+costs is read off the frontier: path tracing on its measured baselines, the base image where it is good enough, the
 cheapest measured neural point that is. The answer counts as right where the route it names costs at most 15 % more
 than the cheapest.
 """
@@ -25,8 +25,8 @@ from tools.plan_prior import read_cells, without
 
 from dnrpipe.core.errors import UserError
 from dnrpipe.studies.cells.provenance import made_by
-from dnrpipe.studies.frames.ladder import crossover, frontier
-from dnrpipe.studies.frontier.command import read_frontier
+from dnrpipe.studies.frames.pareto_front import crossover, frontier
+from dnrpipe.studies.frontier.records import FrontierResults, Point, read_frontier
 from dnrpipe.studies.planning.choose import VIEWS, Predictor
 from dnrpipe.studies.planning.records import Choice, Interval, Route
 from dnrpipe.studies.planning.routes import as_reported, routes
@@ -36,7 +36,7 @@ FRAMES = (200, 2000)
 NEAR = 1.15
 
 
-def opened(root: Path, scene: str, cells: Path) -> tuple[dict[str, Any], Predictor]:
+def opened(root: Path, scene: str, cells: Path) -> tuple[FrontierResults, Predictor]:
     """(what the frontier measured, what the plan predicts with).
 
     Raises UserError: no pilot, or no frontier.
@@ -45,37 +45,37 @@ def opened(root: Path, scene: str, cells: Path) -> tuple[dict[str, Any], Predict
     return results, predictor_in(root, without(read_cells(cells), scene, str(cells)))
 
 
-def check(scene: str, results: dict[str, Any], predictor: Predictor) -> list[dict[str, Any]]:
+def check(scene: str, results: FrontierResults, predictor: Predictor) -> list[dict[str, Any]]:
     """A row per point of the frontier: predicted and actual."""
-    cores, threads = results["cores"], results["threads"]
+    cores, threads = results.cores, results.threads
     rows = []
-    for point in results["points"]:
-        if point["kind"] != "ours":
+    for point in results.points:
+        if point.kind != "ours":
             continue
-        choice = predictor.choice(point["views"], point["spp"], point["steps"])
+        choice = predictor.choice(point.views, point.spp, point.steps)
         traced = predictor.processor.raytrace(choice.views, choice.spp) - predictor.processor.light()
         trained = predictor.processor.finetune(choice.steps, choice.epochs)
-        parts = point["parts"]
+        parts = point.parts
         actual = (cores * (parts["tracing"] + parts["base images"]), threads * parts["training"])
         psnr = predictor.predict(choice).psnr
         rows.append(
             {
                 "scene": scene,
-                "name": point["name"],
+                "name": point.name,
                 "tracing": [round(traced, 2), round(actual[0], 2)],
                 "training": [round(trained, 2), round(actual[1], 2)],
                 "total": [round(traced + trained, 2), round(sum(actual), 2)],
-                "psnr": [round(psnr.expected, 2), round(point["psnr"], 2)],
-                "inside": psnr.low <= point["psnr"] <= psnr.high,
+                "psnr": [round(psnr.expected, 2), round(point.psnr, 2)],
+                "inside": psnr.low <= point.psnr <= psnr.high,
             }
         )
     return rows
 
 
-def routes_of(scene: str, results: dict[str, Any], predictor: Predictor) -> list[dict[str, Any]]:
+def routes_of(scene: str, results: FrontierResults, predictor: Predictor) -> list[dict[str, Any]]:
     """Per number of frames: which route the plan names, which is the cheapest, and what each really costs, seconds."""
-    neural = [point for point in results["points"] if point["kind"] == "ours"]
-    wanted = max(point["psnr"] for point in neural)
+    neural = [point for point in results.points if point.kind == "ours"]
+    wanted = max(point.psnr for point in neural)
     found = []
     for frames in FRAMES:
         expected = _expected(predictor, results, wanted, frames)
@@ -96,21 +96,21 @@ def routes_of(scene: str, results: dict[str, Any], predictor: Predictor) -> list
     return found
 
 
-def clocked(predictor: Predictor, results: dict[str, Any], choice: Choice) -> float:
+def clocked(predictor: Predictor, results: FrontierResults, choice: Choice) -> float:
     """Predicted seconds by the frontier's clock: processor seconds over the cores and over training's threads."""
     costs = predictor.processor
     return (
-        costs.raytrace(choice.views, choice.spp) / results["cores"]
-        + costs.finetune(choice.steps, choice.epochs) / results["threads"]
+        costs.raytrace(choice.views, choice.spp) / results.cores
+        + costs.finetune(choice.steps, choice.epochs) / results.threads
     )
 
 
-def _light(results: dict[str, Any]) -> float:
+def _light(results: FrontierResults) -> float:
     """Seconds of the baked light, which the pilot has baked: known to it, and counted on both sides."""
-    return next(point for point in results["points"] if point["kind"] == "base")["parts"]["light"]
+    return next(point for point in results.points if point.kind == "base").parts["light"]
 
 
-def _expected(predictor: Predictor, results: dict[str, Any], wanted: float, frames: int) -> list[Route]:
+def _expected(predictor: Predictor, results: FrontierResults, wanted: float, frames: int) -> list[Route]:
     """The plan's routes by the frontier's clock."""
     light = _light(results)
     enough = [p for p in predictor.grid(max(VIEWS)) if p.psnr.expected >= wanted]
@@ -126,19 +126,19 @@ def _expected(predictor: Predictor, results: dict[str, Any], wanted: float, fram
     return routes(part, neural, light, scale, wanted, frames)
 
 
-def _actual(results: dict[str, Any], neural: list[dict[str, Any]], wanted: float, frames: int) -> dict[str, float]:
+def _actual(results: FrontierResults, neural: list[Point], wanted: float, frames: int) -> dict[str, float]:
     """Seconds of each route that reaches ``wanted``, without the candidates' passes, which the plan takes as given."""
 
-    def total(point: dict[str, Any]) -> float:
-        return point["upfront"] - point["parts"]["passes"] + frames * point["frame_ms"] / 1000
+    def total(point: Point) -> float:
+        return point.upfront - point.parts["passes"] + frames * point.frame_ms / 1000
 
-    found = {"neural renderer": min(total(point) for point in neural if point["psnr"] >= wanted)}
-    points = {rung["name"]: (rung["ms"], rung["psnr"]) for rung in results["rungs"]}
+    found = {"neural renderer": min(total(point) for point in neural if point.psnr >= wanted)}
+    points = {one.name: (one.ms, one.psnr) for one in results.baselines}
     ms = crossover([points[name] for name in frontier(points)], wanted)
     if ms is not None:
         found["path tracing + denoiser"] = frames * ms / 1000
-    base = next(point for point in results["points"] if point["kind"] == "base")
-    if base["psnr"] >= wanted:
+    base = next(point for point in results.points if point.kind == "base")
+    if base.psnr >= wanted:
         found["base image alone"] = total(base)
     return found
 

@@ -31,9 +31,10 @@ from dnrpipe.stages.session import Session, resolve_settings
 from dnrpipe.studies.cells.provenance import made_by
 from dnrpipe.studies.planning.carry_out import apply, steps_within
 from dnrpipe.studies.planning.choose import Predictor
-from dnrpipe.studies.planning.command import Wanted, make_plan, make_predictor
+from dnrpipe.studies.planning.make_plan import make_plan, make_predictor
 from dnrpipe.studies.planning.pilot import read_pilot
-from dnrpipe.studies.planning.records import Prediction
+from dnrpipe.studies.planning.quality import Prior
+from dnrpipe.studies.planning.records import Prediction, Wanted
 from dnrpipe.studies.planning.seconds import TIME_SPREAD
 from dnrtrain.atomic import write_json
 
@@ -91,28 +92,29 @@ def _run(root: Path, scene: str, share: float, side: str, cells: Path) -> dict[s
         predictor = predictor_in(root, prior)
         usual = preset_choice(predictor, session)
         seconds = share * usual(None).seconds.total.expected
-        record = make_plan(session.workspace, session.settings, session.console, Wanted(seconds=seconds), prior)
+        plan = make_plan(session.run, Wanted(seconds=seconds), prior)
         if side == "preset":
-            record["chosen"] = usual(seconds).model_dump(mode="json")
-        record = apply(session, record, prior)
-    chosen, actual = record.get("carried_out") or record["chosen"], record["actual"]
+            plan = plan.model_copy(update={"chosen": usual(seconds)})
+        plan = apply(session, plan, prior)
+    chosen, actual = plan.carried_out or plan.chosen, plan.actual
+    assert chosen is not None and actual is not None  # it was carried out
     return {
         "scene": scene,
         "share": share,
         "side": side,
         "seconds": round(seconds, 1),
         "load": os.getloadavg()[0],
-        "choice": chosen["choice"],
-        "predicted": _predicted(chosen),
-        "actual": {**actual["seconds"], "cpu": actual["cpu_seconds"], "psnr": actual["psnr"]},
+        "choice": chosen.choice.model_dump(),
+        "predicted": {
+            **chosen.seconds.model_dump(),
+            "cpu": chosen.cpu_seconds,
+            "psnr": chosen.psnr.model_dump(),
+        },
+        "actual": {**actual.seconds, "cpu": actual.cpu_seconds, "psnr": actual.psnr},
     }
 
 
-def _predicted(one: dict[str, Any]) -> dict[str, Any]:
-    return {**one["seconds"], "cpu": one["cpu_seconds"], "psnr": one["psnr"]}
-
-
-def predictor_in(root: Path, prior: Any) -> Predictor:
+def predictor_in(root: Path, prior: Prior) -> Predictor:
     """The plan's predictor in a workspace. Raises UserError: no pilot."""
     workspace = Workspace.open(root)
     pilot = read_pilot(workspace)

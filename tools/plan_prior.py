@@ -1,7 +1,7 @@
 """What `dnrpipe plan` knows before its pilot: shared parameters, fitted to what was measured on the benchmark scenes.
 
     python -m tools.plan_prior collect .cache/plan/*.dnr/frontier/results.json docs/results/ablation-core.json ...
-    python -m tools.plan_prior fit                                       # -> pipeline/dnrpipe/planning/prior.json
+    python -m tools.plan_prior fit     # -> pipeline/dnrpipe/studies/planning/prior.json
 
 ``collect`` gathers cells (views, samples, steps, PSNR, PSNR of the base image, noise of training pictures and of
 references) of `dnrpipe frontier`, of `dnrpipe ablate`, and of its own older output; and the pilots beside frontiers.
@@ -259,7 +259,7 @@ def main() -> int:
     second.add_argument("--out", type=Path, default=Path("docs/results/plan-prior.json"))
     third = verbs.add_parser("fit")
     third.add_argument("cells", type=Path, nargs="?", default=Path("docs/results/plan-prior.json"))
-    third.add_argument("--out", type=Path, default=Path("pipeline/dnrpipe/planning/prior.json"))
+    third.add_argument("--out", type=Path, default=Path("pipeline/dnrpipe/studies/planning/prior.json"))
     options = parser.parse_args()
     if options.verb == "collect":
         collect(options.sources, options.workspaces, options.out)

@@ -8,7 +8,7 @@
                 -> render             novel views with the neural renderer
                 -> report             what accuracy cost in time, as one HTML file
 
-Every stage is a function of files in a workspace (``scene.dnr/``); see :mod:`dnrpipe.core.workspace`.
+Every stage is a function of files in a workspace (``scene.dnr/``); see `dnrpipe.core.workspace`.
 Nothing heavy is imported here.
 """
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -17,10 +18,12 @@ _spec.loader.exec_module(harness)
 
 
 @pytest.fixture(scope="session")
-def tiny(tmp_path_factory: pytest.TempPathFactory, demo_blend: Path) -> Path:
+def tiny(made_once: Callable[[str, Callable[[Path], object]], Path], demo_blend: Path) -> Path:
     """The demo scene through all stages at 64², one command after the other."""
-    folder = tmp_path_factory.mktemp("tiny")
-    harness.run("prepare", str(demo_blend), folder=folder)
-    for stage in harness.STAGES[1:]:
-        harness.run(stage, folder=folder)
-    return folder / "demo.dnr"
+
+    def build(folder: Path) -> None:
+        harness.run("prepare", str(demo_blend), folder=folder)
+        for stage in harness.STAGES[1:]:
+            harness.run(stage, folder=folder)
+
+    return made_once("tiny", build) / "demo.dnr"

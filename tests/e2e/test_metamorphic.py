@@ -1,7 +1,7 @@
 """What must not matter does not, through training: the same still life in other units, under other names, with its
 views in another order, and trained in half the bits, ends with the same held-out quality.
 
-What is the same before training is held by tests/test_robust_scenes.py, far more closely.
+What is the same before training is held by tests/test_robust_scenes.py, far more closely, and quickly.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ pytest.importorskip("bpy")
 
 import e2e_harness as harness
 
-pytestmark = [pytest.mark.slow, pytest.mark.e2e]
+pytestmark = [pytest.mark.slow, pytest.mark.e2e, pytest.mark.robustness]
 
 SMALL = {
     "DNRPIPE_CAMERAS__TRAIN": "6",

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from playwright.sync_api import Page
+from tests.plan_record import write_plan
 from tests.service.harness import Server, empty_workspace
 from tests.service.test_planned import prediction
 from websockets.sync.client import connect
@@ -235,10 +236,9 @@ def test_what_changes_while_a_job_runs_in_a_browser(server: Server, trained: str
     """The live picture comes and goes on by itself, with the reference beside it; seconds planned and spent."""
     workspace = server.root / "watched.dnr"
     shutil.copytree(server.root / f"{trained}.dnr", workspace, ignore=shutil.ignore_patterns("preview", ".lock*"))
-    (workspace / "plan").mkdir()
-    plan = {"made": time.time(), "chosen": None, "settings_default": prediction(2, 60)}
-    plan["settings_default"]["choice"]["spp"] = 8
-    (workspace / "plan" / "plan.json").write_text(json.dumps(plan))
+    settings_default = prediction(2, 60)
+    settings_default["choice"]["spp"] = 8
+    write_plan(workspace, made=time.time(), chosen=None, settings_default=settings_default)
     settings: dict[str, Any] = {"finetune.step2.epochs": 60, "finetune.preview_seconds": 0.5}
     epoch = "Number(document.querySelector('#live').dataset.epoch)"
     with server.client() as client, open_page(server.url, width=1280) as (page, errors):

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.plan_record import write_plan
 
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.ledger import CostRecord
@@ -30,9 +30,7 @@ def prediction(views: int, epochs: int) -> dict[str, Any]:
 
 def planned(root: Path, *, chosen: dict[str, Any] | None) -> Workspace:
     workspace = Workspace.create(root, Source(path="/none.blend", sha256="0"))
-    (root / "plan").mkdir()
-    record = {"made": MADE, "chosen": chosen, "settings_default": prediction(25, 40), "table": []}
-    (root / "plan" / "plan.json").write_text(json.dumps(record))
+    write_plan(root, made=MADE, chosen=chosen, settings_default=prediction(25, 40))
     return workspace
 
 

@@ -53,7 +53,7 @@ def image(path: Path) -> np.ndarray:
 
 
 def test_of_a_job(server: Server, trained: str) -> None:
-    """First and last epoch at least; beside it the reference that evaluation traced; nothing else is rendered again."""
+    """First and last epoch at least; beside it the reference that evaluation traced. Only a base image is rendered."""
     workspace = copy_of(server, trained, "shown")
     booked = len(Ledger(workspace / "costs.jsonl").read())
     with server.client() as client:
@@ -73,8 +73,8 @@ def test_of_a_job(server: Server, trained: str) -> None:
     np.testing.assert_array_equal(truth, image(workspace / "evaluation" / f"{found.view}.truth.png"))
     assert found.psnr == pytest.approx(-10 * np.log10(np.square(truth - prediction).mean()), abs=0.1)
     new = [r for r in Ledger(workspace / "costs.jsonl").read()[booked:] if r.unit == "view"]
-    assert {(r.name, r.stage, r.purpose) for r in new} == {(f"preview/{found.view}", "finetune", "evaluation")}
-    assert len(new) == len(told)
+    names = [f"base/test/{found.view}", *[f"preview/{found.view}"] * len(told)]
+    assert [(r.name, r.stage, r.purpose) for r in new] == [(name, "finetune", "evaluation") for name in names]
 
 
 def test_without_them_the_weights_are_the_same(server: Server, trained: str) -> None:
@@ -91,20 +91,21 @@ def test_without_them_the_weights_are_the_same(server: Server, trained: str) -> 
 
 
 def test_first_of_all(server: Server, trained: str) -> None:
-    """Without its base image that is rendered as evaluation's; without a reference there is no PSNR."""
+    """Nothing of evaluation's is made for it; without a reference there is no PSNR."""
     workspace = copy_of(server, trained, "early")
-    for part in ("base/test", "raytraced/test"):
+    for part in ("base/test", "raytraced/test", "preview"):
         shutil.rmtree(workspace / part)
     booked = len(Ledger(workspace / "costs.jsonl").read())
     told, _ = finetune(workspace)
     assert [(e["split"], e["psnr"], list(e["files"])) for e in told] == [("test", None, ["prediction"])] * len(told)
     assert told and not (workspace / "preview" / "truth.png").exists()
     new = [r for r in Ledger(workspace / "costs.jsonl").read()[booked:] if r.name.startswith("base/")]
-    assert [(r.name, r.stage, r.purpose) for r in new] == [(f"base/test/{told[0]['view']}", "evaluate", "evaluation")]
+    assert [(r.name, r.stage, r.purpose) for r in new] == [(f"base/test/{told[0]['view']}", "finetune", "evaluation")]
+    assert not (workspace / "base" / "test").exists()
 
 
 def test_a_damaged_reference_costs_the_view_not_the_training(server: Server, trained: str) -> None:
-    """It is evaluation's to mend; meanwhile a training view is shown, which is said."""
+    """It is evaluation's to repair; meanwhile a training view is shown, which is said."""
     workspace = copy_of(server, trained, "dented")
     (path,) = (workspace / "raytraced" / "test").glob("*.exr")
     data = bytearray(path.read_bytes())

@@ -175,25 +175,31 @@ def test_identical_views(scene: Scene, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_bfloat16_ends_where_float32_does(scene: Scene, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("seeds", "epochs", "least", "within"),
+    [(1, 15, 21, 0.5), pytest.param(3, 40, 22, 0.1, marks=pytest.mark.robustness)],
+)
+def test_bfloat16_ends_where_float32_does(
+    scene: Scene, tmp_path: Path, seeds: int, epochs: int, least: float, within: float
+) -> None:
     """Held-out PSNR within 0.1 dB once the learning rate has fallen far enough for a run to come to rest.
 
     Mean of three seeds: on so small a scene one run's rounding alone is worth 0.1 dB, either way, by processor.
     """
     target = scene.held_out.tensors.target
     assert target is not None
-    changes = {"epochs": 40, "ema": 0.97, "learning_rate_end": 1e-5, "augment": False}
+    changes = {"epochs": epochs, "ema": 0.97, "learning_rate_end": 1e-5, "augment": False}
     scores: dict[str, list[float]] = {"float32": [], "bfloat16": []}
     for precision, found in scores.items():
         settings = FRESH.model_copy(update={**changes, "precision": precision})
-        for seed in range(3):
+        for seed in range(seeds):
             folder = tmp_path / f"{precision}-{seed}"
             list(events_of(scene.traced, folder, settings, MODEL.model_copy(update={"width": 16}), seed))
             pictures = render_views(load_model(folder / "step2"), scene.held_out)
             found.append(float(psnr(pictures, target).mean()))
     print(scores)
-    assert min(map(min, scores.values())) > 22
-    assert abs(mean(scores["float32"]) - mean(scores["bfloat16"])) < 0.1
+    assert min(map(min, scores.values())) > least
+    assert abs(mean(scores["float32"]) - mean(scores["bfloat16"])) < within
 
 
 # -- damage ------------------------------------------------------------------------------------------------

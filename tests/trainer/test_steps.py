@@ -176,7 +176,18 @@ def _epoch(progress: Path) -> int:
 
 
 @pytest.mark.slow
-def test_killed_at_any_moment_it_resumes_bit_for_bit(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "moments",
+    [
+        [("step1", 1), ("step2", 3)],
+        pytest.param(
+            [("step1", 0), ("step1", 1), ("step1", 4), ("step2", 0), ("step2", 3), ("step2", 9)],
+            marks=pytest.mark.robustness,
+        ),
+    ],
+    ids=len,
+)
+def test_killed_at_any_moment_it_resumes_bit_for_bit(moments: list[tuple[str, int]], tmp_path: Path) -> None:
     """SIGKILL at random moments of both steps; weights and selection equal the undisturbed run's."""
     synthetic.write_scene(tmp_path / "scene", synthetic.dome(run_steps.VIEWS, run_steps.SIDE))
     script = str(Path(run_steps.__file__))
@@ -187,7 +198,7 @@ def test_killed_at_any_moment_it_resumes_bit_for_bit(tmp_path: Path) -> None:
     done = subprocess.run(command("whole"), capture_output=True, text=True, check=True)
     dice = random.Random(1)
     kills: set[tuple[str, int]] = set()
-    for step, epoch in [("step1", 0), ("step1", 1), ("step1", 4), ("step2", 0), ("step2", 3), ("step2", 9)]:
+    for step, epoch in moments:
         process = subprocess.Popen(command("killed"), stdout=subprocess.PIPE, text=True)
         progress = tmp_path / "killed" / step / "checkpoint.json"
         while process.poll() is None and _epoch(progress) < epoch:

@@ -1,9 +1,12 @@
 """Our frames against path tracing + Open Image Denoise at equal time, and how much both flicker: `make bench-frames`.
 
-reference  many samples per pixel, two halves, kept on disk
-motion     reprojection by known motion, flicker (numpy only)
-stability  an orbit of close frames
-document   JSON and Markdown
+bench_workspace  one workspace through the benchmark
+reference        many samples per pixel, two halves, kept on disk
+standing         one renderer against the baselines
+motion           reprojection by known motion, flicker (numpy only)
+stability        an orbit of close frames
+equal_time       what N frames cost, everything before the first one included
+document         JSON and Markdown
 
-The renderers themselves are in :mod:`dnrpipe.studies.frames`.
+The renderers themselves are in `dnrpipe.studies.frames`.
 """

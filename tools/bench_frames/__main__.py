@@ -43,7 +43,7 @@ def _one(options: argparse.Namespace) -> int:
     try:
         os.environ.update(choose_variant().environment)  # before anything imports Mitsuba
         set_thread_waiting(os.environ)  # as the command line does
-        from .run import Options, bench
+        from .bench_workspace import Options, bench
 
         (root,) = options.workspaces
         chosen = Options(

@@ -15,7 +15,7 @@ from typing import Any
 from dnrpipe.studies.frames.ours import BASE, NEURAL
 from dnrtrain.atomic import atomic_path, write_json
 
-from . import upfront
+from . import equal_time
 
 PACKAGES = ("mitsuba", "drjit", "mitsuba-oidn", "torch", "numpy")
 
@@ -73,7 +73,7 @@ def markdown(record: dict[str, Any]) -> str:
         "",
         *_overview(scenes),
     ]
-    counted = upfront.lines(scenes)
+    counted = equal_time.lines(scenes)
     if counted:
         lines += [
             "",

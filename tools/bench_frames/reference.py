@@ -2,7 +2,8 @@
 
 A half's noise is independent of the other's: rms((A - B) / 2) estimates the RMSE of the mean. Where that alone would
 cap what can be measured (caustics, light through openings), the halves are denoised with clean auxiliary images, each
-by itself; what is left of the noise is estimated in the same way. The denoiser's own bias stays, and favours the rival.
+by itself; what is left of the noise is estimated in the same way. The denoiser's own bias stays, and favours the
+baselines.
 """
 
 from __future__ import annotations
@@ -64,8 +65,8 @@ def make_references(
 
 def _halves(scene: BenchScene, view: View, split: str, spp: int, path: Path) -> list[np.ndarray]:
     """[A, B], float32 [H, W, 4]."""
-    stamp = digest([scene.fingerprint, view.model_dump(mode="json"), spp])
-    if (read_metadata(path) or {}).get("fingerprint") != stamp:
+    fingerprint = digest([scene.fingerprint, view.model_dump(mode="json"), spp])
+    if (read_metadata(path) or {}).get("fingerprint") != fingerprint:
         integrator, _ = scene.engine.integrator(scene.bundle, scene.integrator, scene.max_depth)
         sensor, seed = scene.engine.sensor(view), view_seed(7, split, view.name)
         channels = {}
@@ -74,7 +75,7 @@ def _halves(scene: BenchScene, view: View, split: str, spp: int, path: Path) -> 
             finite = np.isfinite(image).all(axis=-1, keepdims=True)
             channels |= {f"{half}.{c}": np.where(finite, image, 0)[..., i] for i, c in enumerate("RGBA")}
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_exr(path, channels, {"fingerprint": stamp, "spp": spp})
+        write_exr(path, channels, {"fingerprint": fingerprint, "spp": spp})
     channels, _ = read_exr(path)
     return [np.stack([channels[f"{half}.{c}"] for c in "RGBA"], axis=-1) for half in HALVES]
 

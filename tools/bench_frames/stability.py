@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from dnrpipe.core.cameras import orbit_views
+from dnrpipe.studies.frames.baselines import make_baselines, render_baselines
 from dnrpipe.studies.frames.ours import Ours
-from dnrpipe.studies.frames.rival import climb, make_rungs
 from dnrpipe.studies.frames.scene import BenchScene, Clock
 from dnrtrain.contract import View
 
@@ -24,7 +24,7 @@ def measure(
     scene: BenchScene,
     ours: Ours,
     clock: Clock,
-    rungs: list[tuple[int, str]],
+    baselines: list[tuple[int, str]],
     *,
     frames: int,
     spp: int,
@@ -32,8 +32,17 @@ def measure(
     folder: Path,
     tell: Any,
 ) -> dict[str, Any]:
-    """{"frames", "degrees", "reference": kind, "rows": {name: :func:`.motion.flicker`}} of ours, the base image and
-    the rival's ``rungs`` (samples, method), which draw new random numbers for every frame.
+    """Flicker of ours, of the base image and of baselines, which draw new random numbers for every frame.
+
+    Args:
+        scene, ours, clock: of the benchmark.
+        baselines: (samples, method) of each.
+        frames: of the orbit.
+        spp, kind: of the references.
+        folder: references are kept there.
+        tell: called with a line per frame.
+
+    Returns {"frames", "degrees", "reference", "reference_spp", "reference_noise", "rows": {name: `motion.flicker`}}.
     """
     views = _orbit(scene, frames)
     reference = make_references(scene, views, "orbit", spp, kind, folder, tell)
@@ -45,10 +54,10 @@ def measure(
         surfaces.append(surface_of(view, gbuffer))
         for name, frame in ours.frame(view, clock).items():
             found.setdefault(name, []).append(_plane(frame["picture"]))
-        for spp_, method in rungs:
-            rung = make_rungs((spp_,), (method,))
-            climb(scene, view, 1_000_003 * (number + 1), clock, rung)
-            (one,) = rung.values()
+        for spp_, method in baselines:
+            single = make_baselines((spp_,), (method,))
+            render_baselines(scene, view, 1_000_003 * (number + 1), clock, single)
+            (one,) = single.values()
             found.setdefault(one.name, []).append(_plane(one.pictures[0]))
         tell(f"{scene.name}: orbit frame {number + 1} of {frames}")
     rows = {name: flicker(pictures, truth, surfaces) for name, pictures in found.items()}

@@ -5,24 +5,26 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from dnrpipe.studies.frames.ladder import Point, crossover, frontier, quality_at
+from dnrpipe.studies.frames.pareto_front import Point, crossover, frontier, quality_at
 
 
 def standing(points: Mapping[str, Point], ours: Point) -> dict[str, Any]:
-    """Ours against the ladder.
+    """Ours against the baselines.
 
-    {"frontier": names, "rival_db": the rival at our time, "lead_db": ours minus that, "cheapest": whether that is the
-    rival's cheapest point, which takes longer than we do, "crossover_ms": None where the ladder ends below us,
-    "ladder_end_ms"}
+    Returns:
+        frontier: names of the baselines that nothing beats.
+        rival_db: their dB at our time. lead_db: ours minus that.
+        cheapest: whether that is their cheapest point, which takes longer than we do.
+        crossover_ms: when they draw level, None where they end below us. ladder_end_ms: of their last point.
     """
     names = frontier(points)
     line = [points[name] for name in names]
     found = quality_at(line, ours[0])
-    rival = line[0][1] if found is None else found
+    baseline = line[0][1] if found is None else found
     return {
         "frontier": names,
-        "rival_db": rival,
-        "lead_db": ours[1] - rival,
+        "rival_db": baseline,
+        "lead_db": ours[1] - baseline,
         "cheapest": found is None,
         "crossover_ms": crossover(line, ours[1]),
         "ladder_end_ms": line[-1][0],
@@ -30,7 +32,7 @@ def standing(points: Mapping[str, Point], ours: Point) -> dict[str, Any]:
 
 
 def classes(points: Mapping[str, Point], ours: Point, limits: Sequence[float]) -> list[dict[str, Any]]:
-    """Per class of at most so many ms: the rival's best point and ours; None where one has nothing so fast."""
+    """Per class of at most so many ms: the best baseline and ours; None where one has nothing so fast."""
     rows = []
     for limit in limits:
         within = {name: point for name, point in points.items() if point[0] <= limit}

@@ -149,7 +149,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "seconds": 1,
     }
     path.write_text("\n".join(json.dumps(line) for _ in range(3)) + "\n")
-    keep("ledger", path, lambda p: (Ledger(p).read(), Ledger(p).torn_lines()))
+    keep("ledger", path, lambda p: (Ledger(p).read(), Ledger(p).truncated_records()))
 
     from PIL import Image
 

@@ -17,7 +17,7 @@ from dnrpipe.core.scene_files import read_census, read_summary
 from dnrpipe.core.settings import CameraSettings, resolve
 from dnrpipe.core.workspace import Source, Workspace, file_sha256
 from dnrpipe.raytrace.variants import choose_variant
-from dnrpipe.stages import prepare
+from dnrpipe.stages.prepare import convert_scene
 from dnrpipe.stages.stage import Run
 from dnrpipe.workers.processes import Retry, TaskResult, run_tasks
 from dnrtrain.exr import read_exr
@@ -35,7 +35,7 @@ def convert(blend: Path, root: Path, *, quiet: bool = True) -> Workspace:
         shutil.rmtree(root)
     workspace = Workspace.create(root, Source(path=str(blend.resolve()), sha256=file_sha256(blend)))
     try:
-        prepare._convert(Run(workspace, resolve(None, {}), Console(quiet=quiet), id="fidelity"))
+        convert_scene(Run(workspace, resolve(None, {}), Console(quiet=quiet)))
     except Exception as error:
         raise FidelityError(f"{blend.stem}: {' '.join(str(error).split())}") from error
     return workspace

@@ -29,7 +29,7 @@ class Record(BaseModel):
         return self.model_dump(exclude_unset=True)
 
 
-R = TypeVar("R", bound=Record)
+Model = TypeVar("Model", bound=BaseModel)
 
 
 class Selection(Record):
@@ -128,7 +128,7 @@ def write(path: Path, record: Record) -> None:
     write_json(path, record.data())
 
 
-def read(path: Path, kind: type[R]) -> R:
+def read(path: Path, kind: type[Model]) -> Model:
     """Read a record. Raises FileNotFoundError: there is none; DamagedFile: it does not read, or not as its kind."""
     try:
         return kind.model_validate_json(path.read_bytes())

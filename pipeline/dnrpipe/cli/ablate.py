@@ -45,7 +45,7 @@ def ablate(as_json: bool, quiet: bool, out: Path, **options: Any) -> None:
       dnrpipe ablate --scenes my.blend --rows vanilla,dnr --out my-ablation
     """
     from ..core.console import Console
-    from ..studies.ablation.command import run_ablation
+    from ..studies.ablation.ablate import run_ablation
 
     console = Console(json_mode=as_json, quiet=quiet)
     results = run_ablation(out=out, console=console, **options)

@@ -47,7 +47,7 @@ def bench_select(as_json: bool, quiet: bool, out: Path, **options: Any) -> None:
       dnrpipe bench-select --scenes my.blend --pools dome --budgets full --policies all --out my-bench
     """
     from ..core.console import Console
-    from ..studies.selectbench.command import run_bench
+    from ..studies.selectbench.bench_select import run_bench
 
     console = Console(json_mode=as_json, quiet=quiet)
     results = run_bench(out=out, console=console, **options)

@@ -56,7 +56,7 @@ def frontier(
       dnrpipe frontier scene.blend --also none --ladder 1,4,16 --json
     """
     from ..core.errors import UserError
-    from ..studies.frontier.command import run_frontier
+    from ..studies.frontier.measure_frontier import run_frontier
 
     if options.pop("force"):
         raise UserError("--force: remove the workspace's folder frontier/ to measure everything anew")
@@ -67,7 +67,7 @@ def frontier(
     with open_session("frontier", options, scene=scene, overrides=overrides) as session:
         session.stages("prepare")
         results = run_frontier(
-            session,
+            session.run,
             budgets=budgets,
             spp=spp,
             iterations=iterations,
@@ -78,5 +78,5 @@ def frontier(
             jobs=jobs,
         )
         folder = session.workspace.root / "frontier"
-        session.console.say(f"{len(results['points'])} points: {folder / 'report.md'}, {folder / 'frontier-*.png'}")
-        session.console.result(results)
+        session.console.say(f"{len(results.points)} points: {folder / 'report.md'}, {folder / 'frontier-*.png'}")
+        session.console.result(results.data())

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from dataclasses import asdict
+from typing import TYPE_CHECKING
 
 import click
 
 from ..core.errors import UserError
+
+if TYPE_CHECKING:
+    from ..core.ledger import CostSum, CostSummary
 
 
 @click.command()
@@ -23,22 +27,20 @@ def status(workspace: str | None, as_json: bool) -> None:
     """
     from ..core.console import clock
     from ..core.workspace import Workspace, find_workspace
-    from ..stages import pipeline as stages
+    from ..stages.pipeline import status as status_of
     from ..stages.session import resolve_settings
 
     found = Workspace.open(find_workspace(workspace))
-    rows = stages.status(found, resolve_settings(found, {}, None))
+    rows = status_of(found, resolve_settings(found, {}, None))
     if as_json:
-        click.echo(json.dumps({"workspace": str(found.root), "stages": rows}, indent=2))
+        click.echo(json.dumps({"workspace": str(found.root), "stages": [asdict(row) for row in rows]}, indent=2))
         return
     click.echo(f"{found.root}  (from {found.manifest.source.path})")
     for row in rows:
-        took = clock(row["seconds"]) if row["seconds"] is not None else "-"
-        click.echo(
-            f"  {row['state']:8} {row['command']:18} {row['present']:>4}/{row['wanted']:<4} {took:>7}  {row['does']}"
-        )
-    due = next((row for row in rows if row["state"] != "done"), None)
-    click.echo(f"next: dnrpipe {due['command']}" if due else "next: dnrpipe render --orbit 60, or dnrpipe report")
+        took = clock(row.seconds) if row.seconds is not None else "-"
+        click.echo(f"  {row.state:8} {row.command:18} {row.present:>4}/{row.wanted:<4} {took:>7}  {row.does}")
+    due = next((row for row in rows if row.state != "done"), None)
+    click.echo(f"next: dnrpipe {due.command}" if due else "next: dnrpipe render --orbit 60, or dnrpipe report")
 
 
 @click.command()
@@ -56,38 +58,33 @@ def costs(workspace: str | None, as_json: bool) -> None:
     from ..core.workspace import Workspace, find_workspace
 
     found = Workspace.open(find_workspace(workspace))
-    prepared = found.manifest.stages.get("prepare")
-    chosen = found.manifest.stages.get("raytrace")
+    prepared, raytraced = found.manifest.prepared, found.manifest.raytraced
     summary = summarise(
         found.ledger.read(),
-        n_candidates=prepared.detail["views"]["train"] if prepared else None,
-        only={f"train/{name}" for name in chosen.detail["views"]} if chosen else None,
-        torn_lines=found.ledger.torn_lines(),
+        n_candidates=prepared.views["train"] if prepared else None,
+        only={f"train/{name}" for name in raytraced.views} if raytraced else None,
+        truncated_records=found.ledger.truncated_records(),
     )
-    click.echo(json.dumps(summary, indent=2) if as_json else _costs_table(summary))
+    click.echo(json.dumps(summary.model_dump(), indent=2) if as_json else _costs_table(summary))
 
 
-def _costs_table(summary: dict[str, Any]) -> str:
-    from ..core.console import clock
-
+def _costs_table(summary: CostSummary) -> str:
     lines = [f"{'stage':10} {'for':12} {'units':>6} {'wall':>8} {'cpu':>8}"]
-    for stage, purposes in summary["by_stage_and_purpose"].items():
-        for purpose, part in purposes.items():
-            lines.append(
-                f"{stage:10} {purpose:12} {part['records']:>6} {clock(part['wall_seconds']):>8}"
-                f" {clock(part['cpu_seconds']):>8}"
-            )
-    whole = summary["total"]
-    lines.append(
-        f"{'total':23} {whole['records']:>6} {clock(whole['wall_seconds']):>8} {clock(whole['cpu_seconds']):>8}"
-    )
-    tracing = summary["tracing_all"]
-    if tracing:
+    for stage, purposes in summary.by_stage_and_purpose.items():
+        lines += [f"{stage:10} {purpose:12} {_sum_columns(part)}" for purpose, part in purposes.items()]
+    lines.append(f"{'total':23} {_sum_columns(summary.total)}")
+    if tracing := summary.tracing_all:
         lines.append(
-            f"ray-traced {tracing['views']} of {tracing['candidates']} candidates in"
-            f" {tracing['actual_seconds']:.1f} s; all would have cost {tracing['all_seconds']:.1f} s"
+            f"ray-traced {tracing.views} of {tracing.candidates} candidates in {tracing.actual_seconds:.1f} s;"
+            f" all would have cost {tracing.all_seconds:.1f} s"
         )
     return "\n".join(lines)
+
+
+def _sum_columns(part: CostSum) -> str:
+    from ..core.console import clock
+
+    return f"{part.records:>6} {clock(part.wall_seconds):>8} {clock(part.cpu_seconds):>8}"
 
 
 @click.command()

@@ -49,12 +49,13 @@ def plan(
         raise UserError("--apply: what shall be carried out? give --time or --target-psnr")
     from ..core.units import parse_seconds
     from ..studies.planning.carry_out import apply
-    from ..studies.planning.command import Wanted, make_plan
+    from ..studies.planning.make_plan import make_plan
     from ..studies.planning.pilot import pilot_path
-    from ..studies.planning.words import actual_lines, lines
+    from ..studies.planning.plan_text import actual_lines, lines
+    from ..studies.planning.records import Wanted
     from ..workers.view_tasks import worker_count
 
-    wanted = Wanted(amount("--time", duration, parse_seconds), target_psnr, frames)
+    wanted = Wanted(seconds=amount("--time", duration, parse_seconds), psnr=target_psnr, frames=frames)
     if scene is not None and (scene / "manifest.json").exists():
         options["workspace"], scene = str(scene), None
     overrides = {**camera_overrides(options), **strict_override(strict)}
@@ -63,13 +64,13 @@ def plan(
         session.stages("prepare")
         if force:
             pilot_path(session.workspace).unlink(missing_ok=True)
-        record = make_plan(session.workspace, session.settings, session.console, wanted)
-        for line in lines(record, worker_count(0)):
+        made = make_plan(session.run, wanted)
+        for line in lines(made, worker_count(0)):
             session.console.say(line)
         if carry_out:
-            if record["chosen"] is None:
+            if made.chosen is None:
                 raise UserError(f"--apply: nothing is expected to reach {target_psnr:g} dB; see the routes above")
-            record = apply(session, record)
-            for line in actual_lines(record):
+            made = apply(session, made)
+            for line in actual_lines(made):
                 session.console.say(line)
-        session.console.result({"workspace": str(session.workspace.root), **record})
+        session.console.result({"workspace": str(session.workspace.root), **made.data()})

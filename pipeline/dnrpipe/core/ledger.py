@@ -1,11 +1,11 @@
 """The ledger: what every piece of work cost, one JSON line each (``costs.jsonl``).
 
-Work that makes training data or weights is booked as ``training``; ray-traced references of held-out
-views as ``evaluation`` (a user who only wants the renderer never pays for them); frames of the finished
-renderer as ``inference``.
+The ledger books work that makes training data or weights as ``training``. It books ray-traced references of held-out
+views as ``evaluation``: who only wants the renderer never pays for them. It books frames of the finished renderer as
+``inference``.
 
-Seconds are wall seconds of one unit of work. Units that ran side by side carry ``workers`` > 1: their wall
-share is ``seconds / workers`` (exact when the workers were busy throughout, an estimate otherwise).
+Seconds are wall seconds of one unit of work. Units that ran side by side have ``workers`` > 1: their share of the wall
+clock is ``seconds / workers``. That is exact where the workers were busy throughout, else an estimate.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from .errors import UserError
 StageName = Literal["prepare", "plan", "select", "raytrace", "finetune", "evaluate", "render"]
 Purpose = Literal["training", "evaluation", "inference"]
 Unit = Literal["scene", "view", "epoch"]
+UpfrontPart = Literal["conversion", "passes", "pilot", "selection", "tracing", "light", "base images", "training"]
 
 STAGE_ORDER: tuple[str, ...] = get_args(StageName)
 PURPOSE_ORDER: tuple[str, ...] = get_args(Purpose)
@@ -33,11 +34,20 @@ PURPOSE_ORDER: tuple[str, ...] = get_args(Purpose)
 class CostRecord(BaseModel):
     """One unit of work that cost time.
 
-    time: unix seconds when it ended. run: id of the command that did it. name: what it was, e.g.
-    ``train/0007`` or ``epoch 3``. seconds: wall. workers: how many such units ran side by side.
-    width, height: pixels. spp: samples per pixel. steps: optimiser steps. peak_mb: peak memory, MiB.
-    noise: estimated relative error of the ray-traced view. cache_hit: the result was found, not computed;
-    ``seconds`` is then what the look-up took. detail: anything JSON-able, without NaN.
+    Args:
+        time: unix seconds when it ended.
+        run: id of the command that did it.
+        name: what it was, e.g. ``train/0007`` or ``epoch 3``.
+        seconds: wall clock.
+        cpu_seconds: of the process.
+        workers: how many such units ran side by side.
+        width, height: pixels.
+        spp: samples per pixel.
+        steps: optimiser steps.
+        peak_mb: peak memory, MiB.
+        noise: estimated relative error of the ray-traced view.
+        cache_hit: the result was found, not computed; ``seconds`` is then what the look-up took.
+        detail: anything JSON-able, without NaN.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -79,15 +89,15 @@ class CostRecord(BaseModel):
 class Ledger:
     """An append-only file of cost records. Several processes may append at once.
 
-    It is the one file not written by temp + rename: a rename would lose a concurrent append. Each record
-    is a single ``write`` with O_APPEND and an fsync; a line torn by a crash costs that line only.
+    It is the one file that is not written by temp + rename: a rename would lose a concurrent append. Each record is a
+    single ``write`` with O_APPEND and an fsync: a crash truncates one record, no more.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
 
     def append(self, record: CostRecord) -> None:
-        """Append one record, durably. A torn last line is closed with a newline first.
+        """Append one record, durably. After a truncated record it starts a new line first.
 
         Raises:
             OSError: the file cannot be written (read-only, disk full).
@@ -109,15 +119,15 @@ class Ledger:
             os.close(descriptor)
 
     def read(self) -> list[CostRecord]:
-        """All whole records in file order; [] when there is no ledger yet. Torn lines are left out.
+        """All whole records in file order; [] when there is no ledger yet. Truncated records are left out.
 
         Raises:
             UserError: a whole line is not a cost record (foreign file, newer version).
         """
         return self._parse()[0]
 
-    def torn_lines(self) -> int:
-        """How many lines a crash cut short: work whose cost is not in the sums."""
+    def truncated_records(self) -> int:
+        """How many records a crash cut short: work whose cost is not in the sums."""
         return self._parse()[1]
 
     def _parse(self) -> tuple[list[CostRecord], int]:
@@ -126,14 +136,14 @@ class Ledger:
         except FileNotFoundError:
             return [], 0
         records: list[CostRecord] = []
-        torn = 0
+        truncated = 0
         for number, line in enumerate(data.split(b"\n"), start=1):
             if not line.strip():
                 continue
             try:
                 value = json.loads(line)
             except ValueError:  # JSONDecodeError, and UnicodeDecodeError of a block of zeros or noise
-                torn += 1
+                truncated += 1
                 continue
             try:
                 records.append(CostRecord.model_validate(value))
@@ -144,7 +154,7 @@ class Ledger:
                     f"{self.path}:{number}: not a cost record ({where}: {first['msg'].lower()}); "
                     "move the file away to start a new ledger"
                 ) from None
-        return records, torn
+        return records, truncated
 
 
 class CostSum(BaseModel):
@@ -190,11 +200,12 @@ def _group(records: Sequence[CostRecord], order: Sequence[str], key: Callable[[C
 
 
 def traced_views(records: Sequence[CostRecord], purpose: str, only: Collection[str] | None = None) -> list[CostRecord]:
-    """The last *computed* record of each ray-traced view (cache hits left out), in order of appearance.
+    """The last computed record of each ray-traced view, in order of appearance. Cache hits are left out.
 
-    A view that was traced twice (other spp, other settings) counts once, with what it costs now. Ray
-    tracing is what has samples per pixel, whichever stage asked for it. ``only``: names such as
-    ``train/0007`` to keep, e.g. those of the present selection.
+    A view that was traced twice (other spp, other settings) counts once, with what it costs now. Ray tracing is what
+    has samples per pixel, whichever stage asked for it.
+
+    only: names such as ``train/0007`` to keep, e.g. those of the present selection.
     """
     latest: dict[str, CostRecord] = {}
     for record in records:
@@ -226,28 +237,55 @@ def selection_cost(records: Sequence[CostRecord]) -> CostSum:
     return total(latest_epochs(records, "select"))
 
 
-def upfront_seconds(records: Sequence[CostRecord], only: Collection[str] | None = None) -> float:
-    """Wall seconds until the renderer exists: all training work once, at its latest cost.
+def upfront_work(
+    records: Iterable[CostRecord], only: Collection[str] | None = None
+) -> dict[UpfrontPart, list[CostRecord]]:
+    """What comes before the first neural frame, by kind: each unit of training work once, at its latest cost.
 
-    Conversion, passes, both training steps and tracing of the training views; repeated runs, evaluation
-    and views that are no longer chosen (``only``, see :func:`traced_views`) are left out.
+    Repeated runs, cache hits and evaluation are left out, and so are traced views and base images that are no longer
+    chosen (``only``, see `traced_views`). A caller that does not count a kind of work leaves its part out; `total` sums
+    a part by either clock.
     """
-    latest: dict[tuple[str, str, str], CostRecord] = {}
+    latest: dict[tuple[UpfrontPart, str, str], CostRecord] = {}
     for record in records:
         if record.purpose != "training" or record.cache_hit:
             continue
-        unwanted = only is not None and record.name.removeprefix("base/") not in only
-        if record.stage == "raytrace" and record.unit == "view" and unwanted:
+        part = _upfront_part(record)
+        traced = record.unit == "view" and part in ("tracing", "base images")
+        if only is not None and traced and record.name.removeprefix("base/") not in only:
             continue
-        latest[(record.stage, record.unit, record.name)] = _whole(record)
-    return total(latest.values()).wall_seconds
+        step = record.stage if record.unit == "epoch" else ""  # step 1 and step 2 count their epochs alike
+        latest[part, step, record.name] = _whole(record)
+    work: dict[UpfrontPart, list[CostRecord]] = {part: [] for part in get_args(UpfrontPart)}
+    for (part, _, _), record in latest.items():
+        work[part].append(record)
+    return work
+
+
+def _upfront_part(record: CostRecord) -> UpfrontPart:
+    if record.unit == "epoch":
+        return "training"
+    if record.unit == "scene" and record.name == "light":  # whichever stage baked it
+        return "light"
+    if record.stage == "prepare":
+        return "passes" if record.unit == "view" else "conversion"
+    if record.stage == "plan":
+        return "pilot"
+    if record.stage == "select":
+        return "selection"
+    return "base images" if record.name.startswith("base/") else "tracing"
+
+
+def upfront_seconds(records: Iterable[CostRecord], only: Collection[str] | None = None) -> float:
+    """Wall seconds of all `upfront_work`: how long it took until the renderer was there."""
+    return total(record for part in upfront_work(records, only).values() for record in part).wall_seconds
 
 
 class TracingComparison(BaseModel):
-    """Ray-tracing the chosen views against ray-tracing every candidate; wall seconds.
+    """Ray-tracing the chosen views against ray-tracing every candidate, in wall seconds.
 
-    ``saved_seconds`` is gross; ``net_saved_seconds`` takes off what choosing the views cost (stage
-    ``select``) and is negative where choosing cost more than it saved.
+    ``saved_seconds`` is gross. ``net_saved_seconds`` takes off what choosing the views cost (stage ``select``); it is
+    negative where choosing cost more than it saved.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -267,9 +305,8 @@ def tracing_all_would_cost(
 ) -> TracingComparison | None:
     """Mean seconds per ray-traced training view × candidates, against what was spent on the chosen ones.
 
-    Assumes that the candidates not traced cost what the traced ones cost on average. ``only``: see
-    :func:`traced_views`. None while no training view was traced.
-    Raises ValueError when ``n_candidates`` is negative.
+    It assumes that the other candidates would cost what the traced ones cost on average. None while no training view
+    was traced. only: see `traced_views`. Raises ValueError when ``n_candidates`` is negative.
     """
     if n_candidates < 0:
         raise ValueError(f"n_candidates must not be negative, is {n_candidates}")
@@ -301,55 +338,91 @@ def break_even_frames(upfront_seconds: float, traced_frame: float, neural_frame:
     return math.ceil(upfront_seconds / gain) if gain > 0 else None
 
 
+class RaytracedSum(BaseModel):
+    """The ray-traced views of one purpose.
+
+    Args:
+        views: how many.
+        spp: all numbers of samples per pixel that they have.
+        seconds_per_view: mean, on one worker.
+        slowest_view_seconds: on one worker.
+        wall_seconds: of all of them.
+        noise: mean estimated relative error; None where it is unknown.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    views: int
+    spp: list[int]
+    seconds_per_view: float
+    slowest_view_seconds: float
+    wall_seconds: float
+    noise: float | None
+
+
+class CostSummary(BaseModel):
+    """What ``dnrpipe costs`` and the report print. Every run is in the sums, repeated work too.
+
+    Args:
+        total, by_stage, by_purpose, by_stage_and_purpose: sums; stages and purposes without records are absent.
+        raytraced: by purpose.
+        tracing_all: None without ray-traced training views, or where the candidates are not known.
+        runs: how many commands have booked something.
+        devices: all that they ran on.
+        torn_lines: truncated records, whose seconds are not counted.
+    """
+
+    model_config = ConfigDict(extra="forbid")
+
+    total: CostSum
+    by_stage: dict[str, CostSum]
+    by_purpose: dict[str, CostSum]
+    by_stage_and_purpose: dict[str, dict[str, CostSum]]
+    raytraced: dict[str, RaytracedSum]
+    tracing_all: TracingComparison | None
+    runs: int
+    devices: list[str]
+    torn_lines: int
+
+
 def summarise(
     records: Sequence[CostRecord],
     *,
     n_candidates: int | None = None,
     only: Collection[str] | None = None,
-    torn_lines: int = 0,
-) -> dict[str, Any]:
-    """Everything ``dnrpipe costs`` and the report print, as JSON-able values.
+    truncated_records: int = 0,
+) -> CostSummary:
+    """Sum up a ledger.
 
     Args:
+        records: of the ledger.
         n_candidates: number of candidate views; without it ``tracing_all`` is None.
         only: names of the training views that count as chosen (``train/0007``); None = all in the ledger.
-        torn_lines: see :meth:`Ledger.torn_lines`.
-
-    Keys: total, by_stage, by_purpose, by_stage_and_purpose (see :class:`CostSum`; every run is in them,
-    repeated work too); raytraced (per purpose: views, spp, mean and largest seconds per view on one
-    worker, wall seconds, mean estimated noise); tracing_all (see :class:`TracingComparison`); runs,
-    devices, torn_lines.
+        truncated_records: of the ledger.
     """
-    raytraced: dict[str, dict[str, Any]] = {}
-    for purpose in PURPOSE_ORDER:
-        views = traced_views(records, purpose, only if purpose == "training" else None)
-        if not views:
-            continue
-        noises = [r.noise for r in views if r.noise is not None]
-        raytraced[purpose] = {
-            "views": len(views),
-            "spp": sorted({r.spp for r in views if r.spp is not None}),
-            "seconds_per_view": math.fsum(r.seconds for r in views) / len(views),
-            "slowest_view_seconds": max(r.seconds for r in views),
-            "wall_seconds": math.fsum(r.wall_seconds for r in views),
-            "noise": math.fsum(noises) / len(noises) if noises else None,
-        }
-    comparison = None if n_candidates is None else tracing_all_would_cost(records, n_candidates, only)
     stages = by_stage(records)
-    return {
-        "total": total(records).model_dump(),
-        "by_stage": {name: value.model_dump() for name, value in stages.items()},
-        "by_purpose": {name: value.model_dump() for name, value in by_purpose(records).items()},
-        "by_stage_and_purpose": {
-            name: {
-                purpose: value.model_dump()
-                for purpose, value in by_purpose([r for r in records if r.stage == name]).items()
-            }
-            for name in stages
-        },
-        "raytraced": raytraced,
-        "tracing_all": comparison.model_dump() if comparison else None,
-        "runs": len({r.run for r in records}),
-        "devices": sorted({r.device for r in records}),
-        "torn_lines": torn_lines,
-    }
+    chosen = {purpose: only if purpose == "training" else None for purpose in PURPOSE_ORDER}
+    traced = {purpose: traced_views(records, purpose, names) for purpose, names in chosen.items()}
+    return CostSummary(
+        total=total(records),
+        by_stage=stages,
+        by_purpose=by_purpose(records),
+        by_stage_and_purpose={name: by_purpose([r for r in records if r.stage == name]) for name in stages},
+        raytraced={purpose: _raytraced(views) for purpose, views in traced.items() if views},
+        tracing_all=None if n_candidates is None else tracing_all_would_cost(records, n_candidates, only),
+        runs=len({r.run for r in records}),
+        devices=sorted({r.device for r in records}),
+        torn_lines=truncated_records,
+    )
+
+
+def _raytraced(views: Sequence[CostRecord]) -> RaytracedSum:
+    noises = [r.noise for r in views if r.noise is not None]
+    return RaytracedSum(
+        views=len(views),
+        spp=sorted({r.spp for r in views if r.spp is not None}),
+        seconds_per_view=math.fsum(r.seconds for r in views) / len(views),
+        slowest_view_seconds=max(r.seconds for r in views),
+        wall_seconds=math.fsum(r.wall_seconds for r in views),
+        noise=math.fsum(noises) / len(noises) if noises else None,
+    )

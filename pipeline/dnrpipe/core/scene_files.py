@@ -7,10 +7,10 @@ import json
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 from dnrtrain.contract import SPLITS, DamagedFile, SceneFrame, View, read_cameras
-from dnrtrain.records import Selection, first_error, read
+from dnrtrain.records import Selection, read
 
 from .errors import UserError
 from .scene_records import Census, Prepared, RasterChoice, SceneSummary
@@ -26,18 +26,21 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise UserError(f"{path}: is missing; run `dnrpipe prepare --force`") from None
+        raise _missing(path) from None
     except (ValueError, RecursionError) as error:
         raise DamagedFile(path, str(error)) from None
 
 
+def _missing(path: Path) -> UserError:
+    return UserError(f"{path}: is missing; run `dnrpipe prepare --force`")
+
+
 def read_record(path: Path, kind: type[Model]) -> Model:
     """JSON that an earlier stage wrote, as a record. Raises UserError, DamagedFile as `read_json`."""
-    value = read_json(path)
     try:
-        return kind.model_validate(value)
-    except ValidationError as error:
-        raise DamagedFile(path, first_error(error)) from None
+        return read(path, kind)
+    except FileNotFoundError:
+        raise _missing(path) from None
 
 
 def read_summary(scene: Path) -> SceneSummary:

@@ -41,8 +41,12 @@ LOCK_FILES = (".lock", ".lock-owner")
 class StageRecord(BaseModel):
     """What a finished stage leaves in the manifest.
 
-    fingerprint: hash of what the stage computed from. output: hash of what it made, as far as later
-    stages can see it. seconds: wall time of the run that finished it.
+    Args:
+        fingerprint: hash of what the stage computed from.
+        output: hash of what it made, as far as later stages can see it.
+        finished: unix seconds.
+        seconds: wall time of the run that finished it.
+        detail: what ``--json`` tells of it. `Manifest` reads back what other stages need.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -52,6 +56,37 @@ class StageRecord(BaseModel):
     finished: float
     seconds: float
     detail: dict[str, Any] = Field(default_factory=dict)
+
+    @property
+    def perceptual(self) -> bool | None:
+        """Whether it had perceptual weights; None where it needs none."""
+        return self.detail.get("perceptual")
+
+
+class Prepared(BaseModel):
+    """What stage `prepare` did.
+
+    Args:
+        raster_engine, raster_reason: what draws rasterised colour, and why.
+        views: how many, by split.
+        triangles: of the scene.
+    """
+
+    model_config = ConfigDict(extra="ignore", strict=True)
+
+    raster_engine: str = ""
+    raster_reason: str = ""
+    views: dict[str, int]
+    triangles: int = 0
+
+
+class Raytraced(BaseModel):
+    """What stage `raytrace` did. views: their names. spp: samples per pixel, of each view where they have their own."""
+
+    model_config = ConfigDict(extra="ignore", strict=True)
+
+    views: list[str]
+    spp: int | list[int | None] | None = None
 
 
 class Source(BaseModel):
@@ -64,7 +99,7 @@ class Source(BaseModel):
 
 
 class Manifest(BaseModel):
-    """``manifest.json``. ``overrides`` are the flags given so far; ``settings`` the last resolved copy."""
+    """``manifest.json``. overrides: the flags given so far. settings: the last resolved copy."""
 
     model_config = ConfigDict(extra="forbid", populate_by_name=True)
 
@@ -78,24 +113,34 @@ class Manifest(BaseModel):
 
     @field_validator("stages")
     @classmethod
-    def _counted(cls, stages: dict[str, StageRecord]) -> dict[str, StageRecord]:
+    def _readable(cls, stages: dict[str, StageRecord]) -> dict[str, StageRecord]:
         """What other commands read of a record is there."""
-        if "prepare" in stages:
-            views = stages["prepare"].detail.get("views")
-            counted = isinstance(views, dict) and "train" in views and all(type(n) is int for n in views.values())
-            if not counted:
+        for name, kind in (("prepare", Prepared), ("raytrace", Raytraced)):
+            try:
+                found = kind.model_validate(stages[name].detail) if name in stages else None
+            except ValidationError as error:
+                raise ValueError(f"stage {name}: {error.errors()[0]['msg']}") from None
+            if isinstance(found, Prepared) and "train" not in found.views:
                 raise ValueError("stage prepare does not say how many views it has")
-        if "raytrace" in stages and not isinstance(stages["raytrace"].detail.get("views"), list):
-            raise ValueError("stage raytrace does not say which views it has")
         return stages
+
+    @property
+    def prepared(self) -> Prepared | None:
+        """What stage `prepare` did; None before it has."""
+        return Prepared.model_validate(self.stages["prepare"].detail) if "prepare" in self.stages else None
+
+    @property
+    def raytraced(self) -> Raytraced | None:
+        """What stage `raytrace` did; None before it has."""
+        return Raytraced.model_validate(self.stages["raytrace"].detail) if "raytrace" in self.stages else None
 
 
 class DamagedManifest(UserError):
-    """``manifest.json`` is torn or foreign; preparing the scene again makes a new one."""
+    """``manifest.json`` is truncated or foreign; preparing the scene again makes a new one."""
 
 
 class Workspace:
-    """Paths and the manifest of one workspace. Open with :meth:`open`, make with :meth:`create`."""
+    """Paths and the manifest of one workspace. Open with `open`, make with `create`."""
 
     def __init__(self, root: Path, manifest: Manifest) -> None:
         self.root = root

@@ -22,11 +22,13 @@ import numpy as np
 
 from dnrtrain.atomic import atomic_path, write_json, write_text
 from dnrtrain.contract import View
+from dnrtrain.records import read
 
 from .. import __version__
 from ..core.console import Console
-from ..core.scene_files import read_frame, read_json, read_selection
+from ..core.scene_files import read_frame, read_selection
 from ..core.workspace import Workspace
+from ..stages.records import METRICS, Metrics
 from ..stages.session import resolve_settings
 from .browser import require_chromium
 from .folder import claim, finish
@@ -118,12 +120,12 @@ def held_out(workspace: Workspace, model: DNR, views: Sequence[View], maps: Surf
     with torch.no_grad():
         shown = render_views(model, data)
         base = compose(tensors.display(tensors.base), tensors.coverage)
-    own = workspace.evaluation / "metrics.json"
+    own = workspace.evaluation / METRICS
     return {
         "test_views": len(views),
         "psnr": float(psnr(shown, tensors.target).mean()),
         "psnr_base": float(psnr(base, tensors.target).mean()),
-        "psnr_workspace": read_json(own)["mean"]["psnr"] if own.is_file() else None,
+        "psnr_workspace": read(own, Metrics).mean["psnr"] if own.is_file() else None,
     }
 
 

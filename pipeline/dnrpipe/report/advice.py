@@ -9,6 +9,7 @@ from typing import Any
 
 from dnrtrain.contract import View
 
+from ..core.ledger import CostSummary
 from ..core.units import duration, several
 from .data import Missing, Quality, Selection, Training
 from .quality import perceptual_note
@@ -39,7 +40,7 @@ def notes(
     quality: Quality | None,
     selection: Selection | None,
     training: Sequence[Training],
-    summary: dict[str, Any],
+    summary: CostSummary,
     manifest: dict[str, Any],
     upfront: float | None,
     break_even: int | None,
@@ -67,12 +68,12 @@ def notes(
             + " Raise raytrace.evaluation_spp, or set raytrace.evaluation_noise, before reading more into small "
             "differences."
         )
-    tracing = summary.get("tracing_all")
-    if tracing and tracing["net_saved_seconds"] < 0:
+    tracing = summary.tracing_all
+    if tracing and tracing.net_saved_seconds < 0:
         trained = selection is None or selection.trained
         found.append(
-            f"{'Step 1' if trained else 'Choosing'} took {duration(tracing['selection_seconds'])}, more than the "
-            f"{duration(tracing['saved_seconds'])} of ray tracing that it saved: at this resolution and sample "
+            f"{'Step 1' if trained else 'Choosing'} took {duration(tracing.selection_seconds)}, more than the "
+            f"{duration(tracing.saved_seconds)} of ray tracing that it saved: at this resolution and sample "
             "count, tracing every candidate costs less than choosing."
             + (" (Step 1 also pre-trains the renderer.)" if trained else "")
         )
@@ -84,6 +85,6 @@ def notes(
         found.append(f"{steps} skipped because a gradient was not finite.")
     if selection and 0 < selection.traced < len(selection.views):
         found.append(f"Only {selection.traced} of the {len(selection.views)} chosen views are ray-traced so far.")
-    if summary["torn_lines"]:
-        found.append(f"{summary['torn_lines']} ledger lines were cut short by a crash; their seconds are not counted.")
+    if summary.torn_lines:
+        found.append(f"{summary.torn_lines} ledger lines were cut short by a crash; their seconds are not counted.")
     return found

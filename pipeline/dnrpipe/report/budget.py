@@ -6,13 +6,14 @@ Reads `plan/plan.json` (`dnrpipe plan`) and `frontier/results.json` (`dnrpipe fr
 from __future__ import annotations
 
 import base64
-import json
 import re
 from pathlib import Path
-from typing import Any
 
+from ..core.errors import UserError
 from ..core.units import duration
-from ..studies.frames.ladder import quality_at
+from ..studies.frames.pareto_front import quality_at
+from ..studies.planning.plan_text import route_lines, why
+from ..studies.planning.records import RENDERER_STAGES, Plan, read_plan
 from .data import Budget, FrontierSummary, PlannedRow, Quality
 
 NEXT = 60.0
@@ -21,7 +22,10 @@ NEXT = 60.0
 
 def build_budget(root: Path, quality: Quality | None, upfront: float | None) -> Budget | None:
     """The part's sentences; None while nothing was spent and nothing is planned."""
-    plan = _read(root / "plan" / "plan.json")
+    try:
+        plan = read_plan(root)
+    except UserError:  # damaged, which its own command reports
+        plan = None
     frontier = _frontier_summary(root)
     if upfront is None and plan is None and frontier is None:
         return None
@@ -30,43 +34,42 @@ def build_budget(root: Path, quality: Quality | None, upfront: float | None) -> 
         cost=_cost(upfront, plan),
         bought=_bought(psnr, plan, quality),
         following=_following(plan),
-        rows=_rows(plan),
-        why=_why(plan),
-        routes=_routes(plan),
+        rows=_rows(plan) if plan else [],
+        why=why(plan) if plan else [],
+        routes=[re.sub(r" {2,}", " · ", line.strip()) for line in route_lines(plan)] if plan else [],  # no columns here
         frontier=frontier,
     )
 
 
-def _cost(upfront: float | None, plan: dict[str, Any] | None) -> str:
+def _cost(upfront: float | None, plan: Plan | None) -> str:
     if upfront is None:
         return "Nothing was spent yet."
     text = f"{duration(upfront)} until the renderer was there"
-    if plan and plan.get("actual"):
-        predicted = plan["chosen"]["seconds"]["total"]["expected"]
-        actual = plan["actual"]["seconds"]["total"]
+    if plan and plan.chosen and plan.actual:
+        predicted, actual = plan.chosen.seconds.total.expected, plan.actual.seconds["total"]
         text += f". The planned part took {duration(actual)}; {duration(predicted)} were predicted"
     return text + "."
 
 
-def _bought(psnr: float | None, plan: dict[str, Any] | None, quality: Quality | None) -> str:
+def _bought(psnr: float | None, plan: Plan | None, quality: Quality | None) -> str:
     if psnr is None:
         return "Not measured yet; `dnrpipe evaluate` measures it."
     text = f"{psnr:.1f} dB on views that it never saw"
-    if plan and plan.get("actual") and plan["actual"]["psnr"] is not None:
-        text += f" ({plan['chosen']['psnr']['expected']:.1f} dB were predicted)"
+    if plan and plan.chosen and plan.actual and plan.actual.psnr is not None:
+        text += f" ({plan.chosen.psnr.expected:.1f} dB were predicted)"
     if plan:
-        text += f"; its base image alone, which needs no training, has about {plan['base_psnr']:.1f} dB"
+        text += f"; its base image alone, which needs no training, has about {plan.base_psnr:.1f} dB"
     if quality and quality.frame_seconds and quality.traced_seconds:
         text += f". A frame takes {duration(quality.frame_seconds)} instead of {duration(quality.traced_seconds)}"
     return text + "."
 
 
-def _following(plan: dict[str, Any] | None) -> str:
+def _following(plan: Plan | None) -> str:
     if plan is None:
         return "Unknown; `dnrpipe plan` predicts it."
-    line = [(row["seconds"]["total"]["expected"], row["psnr"]["expected"]) for row in plan["table"]]
-    chosen = plan["chosen"] or plan["settings_default"]
-    now = max(chosen["seconds"]["total"]["expected"], line[0][0])  # the plan knows nothing below its smallest choice
+    line = [(row.seconds.total.expected, row.psnr.expected) for row in plan.table]
+    chosen = plan.chosen or plan.settings_default
+    now = max(chosen.seconds.total.expected, line[0][0])  # the plan knows nothing below its smallest choice
     here, later = quality_at(line, now), quality_at(line, now + NEXT)
     assert here is not None and later is not None  # both lie on the line
     gain = later - here
@@ -77,76 +80,53 @@ def _following(plan: dict[str, Any] | None) -> str:
     )
 
 
-def _rows(plan: dict[str, Any] | None) -> list[PlannedRow]:
-    if plan is None or not plan.get("actual"):
+def _rows(plan: Plan) -> list[PlannedRow]:
+    chosen, actual = plan.chosen, plan.actual
+    if chosen is None or actual is None:
         return []
-    chosen, actual = plan["chosen"], plan["actual"]
     rows = [
         PlannedRow(
             what=name,
-            predicted=duration(chosen["seconds"][name]),
-            actual=duration(actual["seconds"][name]) if actual["ran"][name] else "was done before",
+            predicted=duration(getattr(chosen.seconds, name)),
+            actual=duration(actual.seconds[name]) if actual.ran[name] else "was done before",
         )
-        for name in ("select", "raytrace", "finetune")
+        for name in RENDERER_STAGES
     ]
-    total, psnr = chosen["seconds"]["total"], chosen["psnr"]
+    total, psnr = chosen.seconds.total, chosen.psnr
     rows.append(
         PlannedRow(
             what="all three",
-            predicted=f"{duration(total['expected'])} ({duration(total['low'])} to {duration(total['high'])})",
-            actual=duration(actual["seconds"]["total"]),
+            predicted=f"{duration(total.expected)} ({duration(total.low)} to {duration(total.high)})",
+            actual=duration(actual.seconds["total"]),
         )
     )
-    if carried_out := plan.get("carried_out"):
-        steps = [str(one["choice"]["steps"]) for one in (chosen, carried_out)]
+    if plan.carried_out is not None:
+        steps = [str(one.choice.steps) for one in (chosen, plan.carried_out)]
         rows.append(PlannedRow(what="steps, by the time left", predicted=steps[0], actual=steps[1]))
-    if actual["psnr"] is not None:
+    if actual.psnr is not None:
         rows.append(
             PlannedRow(
                 what="PSNR, held-out",
-                predicted=f"{psnr['expected']:.1f} dB ({psnr['low']:.1f} to {psnr['high']:.1f})",
-                actual=f"{actual['psnr']:.1f} dB",
+                predicted=f"{psnr.expected:.1f} dB ({psnr.low:.1f} to {psnr.high:.1f})",
+                actual=f"{actual.psnr:.1f} dB",
             )
         )
     return rows
 
 
-def _why(plan: dict[str, Any] | None) -> list[str]:
-    if plan is None or plan["chosen"] is None:
-        return []
-    from ..studies.planning.words import why
-
-    return why(plan)
-
-
-def _routes(plan: dict[str, Any] | None) -> list[str]:
-    if plan is None or "routes" not in plan:
-        return []
-    from ..studies.planning.words import route_lines
-
-    return [re.sub(r" {2,}", " · ", line.strip()) for line in route_lines(plan)]  # columns are the terminal's
-
-
 def _frontier_summary(root: Path) -> FrontierSummary | None:
-    from ..studies.frontier.command import SCHEMA
-    from ..studies.frontier.words import verdict
+    """What `dnrpipe frontier` measured; None where it is missing or damaged, which that command reports."""
+    from ..studies.frontier.frontier_report import verdict
+    from ..studies.frontier.records import read_frontier
 
-    results = _read(root / "frontier" / "results.json")
-    if results is None or results.get("schema") != SCHEMA:
+    try:
+        results = read_frontier(root / "frontier" / "results.json")
+    except UserError:
         return None
     pictures = []
-    for frames in results["frames"]:
+    for frames in results.frames:
         path = root / "frontier" / f"frontier-{frames}.png"
         if path.exists():
             uri = "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
             pictures.append((verdict(results, frames), uri))
     return FrontierSummary(pictures=pictures)
-
-
-def _read(path: Path) -> dict[str, Any] | None:
-    """A file of an optional part; None if it is missing or damaged, which its own command reports."""
-    try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
-    return value if isinstance(value, dict) else None

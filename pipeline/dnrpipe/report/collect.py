@@ -10,22 +10,23 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 from dnrtrain.contract import ContractError, DamagedFile, SceneFrame, View, read_cameras
-from dnrtrain.records import ModelRecord
+from dnrtrain.records import ModelRecord, read
 from dnrtrain.records import Selection as SelectionRecord
 
 from ..core.errors import UserError
-from ..core.ledger import CostRecord, Ledger, break_even_frames, summarise, traced_views, upfront_seconds
+from ..core.ledger import CostRecord, CostSummary, Ledger, break_even_frames, summarise, traced_views, upfront_seconds
 from ..core.scene_files import read_census, read_summary
 from ..core.scene_records import FindingKind
+from ..stages.records import METRICS, Metrics
 from .advice import missing, notes
 from .budget import build_budget
 from .coverage import coverage_maps
 from .data import ChosenView, FindingGroup, ReportData, Selection, Sphere, SphereView, Training
 from .pictures import ExrPictures
-from .quality import Metrics, build_quality
+from .quality import build_quality
 from .words import verdict
 
 KINDS: dict[FindingKind, tuple[str, bool]] = {
@@ -48,19 +49,19 @@ R = TypeVar("R")
 class Outline(BaseModel):
     """A workspace's figures without pictures: quick enough to read while a stage runs.
 
-    psnr: dB by test view, in the order of the evaluation. costs: see `core.ledger.summarise`.
+    psnr: dB by test view, in the order of the evaluation.
     """
 
     sphere: Sphere | None
     training: list[Training]
     psnr: dict[str, float | None]
-    costs: dict[str, Any]
+    costs: CostSummary
 
 
 def outline(root: Path) -> Outline:
     """Read a workspace's figures. Raises UserError: a file is damaged."""
     views = {split: _read_views(root, split) for split in ("train", "test")}
-    metrics = _read_model(root / "evaluation" / "metrics.json", Metrics, "evaluate")
+    metrics = _read_model(root / "evaluation" / METRICS, Metrics, "evaluate")
     chosen = _read_model(root / "selection.json", SelectionRecord, "select")
     selected = {f"train/{name}" for name in chosen.views} if chosen else None
     return Outline(
@@ -82,13 +83,18 @@ def collect(root: Path, *, made_at: datetime | None = None) -> ReportData:
     if manifest is None:
         raise UserError(f"{root}: not a dnrpipe workspace; make one with `dnrpipe prepare SCENE`")
     cameras = {split: _read_views(root, split) for split in ("train", "val", "test")}
-    metrics = _read_model(root / "evaluation" / "metrics.json", Metrics, "evaluate")
+    metrics = _read_model(root / "evaluation" / METRICS, Metrics, "evaluate")
     chosen = _read_model(root / "selection.json", SelectionRecord, "select")
     ledger = Ledger(root / "costs.jsonl")
-    records, torn = ledger.read(), ledger.torn_lines()
+    records = ledger.read()
 
     selected = {f"train/{name}" for name in chosen.views} if chosen else None
-    summary = summarise(records, n_candidates=len(cameras["train"]) or None, only=selected, torn_lines=torn)
+    summary = summarise(
+        records,
+        n_candidates=len(cameras["train"]) or None,
+        only=selected,
+        truncated_records=ledger.truncated_records(),
+    )
     quality = build_quality(root, metrics, records) if metrics else None
     selection = _selection(root, chosen, records, cameras["train"]) if chosen else None
     training = [t for t in (_training(root, step) for step in (1, 2)) if t]
@@ -138,15 +144,13 @@ def _read_json(path: Path, command: str) -> dict[str, Any] | None:
 
 
 def _read_model(path: Path, model: type[Model], command: str) -> Model | None:
-    value = _read_json(path, command)
-    if value is None:
-        return None
+    """A record; None where there is none. Raises UserError that names the command that makes it again."""
     try:
-        return model.model_validate(value)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise UserError(f"{path}: {where}: {first['msg'].lower()}; run `dnrpipe {command}` again") from None
+        return read(path, model)
+    except FileNotFoundError:
+        return None
+    except DamagedFile as damage:
+        raise UserError(f"{path}: damaged ({damage.reason}); run `dnrpipe {command}` again") from None
 
 
 def _of_scene(root: Path, name: str, reader: Callable[[Path], R]) -> R | None:

@@ -10,6 +10,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from ..core.ledger import CostSummary
+
 
 class _Frozen(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -238,7 +240,7 @@ class ReportData(BaseModel):
     selection: Selection | None
     sphere: Sphere | None
     training: list[Training]
-    costs: dict[str, Any] | None
+    costs: CostSummary | None
     budget: Budget | None = None
     break_even: int | None
     upfront_seconds: float | None

@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
-
 from ..core.ledger import CostRecord, traced_views
+from ..stages.records import Metrics, ViewMetrics
 from .data import MetricRow, Quality, TestView
 from .pictures import FEATURED_SIDE, THUMBNAIL_SIDE, load_png
 
@@ -24,38 +23,6 @@ METRICS: tuple[tuple[str, str, str, int, bool], ...] = (
     ("lpips_vgg", "LPIPS (VGG)", "", 4, False),
     ("flip", "FLIP", "", 4, False),
 )
-
-
-class ViewMetrics(BaseModel):
-    """One view of ``metrics.json``; null where a metric could not be computed."""
-
-    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
-
-    name: str = Field(pattern=r"^[A-Za-z0-9_.-]+$")
-    psnr: float | None = None
-    ssim: float | None = None
-    lpips_alex: float | None = None
-    lpips_vgg: float | None = None
-    flip: float | None = None
-    psnr_mask: float | None = None
-    ssim_mask: float | None = None
-    ceiling_psnr: float | None = None
-    seconds_traced: float | None = None
-    seconds_neural: float | None = None
-    seconds_base: float | None = None
-    spp: int | None = None
-
-
-class Metrics(BaseModel):
-    """``evaluation/metrics.json``. The stored means are not used: the report computes its own."""
-
-    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
-
-    views: list[ViewMetrics] = Field(min_length=1)
-    perceptual: bool = True
-    trained_with_perceptual: bool | None = None
-    device: str = "cpu"
-    neural_ms: float | None = None
 
 
 def build_quality(root: Path, metrics: Metrics, records: Sequence[CostRecord]) -> Quality:
@@ -121,7 +88,7 @@ def _view(root: Path, view: ViewMetrics, side: int) -> TestView:
         share = min(1.0, 10.0 ** ((view.psnr - view.ceiling_psnr) / 10.0))
     stem = f"evaluation/{view.name}"
     return TestView(
-        **view.model_dump(),
+        **view.model_dump(exclude={"reference_noise", "reference_noise_error"}),
         noise_share=share,
         truth=load_png(root, f"{stem}.truth.png", side=side),
         prediction=load_png(root, f"{stem}.prediction.png", side=side),

@@ -125,12 +125,12 @@ def _stage_chart(data: ReportData) -> Markup:
     if not data.costs:
         return Markup("")
     bars = []
-    for stage, purposes in data.costs["by_stage_and_purpose"].items():
+    for stage, purposes in data.costs.by_stage_and_purpose.items():
         segments = [
             charts.Segment(
                 f"bar-{purpose}",
-                value["wall_seconds"],
-                f"{stage}, {PURPOSE_NAMES[purpose]}: {duration(value['wall_seconds'])}",
+                value.wall_seconds,
+                f"{stage}, {PURPOSE_NAMES[purpose]}: {duration(value.wall_seconds)}",
             )
             for purpose, value in purposes.items()
         ]
@@ -140,27 +140,23 @@ def _stage_chart(data: ReportData) -> Markup:
 
 
 def _tracing_chart(data: ReportData) -> Markup:
-    tracing = data.costs["tracing_all"] if data.costs else None
+    tracing = data.costs.tracing_all if data.costs else None
     if not tracing:
         return Markup("")
     chosen = [
-        charts.Segment(
-            "bar-training", tracing["actual_seconds"], f"ray tracing: {duration(tracing['actual_seconds'])}"
-        ),
+        charts.Segment("bar-training", tracing.actual_seconds, f"ray tracing: {duration(tracing.actual_seconds)}"),
         charts.Segment(
             "bar-choosing",
-            tracing["selection_seconds"],
-            f"choosing: {duration(tracing['selection_seconds'])}",
+            tracing.selection_seconds,
+            f"choosing: {duration(tracing.selection_seconds)}",
         ),
     ]
-    everything = charts.Segment(
-        "bar-training", tracing["all_seconds"], f"ray tracing: {duration(tracing['all_seconds'])}"
-    )
-    spent = tracing["actual_seconds"] + tracing["selection_seconds"]
+    everything = charts.Segment("bar-training", tracing.all_seconds, f"ray tracing: {duration(tracing.all_seconds)}")
+    spent = tracing.actual_seconds + tracing.selection_seconds
     return charts.bar_chart(
         [
-            charts.Bar(f"{tracing['views']} chosen", chosen, duration(spent)),
-            charts.Bar(f"all {tracing['candidates']}", [everything], duration(tracing["all_seconds"])),
+            charts.Bar(f"{tracing.views} chosen", chosen, duration(spent)),
+            charts.Bar(f"all {tracing.candidates}", [everything], duration(tracing.all_seconds)),
         ],
         "Ray tracing the chosen views against ray tracing all candidates",
     )

@@ -22,13 +22,13 @@ import httpx
 from pydantic import BaseModel, TypeAdapter
 
 from ..core.errors import UserError
+from ..stages.records import PreviewState
 from .models import (
     Job,
     JobEvent,
     JobPage,
     JobRequest,
     LogPage,
-    PreviewState,
     Scene,
     State,
     WorkspaceDetail,

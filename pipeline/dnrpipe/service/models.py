@@ -201,21 +201,6 @@ class PlanState(_Wire):
     spent: float
 
 
-class PreviewState(_Wire):
-    """The picture of a fine-tuning under way. split: test (held out), or train where nothing is.
-
-    psnr: dB, None without a reference; truth: whether there is one. time: unix seconds.
-    """
-
-    split: Literal["test", "train"]
-    view: str
-    epoch: int
-    epochs: int
-    psnr: float | None
-    truth: bool
-    time: float
-
-
 class WorkspaceDetail(_Wire):
     """What the dashboard shows of a workspace.
 

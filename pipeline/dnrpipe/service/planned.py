@@ -2,32 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict
-
-from ..core.errors import UserError
 from ..core.ledger import total
 from ..core.settings import Settings
 from ..core.workspace import Workspace
-from ..studies.planning.command import plan_path
-from ..studies.planning.records import Choice, Prediction
+from ..studies.planning.records import RENDERER_STAGES, Choice, read_plan
 from .models import PlannedStage, PlanState
-
-UNTIL_THE_RENDERER = ("select", "raytrace", "finetune")
-
-
-class _Plan(BaseModel):
-    """The part of ``plan/plan.json`` that is read here."""
-
-    model_config = ConfigDict(extra="ignore")
-
-    made: float
-    chosen: Prediction | None
-    carried_out: Prediction | None = None
-    settings_default: Prediction
 
 
 def plan_state(workspace: Workspace, settings: Settings, states: Mapping[str, str]) -> PlanState | None:
@@ -44,19 +26,15 @@ def plan_state(workspace: Workspace, settings: Settings, states: Mapping[str, st
     Raises:
         UserError: the plan's file is damaged.
     """
-    path = plan_path(workspace)
-    try:
-        plan = _Plan.model_validate(json.loads(path.read_bytes()))
-    except FileNotFoundError:
+    plan = read_plan(workspace.root)
+    if plan is None:
         return None
-    except (ValueError, RecursionError):
-        raise UserError(f"{path}: damaged; run `dnrpipe plan` again") from None
     known = [found for found in (plan.carried_out, plan.chosen, plan.settings_default) if found is not None]
     prediction = next((found for found in known if _fits(found.choice, settings)), known[0])
     seconds, choice = prediction.seconds, prediction.choice
     since = [record for record in workspace.ledger.read() if record.time >= plan.made]
     stages = []
-    for stage in (*UNTIL_THE_RENDERER, "evaluate"):
+    for stage in (*RENDERER_STAGES, "evaluate"):
         record = workspace.manifest.stages.get(stage)
         done = states.get(stage) == "done"
         spent: float | None = total(r for r in since if r.stage == stage).wall_seconds
@@ -73,7 +51,7 @@ def plan_state(workspace: Workspace, settings: Settings, states: Mapping[str, st
         total=seconds.total.expected,
         low=seconds.total.low,
         high=seconds.total.high,
-        spent=sum(stage.spent or 0.0 for stage in stages if stage.stage in UNTIL_THE_RENDERER),
+        spent=sum(stage.spent or 0.0 for stage in stages if stage.stage in RENDERER_STAGES),
     )
 
 

@@ -13,11 +13,15 @@ from fastapi.responses import FileResponse
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
+from dnrtrain.contract import DamagedFile
+from dnrtrain.records import read
+
 from ..core.errors import UserError
 from ..core.workspace import Workspace
 from ..report.collect import outline
 from ..report.sphere import AZIMUTH, ELEVATION, sphere_svg
 from ..stages.pipeline import status
+from ..stages.records import PREVIEW, PreviewState
 from ..stages.session import resolve_settings
 from .models import (
     NAME_PATTERN,
@@ -25,7 +29,6 @@ from .models import (
     CostState,
     Curve,
     PlacedView,
-    PreviewState,
     Scene,
     StageState,
     TestPicture,
@@ -81,27 +84,27 @@ def get_workspace(name: NamePath, service: Shared) -> WorkspaceDetail:
         workspace = Workspace.open(path)
         settings = resolve_settings(workspace, {}, None)
         rows = status(workspace, settings)
-        plan = plan_state(workspace, settings, {row["stage"]: row["state"] for row in rows})
+        plan = plan_state(workspace, settings, {row.stage: row.state for row in rows})
         known = outline(path)
     except UserError as error:
         raise HTTPException(409, str(error)) from None
-    tracing = known.costs["tracing_all"]
+    tracing = known.costs.tracing_all
     sphere = known.sphere
     return WorkspaceDetail(
         name=name,
-        stages=[StageState(**{key: row[key] for key in StageState.model_fields}) for row in rows],
+        stages=[StageState(**{key: getattr(row, key) for key in StageState.model_fields}) for row in rows],
         views=[PlacedView(**view.model_dump()) for view in sphere.views] if sphere else [],
         sphere=str(sphere_svg(sphere, "oblique")) if sphere else None,
         eye=(AZIMUTH, ELEVATION),
         training=[Curve(title=t.title, losses=t.losses, psnr=t.psnr) for t in known.training],
         tests=[TestPicture(view=view, psnr=psnr) for view, psnr in known.psnr.items()],
         costs=CostState(
-            spent={stage: part["wall_seconds"] for stage, part in known.costs["by_stage"].items()},
-            total=known.costs["total"]["wall_seconds"],
-            traced_views=tracing["views"] if tracing else None,
-            candidates=tracing["candidates"] if tracing else None,
-            tracing_seconds=tracing["actual_seconds"] if tracing else None,
-            tracing_all_seconds=tracing["all_seconds"] if tracing else None,
+            spent={stage: part.wall_seconds for stage, part in known.costs.by_stage.items()},
+            total=known.costs.total.wall_seconds,
+            traced_views=tracing.views if tracing else None,
+            candidates=tracing.candidates if tracing else None,
+            tracing_seconds=tracing.actual_seconds if tracing else None,
+            tracing_all_seconds=tracing.all_seconds if tracing else None,
         ),
         plan=plan,
         viewable="finetune" in workspace.manifest.stages,
@@ -112,12 +115,12 @@ def get_workspace(name: NamePath, service: Shared) -> WorkspaceDetail:
 @router.get("/workspaces/{name}/preview", responses=NOT_FOUND | CONFLICT)
 def preview(name: NamePath, service: Shared) -> PreviewState:
     """What the last picture of fine-tuning shows. 409: its file is damaged."""
-    path = service.root.workspace(name) / "preview" / "preview.json"
+    path = service.root.workspace(name) / "preview" / PREVIEW
     try:
-        return PreviewState.model_validate_json(path.read_bytes())
+        return read(path, PreviewState)
     except FileNotFoundError:
         raise HTTPException(404, f"{name} has no picture of a training") from None
-    except ValueError:
+    except DamagedFile:
         raise HTTPException(409, f"{name}: preview.json is damaged; the next training replaces it") from None
 
 

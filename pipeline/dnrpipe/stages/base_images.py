@@ -97,6 +97,9 @@ def base_views(
     """Render the base images of the views that are missing or out of date -> all tasks, [] where none is rendered.
 
     Args:
+        run: of the stage that needs them.
+        views: all of them.
+        split: that they are of; the ledger names them by it.
         paths: where they go instead of ``base/<split>``.
         purpose: they are booked under, instead of the stage's.
 
@@ -114,7 +117,7 @@ def base_views(
         renderer.common,
         tasks,
         workers=1,  # a kernel to compile; its threads fill the machine
-        book=run.book_views(f"mitsuba {renderer.common['variant']}", prefix="base/", purpose=purpose),
+        book=run.book_views(f"mitsuba {renderer.common['variant']}", folder=f"base/{split}", purpose=purpose),
         environment=renderer.environment,
     )
     warn_of_repairs(tasks, run.console)

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from dnrtrain.atomic import write_json
 from dnrtrain.contract import ContractError
 from dnrtrain.exr import read_metadata
+from dnrtrain.records import write
 
 from ..core.errors import UserError
 from ..core.images import flip_error, write_png
@@ -19,6 +19,7 @@ from ..core.settings import Settings
 from ..core.workspace import Workspace, digest
 from .base_images import RENDERED, base_path, base_views
 from .raytrace import trace_views
+from .records import METRICS, Metrics, ViewMetrics
 from .stage import Outcome, Run
 from .trainer import load, perceptual_weights, torch_device
 
@@ -45,35 +46,38 @@ def evaluate(run: Run) -> Outcome:
     perceptual = perceptual_weights(console)
     lpips = {name: Lpips(name, weights) for name, weights in perceptual.items()} if perceptual else None
     rendered = settings.model.base in RENDERED
-    rows: list[dict[str, Any]] = []
+    rows: list[ViewMetrics] = []
+    neural_seconds: list[float] = []
     with console.bar("test views", len(views)) as bar:
         for view in views:
             data = load(workspace, [view], "test", raytraced=True, base=settings.model.base).to(device)
             seconds, prediction = _timed_render(lambda data=data: render_views(model, data), device)
             assert data.target is not None  # loaded with raytraced=True
-            row: dict[str, Any] = dict(image_metrics(prediction, data.target.cpu(), data.mask.cpu(), lpips))
+            measured = image_metrics(prediction, data.target.cpu(), data.mask.cpu(), lpips)
             truth = _image(data.target)
             predicted = _image(prediction)
             error, heat = flip_error(truth, predicted)
             traced = read_metadata(workspace.raytraced("test", view.name)) or {}
             base = read_metadata(base_path(workspace, "test", view.name)) or {} if rendered else {}
-            row |= {
-                "name": view.name,
-                "flip": error,
-                "ceiling_psnr": _ceiling(traced.get("noise_rmse")),
-                "reference_noise": traced.get("noise"),
-                "reference_noise_error": traced.get("noise_error"),
-                "seconds_traced": traced.get("seconds"),
-                "seconds_neural": seconds,
-                "seconds_base": base.get("seconds"),
-                "spp": traced.get("spp"),
-            }
+            row = ViewMetrics(
+                name=view.name,
+                **measured,
+                flip=error,
+                ceiling_psnr=_ceiling(traced.get("noise_rmse")),
+                reference_noise=traced.get("noise"),
+                reference_noise_error=traced.get("noise_error"),
+                seconds_traced=traced.get("seconds"),
+                seconds_neural=seconds,
+                seconds_base=base.get("seconds"),
+                spp=traced.get("spp"),
+            )
             rows.append(row)
+            neural_seconds.append(seconds)
             files = {}
             for kind, picture in (("truth", truth), ("prediction", predicted), ("flip", heat)):
                 write_png(workspace.evaluation / f"{view.name}.{kind}.png", picture)
                 files[kind] = f"evaluation/{view.name}.{kind}.png"
-            console.events.send("picture", split="test", view=view.name, files=files, psnr=row["psnr"])
+            console.events.send("picture", split="test", view=view.name, files=files, psnr=row.psnr)
             run.book(
                 "evaluation",
                 "view",
@@ -83,28 +87,26 @@ def evaluate(run: Run) -> Outcome:
                 width=view.width,
                 height=view.height,
             )
-            bar.advance(note=f"{row['psnr']:.2f} dB")
-    torch_name = torch.cuda.get_device_name() if device.startswith("cuda") else "cpu"
-    report = {
-        "views": rows,
-        "mean": _mean(rows),
-        "perceptual": perceptual is not None,
-        "trained_with_perceptual": workspace.manifest.stages["finetune"].detail.get("perceptual", False),
-        "device": torch_name,
-        "reference_noise_target": settings.raytrace.evaluation_noise,
-        "neural_ms": 1000 * float(np.median([row["seconds_neural"] for row in rows])),
-    }
+            bar.advance(note=_figure(row.psnr, ".2f", " dB"))
+    mean = _mean(rows)
+    metrics = Metrics(
+        views=rows,
+        mean=mean,
+        perceptual=perceptual is not None,
+        trained_with_perceptual=workspace.manifest.stages["finetune"].perceptual or False,
+        device=torch.cuda.get_device_name() if device.startswith("cuda") else "cpu",
+        reference_noise_target=settings.raytrace.evaluation_noise,
+        neural_ms=1000 * float(np.median(neural_seconds)),
+    )
     _remove_other_pictures(workspace, {view.name for view in views})
-    write_json(workspace.evaluation / "metrics.json", report)
-    mean = report["mean"]
+    write(workspace.evaluation / METRICS, metrics)
+    ceiling = f" (ceiling {mean['ceiling_psnr']:.1f} dB)" if mean["ceiling_psnr"] is not None else ""
     console.say(
-        f"held-out over {len(rows)} views: PSNR {mean['psnr']:.2f} dB"
-        + (f" (ceiling {mean['ceiling_psnr']:.1f} dB)" if mean["ceiling_psnr"] is not None else "")
-        + f", SSIM {mean['ssim']:.4f},"
-        f" FLIP {mean['flip']:.4f}"
+        f"held-out over {len(rows)} views: PSNR {_figure(mean['psnr'], '.2f', ' dB')}{ceiling}, "
+        f"SSIM {_figure(mean['ssim'], '.4f')}, FLIP {_figure(mean['flip'], '.4f')}"
         + (f", LPIPS {mean['lpips_alex']:.4f} (alex)" if mean["lpips_alex"] is not None else ", no LPIPS weights")
     )
-    stable = [{k: v for k, v in row.items() if not k.startswith("seconds")} for row in rows]
+    stable = [{k: v for k, v in row.data().items() if not k.startswith("seconds")} for row in rows]
     return Outcome(digest(stable), {"mean": mean, "views": len(rows), "perceptual": perceptual is not None})
 
 
@@ -113,11 +115,11 @@ def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
     try:
         views = split_views(workspace).get("test", [])
     except ContractError:
-        views = []  # damaged: the stage mends it when it runs
+        views = []  # damaged: the stage repairs it when it runs
     if not views:
         return 0, settings.cameras.test
     done = sum((workspace.evaluation / f"{view.name}.flip.png").exists() for view in views)
-    return (done if (workspace.evaluation / "metrics.json").exists() else 0), len(views)
+    return (done if (workspace.evaluation / METRICS).exists() else 0), len(views)
 
 
 def _timed_render(render: Any, device: str) -> tuple[float, Any]:
@@ -146,13 +148,18 @@ def _ceiling(noise_rmse: float | None) -> float | None:
     return None if not noise_rmse else -20 * math.log10(noise_rmse)
 
 
-def _mean(rows: list[dict[str, Any]]) -> dict[str, float | None]:
+def _mean(rows: list[ViewMetrics]) -> dict[str, float | None]:
+    """The mean of each figure, over the views that have it."""
     result: dict[str, float | None] = {}
-    for key in rows[0]:
-        values = [row[key] for row in rows if isinstance(row[key], int | float)]
-        if key != "name":
-            result[key] = float(np.mean(values)) if values else None
+    for name in ViewMetrics.model_fields:
+        if name != "name":
+            values = [value for row in rows if (value := getattr(row, name)) is not None]
+            result[name] = float(np.mean(values)) if values else None
     return result
+
+
+def _figure(value: float | None, form: str, unit: str = "") -> str:
+    return "not defined" if value is None else f"{value:{form}}{unit}"
 
 
 def _remove_other_pictures(workspace: Workspace, names: set[str]) -> None:

@@ -3,7 +3,7 @@
 preview/
   prediction.png   the view by the weights of now, display space, SIDE pixels at most
   truth.png        its ray-traced reference, where one is on disk
-  preview.json     split, view, epoch, epochs, psnr (None without a reference), truth, time (unix seconds)
+  preview.json     what it shows: `PreviewState`
   base/            its base image
 
 The picture is looked at and never used: no setting, stop or choice depends on it.
@@ -13,11 +13,11 @@ from __future__ import annotations
 
 import importlib.util
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from dnrtrain.atomic import write_json
 from dnrtrain.contract import ContractError, View
 from dnrtrain.events import Previewed
+from dnrtrain.records import write
 
 from ..core.errors import UserError
 from ..core.scene_files import read_selection, split_views
@@ -26,6 +26,7 @@ from ..core.workspace import Workspace, digest, file_sha256
 from ..workers.view_tasks import TasksFailed
 from .base_images import base_views
 from .raytrace import reference_is_made
+from .records import PREVIEW, PreviewState
 from .stage import Outcome, Run
 from .trainer import epochs_done, follow, load, perceptual_weights, torch_device
 
@@ -89,7 +90,7 @@ class LivePicture:
 
     def __init__(self, run: Run, training: ViewSet) -> None:
         self.run, self.workspace, self.console = run, run.workspace, run.console
-        self.split = "train"
+        self.split: Literal["test", "train"] = "train"
         self.preview: Preview | None = None
         settings, console = run.settings, run.console
         if settings.finetune.preview_seconds == 0:
@@ -112,7 +113,7 @@ class LivePicture:
         if view is None:
             self.console.say("no test views: the pictures while it trains are of a training view")
             return None
-        base = self.workspace.preview / "base" / f"{view.name}.exr"
+        base = self.workspace.preview / "base" / "test" / f"{view.name}.exr"
         try:
             base_views(self.run, [view], "test", paths=[base], purpose="evaluation")
             views = load(
@@ -143,12 +144,20 @@ class LivePicture:
                 files["truth"] = "preview/truth.png"
                 write_png(folder / "truth.png", _small(target[0].permute(1, 2, 0).cpu().float().numpy()))
             write_png(folder / "prediction.png", _small(event.image))
-            facts = {"split": self.split, "view": event.view, "epoch": event.epoch, "epochs": event.epochs}
-            facts |= {"psnr": event.psnr}
-            write_json(folder / "preview.json", facts | {"truth": target is not None, "time": round(time.time(), 3)})
+            shown = PreviewState(
+                split=self.split,
+                view=event.view,
+                epoch=event.epoch,
+                epochs=event.epochs,
+                psnr=event.psnr,
+                truth=target is not None,
+                time=round(time.time(), 3),
+            )
+            write(folder / PREVIEW, shown)
         except OSError as error:
             self.console.warn(f"{folder}: the picture of epoch {event.epoch} cannot be written ({error.strerror})")
             return
+        facts = shown.model_dump(exclude={"truth", "time"})
         self.console.events.send("preview", stage="finetune", files=files, **facts)
         height, width = event.image.shape[:2]
         self.run.book(

@@ -11,8 +11,9 @@ import os
 import platform
 import shutil
 import time
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from dnrtrain.contract import DamagedFile
 
@@ -26,6 +27,8 @@ from ..core.settings import Settings
 from ..core.workspace import Workspace, digest
 from . import evaluate, finetune, prepare, raytrace, select
 from .stage import Outcome, Run, Stage
+
+State = Literal["missing", "partial", "stale", "done"]
 
 
 def _light(settings: Settings) -> dict[str, Any]:
@@ -156,7 +159,7 @@ def fingerprint(stage: Stage, workspace: Workspace, settings: Settings) -> str |
     )
 
 
-def state(stage: Stage, workspace: Workspace, settings: Settings) -> str:
+def state(stage: Stage, workspace: Workspace, settings: Settings) -> State:
     """missing: never finished; partial: files are absent; stale: inputs or settings changed; done.
 
     Work done without perceptual weights is stale once they are here; the other way round it stays.
@@ -169,7 +172,7 @@ def state(stage: Stage, workspace: Workspace, settings: Settings) -> str:
         return "stale"
     if any(state(STAGES[need], workspace, settings) == "stale" for need in stage.needs):
         return "stale"
-    if record.detail.get("perceptual") is False and weights_cached():
+    if record.perceptual is False and weights_cached():
         return "stale"
     return "done" if present >= wanted else "partial"
 
@@ -283,23 +286,45 @@ def weights_cached() -> bool:
     return (Path(base) / "weights" / "weights.json").is_file()
 
 
-def status(workspace: Workspace, settings: Settings) -> list[dict[str, Any]]:
-    """One row per stage: name, command, state, units present and wanted, seconds of its last run."""
+@dataclass(frozen=True)
+class StageStatus:
+    """A row of ``dnrpipe status``.
+
+    Args:
+        stage, command, does, reads, writes: of the `Stage`.
+        state: see `state`.
+        present, wanted: units, e.g. views or epochs.
+        seconds: wall time of its last run; None before it has finished one.
+    """
+
+    stage: StageName
+    command: str
+    does: str
+    state: State
+    present: int
+    wanted: int
+    seconds: float | None
+    reads: tuple[str, ...]
+    writes: tuple[str, ...]
+
+
+def status(workspace: Workspace, settings: Settings) -> list[StageStatus]:
+    """One row per stage."""
     rows = []
     for stage in STAGES.values():
         present, wanted = stage.progress(workspace, settings)
         record = workspace.manifest.stages.get(stage.name)
         rows.append(
-            {
-                "stage": stage.name,
-                "command": stage.command,
-                "does": stage.does,
-                "state": state(stage, workspace, settings),
-                "present": present,
-                "wanted": wanted,
-                "seconds": record.seconds if record else None,
-                "reads": list(stage.reads),
-                "writes": list(stage.writes),
-            }
+            StageStatus(
+                stage=stage.name,
+                command=stage.command,
+                does=stage.does,
+                state=state(stage, workspace, settings),
+                present=present,
+                wanted=wanted,
+                seconds=record.seconds if record else None,
+                reads=stage.reads,
+                writes=stage.writes,
+            )
         )
     return rows

@@ -79,7 +79,7 @@ def _plan_effects(run: Run) -> None:
 
 def scene_and_views(run: Run) -> tuple[SceneSummary, dict[str, list[View]]]:
     """Convert the scene and place the cameras, where that is not done: (summary, views by split). No passes."""
-    summary = _convert(run)
+    summary = convert_scene(run)
     return summary, _place_cameras(run.workspace, run.settings, summary)
 
 
@@ -133,7 +133,7 @@ def draw_passes(
     return tasks
 
 
-def _convert(run: Run) -> SceneSummary:
+def convert_scene(run: Run) -> SceneSummary:
     """Open the scene in a worker and write ``scene/``, whole or not at all."""
     workspace, settings, console = run.workspace, run.settings, run.console
     marker = workspace.scene / "prepared.json"

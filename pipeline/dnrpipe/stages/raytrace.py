@@ -11,7 +11,7 @@ from dnrtrain.exr import read_metadata
 
 from ..core.scene_files import read_selection, scene_fingerprint, split_views
 from ..core.settings import Settings
-from ..core.workspace import Workspace, digest
+from ..core.workspace import Raytraced, Workspace, digest
 from ..effects.plan import EffectPlan
 from ..effects.store import lenses, plan_of, trace_config, variant_for
 from ..raytrace.sample_schedule import Goal
@@ -36,8 +36,8 @@ def raytrace_selected(run: Run) -> Outcome:
     spp = [(read_metadata(Path(task["output"])) or {}).get("spp") for task in tasks]
     if goal_of(settings, "train") is not None:
         made.append(spp)  # with a time, how many samples were taken is not known before
-    traced: Any = settings.raytrace.spp if goal_of(settings, "train") is None else spp
-    return Outcome(digest(made), {"views": [view.name for view in selected], "spp": traced})
+    traced = settings.raytrace.spp if goal_of(settings, "train") is None else spp
+    return Outcome(digest(made), Raytraced(views=[view.name for view in selected], spp=traced).model_dump())
 
 
 def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:

@@ -174,7 +174,9 @@ def _inputs(run: Run, views: Sequence[View], frames: Path) -> list[Path]:
         base_views(run, views, "novel", paths=paths)
     else:
         raster = run.settings.model.base == "raster"
-        engine = run.workspace.manifest.stages["prepare"].detail["raster_engine"] if raster else "cycles-direct"
+        prepared = run.workspace.manifest.prepared
+        assert prepared is not None  # the model is of its views
+        engine = prepared.raster_engine if raster else "cycles-direct"
         draw_passes(run, "G-buffers", views, paths, engine, raster=[raster] * len(views))
     return paths
 

@@ -134,13 +134,13 @@ class Session:
         from ..core.cameras import KEYWORDS, read_camera_file
         from .select import check_budget
 
-        record = workspace.manifest.stages.get("prepare") if workspace else None
+        prepared = workspace.manifest.prepared if workspace else None
         if settings.cameras.source not in KEYWORDS and (self.command == "prepare" or self.scene is not None):
             read_camera_file(Path(settings.cameras.source), settings.cameras)
         if self.command == "run" and settings.cameras.source in ("auto", "dome", "sphere"):
             check_budget(settings.select.budget, settings.cameras.train)
-        elif self.command == "select" and record is not None:
-            check_budget(settings.select.budget, record.detail["views"]["train"])
+        elif self.command == "select" and prepared is not None:
+            check_budget(settings.select.budget, prepared.views["train"])
 
 
 def _stored(root: Path, source: Source, *, named: bool) -> Workspace | None:

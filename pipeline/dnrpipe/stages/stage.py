@@ -71,12 +71,12 @@ class Run:
             )
         )
 
-    def book_views(self, device: str, *, prefix: str = "", purpose: Purpose | None = None) -> Book:
+    def book_views(self, device: str, *, folder: str | None = None, purpose: Purpose | None = None) -> Book:
         """What `run_view_tasks` books each view by.
 
         Args:
             device: as the ledger names it.
-            prefix: of the view's name.
+            folder: of the record's name; None: the one that the view's file lies in.
             purpose: None: by the stage, and by the split that the view's file lies in.
         """
         fields = {"seconds", "cpu_seconds", "peak_mb", "spp", "noise"}
@@ -85,7 +85,7 @@ class Run:
             self.book(
                 purpose or self._purpose(task),
                 "view",
-                prefix + task_name(task),
+                task_name(task) if folder is None else f"{folder}/{task['view']['name']}",
                 device=device,
                 workers=workers,
                 width=task["view"]["width"],

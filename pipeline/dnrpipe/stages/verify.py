@@ -188,9 +188,9 @@ def _archive(path: Path) -> None:
 
 
 def _ledger(workspace: Workspace, path: Path) -> None:
-    torn = workspace.ledger.torn_lines()
-    if torn:
-        raise DamagedFile(path, f"{torn} lines do not read and are left out of all sums")
+    truncated = workspace.ledger.truncated_records()
+    if truncated:
+        raise DamagedFile(path, f"{truncated} lines do not read and are left out of all sums")
 
 
 def _leftovers(root: Path) -> list[Path]:

@@ -1,14 +1,14 @@
-"""One cell of the ablation, (scene, row, seed), in a worker process: train, measure, write one JSON file.
+"""One cell of a study, (scene, row, seed), in a worker process: train, measure, write one JSON file.
 
-Tasks are JSON (see :class:`Worker`). Scenes are loaded once per process and kept while cells ask for them.
+Scenes are loaded once per process and kept while cells ask for them.
 """
 
 from __future__ import annotations
 
+import functools
 import json
 import shutil
 import time
-from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,11 +24,13 @@ from ...core.settings import Settings
 from ...core.workspace import Workspace
 from .measure import base_pictures, measure, network_pictures, rendered_ms
 from .scenes import base_file, raster_file
+from .tasks import CellResult, CellTask, Step1Result, Step1Task, Training, TrainingCost
 
 if TYPE_CHECKING:
     from dnrtrain.dataset import ViewSet
-    from dnrtrain.records import ModelRecord
+    from dnrtrain.records import Epoch, ModelRecord
 
+CELL_VERSION = 1  # raise when training or measuring changes what a cell holds
 STEP1_SHARE = 1 / 3
 """Share of the training time that step 1 may take where all rows train equally long."""
 KEPT_SETS = 8
@@ -36,12 +38,7 @@ KEPT_SETS = 8
 
 
 class Worker:
-    """Runs tasks of two kinds; the answer is what the task's ``output`` file holds.
-
-    step1   workspace, settings, policy, seed, seconds (at most; or None) -> {"selected", "epochs", its cost}
-    cell    ... views, targets (folder under raytraced/ of their pictures; default train), coarse (folder of step 1
-            or None), seconds (both steps; or None) -> see ``_cell``
-    """
+    """Answers a `Step1Task` or a `CellTask`; the answer is what the task's ``output`` file holds."""
 
     def __init__(self, common: dict[str, Any]) -> None:
         import torch
@@ -51,114 +48,121 @@ class Worker:
         if common["threads"]:
             torch.set_num_threads(common["threads"])
         self.device, self.threads = common["device"], torch.get_num_threads()
-        self.memory: OrderedDict[str, ViewSet] = OrderedDict()
+        self.views = functools.lru_cache(maxsize=KEPT_SETS)(load_cell_views)
         try:
             self.weights: Any = load_weights()
-        except WeightsMissing:  # the parent has said so, and cells are keyed by it
+        except WeightsMissing:  # the parent has said so, and fingerprints of cells hold it
             self.weights = None
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
-        settings = Settings.model_validate(task["settings"])
-        workspace = Workspace.open(Path(task["workspace"]))
-        made = (self._step1 if task["kind"] == "step1" else self._cell)(task, settings, workspace)
-        write_json(Path(task["output"]), made)
-        return made
+        made: Step1Result | CellResult
+        if task["kind"] == "step1":
+            made = self._step1(Step1Task.model_validate(task))
+        else:
+            made = self._cell(CellTask.model_validate(task))
+        answer = made.model_dump(mode="json")
+        write_json(Path(task["output"]), answer)
+        return answer
 
     # -- the two kinds of tasks ------------------------------------------------------------------------
 
-    def _step1(self, task: dict[str, Any], settings: Settings, workspace: Workspace) -> dict[str, Any]:
+    def _step1(self, task: Step1Task) -> Step1Result:
         """The coarse model on rasterised candidates, and the views its policy chooses."""
-        folder = Path(task["folder"])
-        if task["seconds"] is not None:
-            short = settings.model_copy(deep=True)
-            short.select.step1.epochs = 2
-            pace = self._pace(Path(task["pace"]), folder, lambda at: self._coarse(task, short, workspace, at))
-            settings = settings.model_copy(deep=True)
-            settings.select.step1.epochs = min(max(1, int(task["seconds"] / pace)), settings.select.step1.epochs)
-        selected = next(e for e in self._coarse(task, settings, workspace, folder) if isinstance(e, Selected))
-        epochs = settings.select.step1.epochs
-        return {"key": task["key"], "selected": selected.views, "epochs": epochs, **training_cost(folder)}
+        settings = task.settings
+        if task.seconds is not None:
+            assert task.pace is not None
+            short = _with_step1_epochs(settings, 2)
+            pace = self._pace(task.pace, task.folder, lambda folder: self._train_step1(task, short, folder))
+            limit = max(1, int(task.seconds / pace))
+            settings = _with_step1_epochs(settings, min(limit, settings.select.step1.epochs))
+        events = self._train_step1(task, settings, task.folder)
+        selected = next(event for event in events if isinstance(event, Selected))
+        return Step1Result(
+            key=task.fingerprint,
+            selected=selected.views,
+            epochs=settings.select.step1.epochs,
+            **training_cost(task.folder).model_dump(),
+        )
 
-    def _coarse(self, task: dict[str, Any], settings: Settings, workspace: Workspace, folder: Path) -> Iterator[Event]:
+    def _train_step1(self, task: Step1Task, settings: Settings, folder: Path) -> Iterator[Event]:
         from dnrtrain.step1 import run_step1
 
-        views = self._views(workspace, "train", None, raytraced=False, base="none")
         return run_step1(
-            views,
+            self.views(task.workspace, "train", raytraced=False, base="none"),
             None,
             settings.model,
             settings.select.step1,
-            policy=task["policy"],
+            policy=task.policy,
             budget=settings.select.budget,
-            seed=task["seed"],
+            seed=task.seed,
             device=self.device,
             checkpoints=folder,
-            fingerprint=task["key"],
+            fingerprint=task.fingerprint,
         )
 
-    def _cell(self, task: dict[str, Any], settings: Settings, workspace: Workspace) -> dict[str, Any]:
+    def _cell(self, task: CellTask) -> CellResult:
         """Train where the row has a network, measure all test views, keep one picture."""
-        base = settings.model.base
-        test = self._views(workspace, "test", None, raytraced=True, base=base)
-        training: dict[str, Any] | None = None
-        if task["network"]:
-            training, folder = self._train(task, settings, workspace)
-            pictures, frame_ms = network_pictures(folder, test, self.device)
-            shutil.rmtree(folder)
+        settings, base = task.settings, task.settings.model.base
+        workspace = Workspace.open(task.workspace)
+        test = self.views(task.workspace, "test", raytraced=True, base=base)
+        training: Training | None = None
+        if task.network:
+            training = self._train(task)
+            pictures, frame_ms = network_pictures(task.folder, test, self.device)
+            shutil.rmtree(task.folder)
         else:
             pictures, frame_ms = base_pictures(test), None
-        rows = measure(pictures, test, workspace, self.weights, Path(task["picture"]) if task["picture"] else None)
-        return {
-            "key": task["key"],
-            "scene": task["scene"],
-            "seed": task["seed"],
-            "settings": {
+        base_ms = None
+        if base not in ("none", "raster"):
+            base_ms = rendered_ms([base_file(workspace, base, "test", name) for name in test.names])
+        return CellResult(
+            key=task.fingerprint,
+            scene=task.scene,
+            seed=task.seed,
+            settings={
                 "model": settings.model.model_dump(mode="json"),
                 "step2": settings.finetune.step2.model_dump(mode="json"),
             },
-            "views": task["views"],
-            "training": training,
-            "frame_ms": frame_ms,
-            "base_ms": None if base in ("none", "raster") else self._base_ms(workspace, base, test),
-            "threads": self.threads,
-            "device": self.device,
-            "tests": rows,
-            "code": task["code"],
-            "finished": time.time(),
-        }
+            views=task.views,
+            training=training,
+            frame_ms=frame_ms,
+            base_ms=base_ms,
+            threads=self.threads,
+            device=self.device,
+            tests=measure(pictures, test, workspace, self.weights, task.picture),
+            code=task.code,
+            finished=time.time(),
+        )
 
     # -- training --------------------------------------------------------------------------------------
 
-    def _train(self, task: dict[str, Any], settings: Settings, workspace: Workspace) -> tuple[dict[str, Any], Path]:
-        """Step 2 in the cell's own folder -> (what training took, folder of the model)."""
-        folder = Path(task["folder"])
-        coarse: dict[str, Any] | None = task["coarse_cost"]
+    def _train(self, task: CellTask) -> Training:
+        """Step 2 in the cell's own folder."""
+        settings, coarse = task.settings, task.coarse_cost
         pace = None
-        if task["seconds"] is not None:
-            short = settings.model_copy(deep=True)
-            short.finetune.step2.epochs = 2
-            pace = self._pace(Path(task["pace"]), folder, lambda at: self._step2(task, short, workspace, at))
-            spent = STEP1_SHARE * task["seconds"] if task["full_step1"] else self._clock(coarse) if coarse else 0.0
-            left = task["seconds"] - spent
+        if task.seconds is not None:
+            short = _with_step2_epochs(settings, 2)
+            pace = self._pace(task.pace, task.folder, lambda folder: self._train_step2(task, short, folder))
+            spent = STEP1_SHARE * task.seconds if task.full_step1 else self._clock(coarse) if coarse else 0.0
+            left = task.seconds - spent
             if left < pace:
                 raise ContractError(
-                    f"--seconds {task['seconds']:g}: step 1 leaves {max(left, 0.0):.1f} s, and an epoch of step 2"
+                    f"--seconds {task.seconds:g}: step 1 leaves {max(left, 0.0):.1f} s, and an epoch of step 2"
                     f" takes {pace:.1f} s; give more"
                 )
-            settings = settings.model_copy(deep=True)
-            settings.finetune.step2.epochs = int(left / pace)
-        for _ in self._step2(task, settings, workspace, folder):
+            settings = _with_step2_epochs(settings, int(left / pace))
+        for _ in self._train_step2(task, settings, task.folder):
             pass
-        cost = training_cost(folder)
-        return {
-            "epochs": settings.finetune.step2.epochs,
-            "seconds_per_epoch": pace,
-            "step1": coarse,
-            "step2": cost,
-            "seconds": cost["seconds"] + (coarse["seconds"] if coarse else 0.0),
-            "cpu_seconds": cost["cpu_seconds"] + (coarse["cpu_seconds"] if coarse else 0.0),
-            "perceptual": self.weights is not None,
-        }, folder
+        cost = training_cost(task.folder)
+        return Training(
+            epochs=settings.finetune.step2.epochs,
+            seconds_per_epoch=pace,
+            step1=coarse,
+            step2=cost,
+            seconds=cost.seconds + (coarse.seconds if coarse else 0.0),
+            cpu_seconds=cost.cpu_seconds + (coarse.cpu_seconds if coarse else 0.0),
+            perceptual=self.weights is not None,
+        )
 
     def _pace(self, file: Path, folder: Path, train: Callable[[Path], Iterator[Event]]) -> float:
         """Seconds of one epoch: the second of two (the first warms up), kept in ``file`` for the row's other seeds."""
@@ -170,79 +174,59 @@ class Worker:
                     pass
                 last = _record(scratch).history[-1]
                 shutil.rmtree(scratch)
-                write_json(file, self._clock(last.data()))
+                write_json(file, self._clock(last))
         return float(json.loads(file.read_text()))
 
-    def _clock(self, cost: dict[str, Any]) -> float:
+    def _clock(self, cost: TrainingCost | Epoch) -> float:
         """Seconds of training; on a CPU by processor time, which other work on the machine does not stretch."""
-        return cost["cpu_seconds"] / self.threads if self.device == "cpu" else cost["seconds"]
+        return cost.cpu_seconds / self.threads if self.device == "cpu" else cost.seconds
 
-    def _step2(self, task: dict[str, Any], settings: Settings, workspace: Workspace, folder: Path) -> Iterator[Event]:
+    def _train_step2(self, task: CellTask, settings: Settings, folder: Path) -> Iterator[Event]:
         from dnrtrain.step2 import run_step2
 
         return run_step2(
-            self._views(
-                workspace,
+            self.views(
+                task.workspace,
                 "train",
-                task["views"],
+                tuple(task.views),
                 raytraced=True,
                 base=settings.model.base,
-                targets=task.get("targets"),
+                targets=task.targets,
             ),
             None,
-            Path(task["coarse"] or folder),  # not read by a fresh start
+            task.coarse or folder,  # not read by a fresh start
             settings.model,
             settings.finetune.step2,
-            seed=task["seed"],
+            seed=task.seed,
             device=self.device,
             checkpoints=folder,
-            fingerprint=task["key"],
+            fingerprint=task.fingerprint,
             weights=self.weights,
         )
 
-    def _base_ms(self, workspace: Workspace, kind: str, views: ViewSet) -> float | None:
-        return rendered_ms([base_file(workspace, kind, "test", name) for name in views.names])
-
-    # -- data ------------------------------------------------------------------------------------------
-
-    def _views(
-        self,
-        workspace: Workspace,
-        split: str,
-        names: list[str] | None,
-        *,
-        raytraced: bool,
-        base: str,
-        targets: str | None = None,
-    ) -> ViewSet:
-        """Views of the split (None: all), with ray-traced or rasterised targets; from memory if they are there.
-
-        targets: folder of the ray-traced pictures, where it is not the split's.
-        """
-        key = repr((workspace.root, split, names, raytraced, base, targets))
-        if key not in self.memory:
-            self.memory[key] = load_cell_views(workspace, split, names, raytraced=raytraced, base=base, targets=targets)
-        self.memory.move_to_end(key)
-        while len(self.memory) > KEPT_SETS:
-            self.memory.popitem(last=False)
-        return self.memory[key]
-
 
 def load_cell_views(
-    workspace: Workspace,
+    root: Path,
     split: str,
-    names: list[str] | None,
+    names: tuple[str, ...] | None = None,
     *,
     raytraced: bool,
     base: str,
     targets: str | None = None,
 ) -> ViewSet:
-    """Views of the split (None: all) with ray-traced or rasterised targets and their base images.
+    """Views with ray-traced or rasterised targets and their base images.
 
-    targets: folder of the ray-traced pictures, where it is not the split's.
+    Args:
+        root: of the workspace.
+        split: train or test.
+        names: of the views, None: all of the split.
+        raytraced: whether targets are ray-traced.
+        base: kind of the base images.
+        targets: folder of the ray-traced pictures, where it is not the split's.
     """
     from dnrtrain.dataset import load_views
 
+    workspace = Workspace.open(root)
     views = {view.name: view for view in split_views(workspace)[split]}
     chosen = [views[name] for name in names or views]
     passes = [workspace.passes(split, view.name) for view in chosen]
@@ -258,6 +242,18 @@ def load_cell_views(
     return load_views(passes, images, frame, cameras=chosen, folder=workspace.scene, **extra)
 
 
+def _with_step1_epochs(settings: Settings, epochs: int) -> Settings:
+    changed = settings.model_copy(deep=True)
+    changed.select.step1.epochs = epochs
+    return changed
+
+
+def _with_step2_epochs(settings: Settings, epochs: int) -> Settings:
+    changed = settings.model_copy(deep=True)
+    changed.finetune.step2.epochs = epochs
+    return changed
+
+
 def _record(folder: Path) -> ModelRecord:
     from dnrtrain.checkpoint import read_record
 
@@ -266,14 +262,11 @@ def _record(folder: Path) -> ModelRecord:
     return record
 
 
-def training_cost(folder: Path) -> dict[str, Any]:
+def training_cost(folder: Path) -> TrainingCost:
     """Sums over all epochs, those of an interrupted run included, and what the choice at the end took."""
     record = _record(folder)
     names = ("seconds", "cpu_seconds", "steps", "skipped")
     cost: dict[str, Any] = {name: sum(getattr(epoch, name) for epoch in record.history) for name in names}
     for name, value in record.choosing.items():
         cost[name] += value
-    return cost
-
-
-CELL_VERSION = 1  # raise when training or measuring changes what a cell holds
+    return TrainingCost(**cost)

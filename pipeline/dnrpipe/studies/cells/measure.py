@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from dnrtrain.exr import read_metadata
 
+from ...core.errors import UserError
 from ...core.images import flip_error, write_png
 from ...core.workspace import Workspace
 
@@ -62,6 +63,14 @@ def rendered_ms(files: list[Path]) -> float | None:
     seconds = [(read_metadata(path) or {}).get("seconds") for path in files]
     known = [value for value in seconds if value is not None]
     return 1000 * float(np.median(known)) if known else None
+
+
+def written_seconds(file: Path, clock: Literal["seconds", "cpu_seconds"] = "cpu_seconds") -> float:
+    """Seconds that rendering the file took, by its header. Raises UserError: it is missing or damaged."""
+    metadata = read_metadata(file)
+    if metadata is None:
+        raise UserError(f"{file}: is missing or damaged; run the same command again")
+    return float(metadata[clock])
 
 
 def measure(

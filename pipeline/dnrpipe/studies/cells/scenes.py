@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dnrtrain.contract import View
@@ -30,18 +30,28 @@ HARD_LIGHT = ("interior", "jewels")
 
 @dataclass
 class Scene:
-    """One prepared scene. ``train`` and ``test``: views by name; ``inputs``: hash of passes and cameras."""
+    """One prepared scene of a study.
+
+    Args:
+        name: results are filed by it.
+        workspace: of the scene.
+        console: of the study.
+        train, test: views by name.
+        inputs: hash of passes and cameras.
+        run_id: of the study in the ledger.
+    """
 
     name: str
     workspace: Workspace
+    console: Console
     train: dict[str, View]
     test: dict[str, View]
     inputs: str
-    run_id: str = field(default_factory=lambda: f"ablate-{int(time.time()):x}")
+    run_id: str
 
-    def run(self, settings: Settings, console: Console, stage: StageName) -> Run:
+    def run(self, settings: Settings, stage: StageName) -> Run:
         """Work on the scene, booked under the stage."""
-        return Run(self.workspace, settings, console, stage, self.run_id)
+        return Run(self.workspace, settings, self.console, stage, self.run_id)
 
     def farthest(self, budget: int) -> list[str]:
         """Farthest-point selection: the same views for every seed."""
@@ -60,6 +70,11 @@ class Scene:
         rule = untrained(policy)
         assert rule is not None  # both names above are rules
         return [names[i] for i in rule.choose(candidates, budget, seed).views]
+
+
+def scene_workspace(source: Path, root: Path) -> Workspace:
+    """Make or find the workspace of a scene file in a study's folder."""
+    return Workspace.create(root, Source(path=str(source), sha256=file_sha256(source)))
 
 
 def find_scenes(text: str | None) -> list[Path]:
@@ -82,16 +97,18 @@ def find_scenes(text: str | None) -> list[Path]:
     return found
 
 
-def prepare_scene(source: Path, out: Path, settings: Settings, console: Console) -> Scene:
-    """Make or find the scene's workspace ``<out>/scenes/<name>.dnr`` and its passes."""
-    root = out / "scenes" / f"{source.stem}.dnr"
-    workspace = Workspace.create(root, Source(path=str(source), sha256=file_sha256(source)))
-    return prepared(source.stem, workspace, settings, console)
+def prepared(name: str, run: Run, command: str) -> Scene:
+    """The workspace's passes, made where they are missing, without a word.
 
+    Args:
+        name: of the scene in results.
+        run: workspace, settings and the study's console.
+        command: names the study in the ledger.
 
-def prepared(name: str, workspace: Workspace, settings: Settings, console: Console) -> Scene:
-    """The workspace's passes, made where they are missing. Raises UserError: no test views, too few candidates."""
-    run_stage("prepare", Run(workspace, settings, Console(json_mode=console.json_mode, quiet=True)))
+    Raises UserError: no test views, too few candidates.
+    """
+    workspace, settings, console = run.workspace, run.settings, run.console
+    run_stage("prepare", replace(run, console=Console(json_mode=console.json_mode, quiet=True)))
     views = split_views(workspace)
     if not views.get("test"):
         raise UserError(f"{name}: has no test views to measure on; set cameras.test > 0")
@@ -99,24 +116,24 @@ def prepared(name: str, workspace: Workspace, settings: Settings, console: Conso
     if settings.select.budget > len(train):
         raise UserError(f"a budget of {settings.select.budget} views: {name} has {len(train)} candidate views")
     return Scene(
-        name,
-        workspace,
-        train,
-        {view.name: view for view in views["test"]},
-        workspace.manifest.stages["prepare"].output,
+        name=name,
+        workspace=workspace,
+        console=console,
+        train=train,
+        test={view.name: view for view in views["test"]},
+        inputs=workspace.manifest.stages["prepare"].output,
+        run_id=f"{command}-{int(time.time()):x}",
     )
 
 
-def trace_train(
-    scene: Scene, settings: Settings, console: Console, names: Iterable[str], spp: int | None = None
-) -> dict[str, str]:
+def trace_train(scene: Scene, settings: Settings, names: Iterable[str], spp: int | None = None) -> dict[str, str]:
     """Path-trace the named candidates that are not there yet -> fingerprint of each view's file.
 
-    spp: instead of the settings'; the pictures then lie in a split of their own (:func:`traced_split`).
+    spp: instead of the settings'; the pictures then lie in a split of their own (`traced_split`).
     """
     chosen = set(names)
     wanted = [view for name, view in scene.train.items() if name in chosen]
-    return _trace(scene, settings, console, wanted, traced_split(settings, spp), spp)
+    return _trace(scene.run(settings, "raytrace"), wanted, traced_split(settings, spp), spp)
 
 
 def traced_split(settings: Settings, spp: int | None) -> str:
@@ -124,27 +141,27 @@ def traced_split(settings: Settings, spp: int | None) -> str:
     return "train" if spp in (None, settings.raytrace.spp) else f"train-{spp}spp"
 
 
-def trace_references(scene: Scene, settings: Settings, console: Console) -> dict[str, str]:
+def trace_references(scene: Scene, settings: Settings) -> dict[str, str]:
     """Path-trace the test views, booked as evaluation -> fingerprint of each view's file."""
-    return _trace(scene, settings, console, list(scene.test.values()), "test")
+    return _trace(scene.run(settings, "evaluate"), list(scene.test.values()), "test")
 
 
-def make_bases(scene: Scene, settings: Settings, console: Console, train: Sequence[str]) -> dict[str, str]:
+def make_bases(scene: Scene, settings: Settings, train: Sequence[str]) -> dict[str, str]:
     """Make the base images that ``settings`` call for, of the named candidates and all test views.
 
     -> fingerprint of each view's base image by ``train/NAME`` or ``test/NAME``.
     """
     workspace = scene.workspace
     if settings.model.base == "raster":
-        made = {f"test/{name}": stamp for name, stamp in _raster_test_views(scene, settings, console).items()}
-        return made | {f"train/{name}": scene.inputs for name in train}  # `prepare` drew them
+        drawn = {f"train/{name}": scene.inputs for name in train}  # by `prepare`
+        return drawn | {f"test/{name}": made for name, made in _raster_test_views(scene, settings).items()}
     from ...stages.base_images import base_views
 
     chosen = {"train": [scene.train[name] for name in train], "test": list(scene.test.values())}
     made = {}
     for split, views in chosen.items():
         tasks = base_views(
-            scene.run(settings, console, "evaluate" if split == "test" else "finetune"),
+            scene.run(settings, "evaluate" if split == "test" else "finetune"),
             views,
             split,
             paths=[base_file(workspace, settings.model.base, split, view.name) for view in views],
@@ -165,11 +182,11 @@ def raster_file(workspace: Workspace, view: str) -> Path:
     return workspace.root / "base" / "raster-test" / f"{view}.exr"
 
 
-def _raster_test_views(scene: Scene, settings: Settings, console: Console) -> dict[str, str]:
+def _raster_test_views(scene: Scene, settings: Settings) -> dict[str, str]:
     chosen = read_raster_choice(scene.workspace)
     assert chosen is not None, "stage prepare has chosen one"
     tasks = draw_passes(
-        scene.run(settings, console, "prepare"),
+        scene.run(settings, "prepare"),
         "rasterised test views",
         list(scene.test.values()),
         [raster_file(scene.workspace, name) for name in scene.test],
@@ -179,14 +196,6 @@ def _raster_test_views(scene: Scene, settings: Settings, console: Console) -> di
     return {name: task["fingerprint"] for name, task in zip(scene.test, tasks, strict=True)}
 
 
-def _trace(
-    scene: Scene,
-    settings: Settings,
-    console: Console,
-    views: list[View],
-    split: str,
-    spp: int | None = None,
-) -> dict[str, str]:
-    run = scene.run(settings, console, "evaluate" if split == "test" else "raytrace")
+def _trace(run: Run, views: list[View], split: str, spp: int | None = None) -> dict[str, str]:
     tasks = trace_views(run, views, split, spp=spp)
     return {view.name: task["fingerprint"] for view, task in zip(views, tasks, strict=True)}

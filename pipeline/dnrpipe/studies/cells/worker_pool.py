@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from ...core.console import Console
 from ...core.errors import UserError
@@ -13,11 +12,12 @@ from ...core.settings import Settings
 from ...stages.trainer import torch_device
 from ...workers.answers import answers, warn_of_retries
 from ...workers.view_tasks import TasksFailed, worker_count
+from .tasks import PoolTask
 
 
 @dataclass(frozen=True)
 class WorkerPool:
-    """``device``: torch's. ``threads``: of each worker, 0 = torch's own choice. ``log``: what workers print."""
+    """device: torch's. threads: of each worker, 0 = torch's own choice. log: what workers print."""
 
     device: str
     threads: int
@@ -25,12 +25,12 @@ class WorkerPool:
     log: Path
     console: Console
 
-    def work(self, label: str, module: str, tasks: Sequence[dict[str, Any]]) -> None:
+    def work(self, label: str, module: str, tasks: Sequence[PoolTask]) -> None:
         """Run the tasks whose ``output`` file is missing on workers of ``module``.
 
         Raises TasksFailed after all others are done.
         """
-        due = [task for task in tasks if not Path(task["output"]).exists()]
+        due = [task.model_dump(mode="json") for task in tasks if not task.output.exists()]
         if not due:
             return
         threads = {name: str(self.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")} if self.threads else {}
@@ -67,10 +67,17 @@ def check_amounts(seconds: float | None, seeds: int, jobs: int) -> None:
 
 
 def make_pool(settings: Settings, jobs: int, log: Path, console: Console, *, single: bool = False) -> WorkerPool:
-    """``jobs`` workers, or 0: one per core, one on a GPU.
+    """The workers of a study.
 
-    Cells side by side on a thread each finish more per hour than one after the other on all cores. single: one thread
-    a worker also where there are fewer workers than cores, so that ``jobs`` does not enter what comes out.
+    Cells side by side on a thread each finish more per hour than one after the other on all cores.
+
+    Args:
+        settings: name the device.
+        jobs: workers; 0: one per core, one on a GPU.
+        log: what workers print.
+        console: shows progress and failures.
+        single: one thread a worker also where there are fewer workers than cores, so that ``jobs`` does not enter what
+            comes out.
     """
     device, cores = torch_device(settings), worker_count(0)
     on_gpu = device.startswith("cuda")

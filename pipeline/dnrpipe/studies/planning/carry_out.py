@@ -8,16 +8,14 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
-from dnrtrain.atomic import write_json
-
 from ...core.ledger import StageName, total
 from ...core.scene_files import split_views
 from ...core.units import duration
 from .choose import STEPS, Predictor, cheapest_of_the_best
-from .command import make_predictor, plan_path
+from .make_plan import make_predictor
 from .pilot import read_pilot
 from .quality import Prior, load_prior
-from .records import Choice, Prediction
+from .records import Actual, Choice, Plan, Prediction, write_plan
 
 if TYPE_CHECKING:
     from ...stages.session import Session
@@ -26,49 +24,57 @@ FILLED = 0.97
 """Part of the time left that training is expected to take: being late is worse than a step fewer."""
 
 
-def apply(session: Session, record: dict[str, Any], prior: Prior | None = None) -> dict[str, Any]:
-    """Run the stages with the plan's choice -> the record with ``carried_out``, the choice and its prediction once the
-    steps fit the time left, and ``actual``, what it took and gave; ``plan/plan.json`` holds it. prior: by default the
-    package's.
+def apply(session: Session, plan: Plan, prior: Prior | None = None) -> Plan:
+    """Run the stages with the plan's choice and return the plan as it was carried out, which is written, too.
+
+    ``carried_out`` is the choice once its steps fit the time left; ``actual`` is what it took and gave.
+
+    Args:
+        session: of the workspace; it adopts the plan's settings.
+        plan: with a choice.
+        prior: by default the package's.
     """
     workspace = session.workspace
     before = len(workspace.ledger.read())
     names: list[StageName] = ["select", "raytrace", "finetune"]
     if split_views(workspace).get("test"):
         names.append("evaluate")
-    session.adopt(overrides_of(record))
+    session.adopt(overrides_of(plan))
     session.stages(*names[:2])
-    record = steps_that_fit(session, record, prior or load_prior())
-    session.adopt(overrides_of(record))
-    write_json(plan_path(workspace), record)  # after Ctrl-C the same training goes on
+    plan = steps_that_fit(session, plan, prior or load_prior())
+    session.adopt(overrides_of(plan))
+    write_plan(workspace.root, plan)  # after Ctrl-C the same training goes on
     session.stages(*names[2:])
     answers = session.answers
-    made = {name: answers[name].get("seconds", 0.0) if answers[name]["ran"] else 0.0 for name in names}
+    seconds = {name: answers[name].get("seconds", 0.0) if answers[name]["ran"] else 0.0 for name in names}
     spent = workspace.ledger.read()[before:]
-    actual: dict[str, Any] = {
-        "seconds": {**made, "total": sum(made[name] for name in names[:3])},
-        "cpu_seconds": total(r for r in spent if r.purpose == "training").cpu_seconds,
-        "ran": {name: answers[name]["ran"] for name in names},
-        "psnr": answers.get("evaluate", {}).get("mean", {}).get("psnr"),
-    }
-    record = record | {"actual": actual}
-    write_json(plan_path(workspace), record)
-    return record
+    actual = Actual(
+        seconds={**seconds, "total": sum(seconds[name] for name in names[:3])},
+        cpu_seconds=total(r for r in spent if r.purpose == "training").cpu_seconds,
+        ran={name: answers[name]["ran"] for name in names},
+        psnr=answers.get("evaluate", {}).get("mean", {}).get("psnr"),
+    )
+    plan = plan.model_copy(update={"actual": actual})
+    write_plan(workspace.root, plan)
+    return plan
 
 
-def overrides_of(record: dict[str, Any]) -> dict[str, Any]:
+def overrides_of(plan: Plan) -> dict[str, Any]:
     """The settings that carry out a plan's choice, as it was made or as it is carried out."""
-    choice = (record.get("carried_out") or record["chosen"])["choice"]
+    found = plan.carried_out or plan.chosen
+    assert found is not None  # a plan without a choice is not carried out
     return {
-        "select": {"budget": choice["views"], "policy": record["policy"]},
-        "raytrace": {"spp": choice["spp"]},
-        "finetune": {"step2": {"epochs": choice["epochs"]}},
+        "select": {"budget": found.choice.views, "policy": plan.policy},
+        "raytrace": {"spp": found.choice.spp},
+        "finetune": {"step2": {"epochs": found.choice.epochs}},
     }
 
 
 def steps_within(predictor: Predictor, choice: Choice, seconds: float) -> Prediction:
-    """The choice of the same views and samples with the highest expected PSNR whose training is expected to last
-    ``seconds`` at most: one pass over the views at least. More steps than that may be worse where views are noisy."""
+    """The same views and samples with the steps of the highest expected PSNR within ``seconds`` of training.
+
+    That is one pass over the views at least. More steps may be worse where views are noisy.
+    """
     per_epoch = predictor.choice(choice.views, choice.spp, 1).steps
     one, two = (predictor.wall.finetune(n * per_epoch, n) for n in (1, 2))
     most = max(1, 1 + math.floor((seconds - one) / (two - one)))  # time is a straight line in steps
@@ -77,20 +83,23 @@ def steps_within(predictor: Predictor, choice: Choice, seconds: float) -> Predic
     return cheapest_of_the_best(found)
 
 
-def steps_that_fit(session: Session, record: dict[str, Any], prior: Prior) -> dict[str, Any]:
-    """The record with ``carried_out`` where a plan spends a time; else, with a wanted PSNR or where all was traced by
-    an earlier run, the record as it is."""
-    wanted, answers = record["wanted"]["seconds"], session.answers
+def steps_that_fit(session: Session, plan: Plan, prior: Prior) -> Plan:
+    """The plan with ``carried_out`` where it spends a time.
+
+    With a wanted PSNR, or where all was traced by an earlier run, it stays as it is.
+    """
+    wanted, answers = plan.wanted.seconds, session.answers
     pilot = read_pilot(session.workspace)
-    if wanted is None or record["wanted"]["psnr"] is not None or not answers["raytrace"]["ran"] or pilot is None:
-        return record
+    if wanted is None or plan.wanted.psnr is not None or not answers["raytrace"]["ran"] or pilot is None:
+        return plan
+    assert plan.chosen is not None  # a time chooses
+    choice = plan.chosen.choice
     predictor = make_predictor(session.workspace, session.settings, pilot, prior)
-    chosen = Prediction.model_validate(record["chosen"])
     select = answers["select"]["seconds"] if answers["select"]["ran"] else 0.0
     left = wanted - select - answers["raytrace"]["seconds"]
-    found = steps_within(predictor, chosen.choice, FILLED * left)
+    found = steps_within(predictor, choice, FILLED * left)
     session.console.say(
         f"{duration(max(0.0, left))} of {duration(wanted)} are left for training: {found.choice.steps} steps"
-        f" ({chosen.choice.steps} were planned)"
+        f" ({choice.steps} were planned)"
     )
-    return record | {"carried_out": found.model_dump(mode="json")}
+    return plan.model_copy(update={"carried_out": found})

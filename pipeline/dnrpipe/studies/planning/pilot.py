@@ -20,11 +20,9 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from dnrtrain.atomic import write_json
-from dnrtrain.contract import DamagedFile
 
-from ...core.console import Console
 from ...core.errors import UserError
-from ...core.scene_files import read_json, scene_fingerprint
+from ...core.scene_files import scene_fingerprint
 from ...core.settings import Settings
 from ...core.workspace import Workspace, digest
 from ...effects.plan import EffectPlan
@@ -32,8 +30,8 @@ from ...effects.store import lenses
 from ...stages.base_images import RENDERED, base_renderer
 from ...stages.effect_plan import resolve_plan
 from ...stages.stage import Run
-from .pilot_parts import FOLDER, HELD_OUT, REFERENCE_SPP, RESOLUTION, SPP, STEPS, VIEWS, Piloting
-from .records import LightPart, Pilot, Record
+from .pilot_parts import HELD_OUT, REFERENCE_SPP, RESOLUTION, SPP, STEPS, VIEWS, Piloting
+from .records import FOLDER, LightPart, Pilot, Record
 
 VERSION = 6
 FILE = "pilot.json"
@@ -44,27 +42,28 @@ def pilot_path(workspace: Workspace) -> Path:
     return workspace.root / FOLDER / FILE
 
 
-def run_pilot(workspace: Workspace, settings: Settings, console: Console) -> Pilot:
+def run_pilot(run: Run) -> Pilot:
     """The pilot of the workspace under the settings; parts that are on disk are kept.
 
     Raises UserError: settings that it cannot stand for, or a part that failed twice.
     """
+    workspace, settings = run.workspace, run.settings
     if settings.model.base not in RENDERED:
         raise UserError(
             f"plan: model.base={settings.model.base} has no base image that can be rendered on its own; plan with"
             f" --set model.base=baked (the presets draft and standard), or one of {', '.join(RENDERED)}"
         )
-    run = Run(workspace, settings, console).for_stage("plan")
+    run = run.for_stage("plan")
     plan = resolve_plan(run)
     if plan.on("depth-of-field") and lenses(workspace, settings):
         raise UserError(f"plan: the cameras of {workspace.root} have depth of field, whose frames cannot be timed yet")
     piloting = Piloting(run, plan)
-    stamp = _stamp(workspace, settings, plan)
+    fingerprint = _fingerprint(workspace, settings, plan)
     found = read_pilot(workspace)
     first = piloting.train[0]
-    if found is None or found.fingerprint != stamp:
+    if found is None or found.fingerprint != fingerprint:
         shutil.rmtree(piloting.folder, ignore_errors=True)
-        found = Pilot(fingerprint=stamp, size=(first.width, first.height), load=_load())
+        found = Pilot(fingerprint=fingerprint, size=(first.width, first.height), load=_load())
     bake = found.light is None and not base_renderer(workspace, settings, plan).light_is_baked  # removed, perhaps
     if found.frames is not None and not bake:
         return found
@@ -92,16 +91,13 @@ def run_pilot(workspace: Workspace, settings: Settings, console: Console) -> Pil
 
 def read_pilot(workspace: Workspace) -> Pilot | None:
     """The pilot on disk; None where there is none that this version reads."""
-    path = pilot_path(workspace)
-    if not path.exists():
-        return None
     try:
-        return Pilot.model_validate(read_json(path))
-    except (ValidationError, DamagedFile):  # of another version, or torn: it is run again
+        return Pilot.model_validate_json(pilot_path(workspace).read_bytes())
+    except (FileNotFoundError, ValidationError):  # of another version, or truncated: it is run again
         return None
 
 
-def _stamp(workspace: Workspace, settings: Settings, plan: EffectPlan) -> str:
+def _fingerprint(workspace: Workspace, settings: Settings, plan: EffectPlan) -> str:
     """Hash of all that decides what the pilot measures."""
     step2 = settings.finetune.step2.model_dump(mode="json", exclude={"epochs"})
     return digest(

@@ -1,4 +1,4 @@
-"""What the pilot does: every kind of work once, small, on workers. :mod:`.pilot` keeps it and says what is due."""
+"""What the pilot does: every kind of work once, small, on workers. `pilot` keeps it and says what is due."""
 
 from __future__ import annotations
 
@@ -18,26 +18,27 @@ from ...core.scene_files import split_views
 from ...core.workspace import Workspace
 from ...effects.plan import EffectPlan
 from ...effects.store import trace_config, variant_for
+from ...raytrace.tasks import BaseTask, TracerCommon, TraceTask
 from ...stages.base_images import BaseRenderer, bake_light, base_renderer
 from ...stages.raytrace import view_seed
 from ...stages.stage import Run
 from ...workers.answers import answers, warn_of_retries
 from ...workers.view_tasks import worker_count
-from .records import BasePart, FramePart, LightPart, LightPoint, Traced, TracePart, TrainingPart
+from .pilot_worker import FramesTask, PilotCommon, TrainTask
+from .records import FOLDER, BasePart, FramePart, LightPart, LightPoint, Traced, TracePart, TrainingPart
 
 RESOLUTION = 128
 VIEWS, SPP = 6, 16
 HELD_OUT, REFERENCE_SPP = 6, 64
 STEPS = (100, 300)
 """Two trainings: from the second on, how fast a scene's network still gains is measured, not assumed."""
-RUNGS = (1, 4, 16, 64)
+SAMPLE_COUNTS = (1, 4, 16, 64)
 METHODS = ("raw", "clean16-fast", "clean16")
-"""Path tracing's samples, and what the denoiser is given (:mod:`..frames.rival`)."""
+"""Samples per pixel of path tracing, and what the denoiser is given (`frames.baselines`)."""
 LIGHT_PATHS = 2 * 512 * 512 * 128
 """Paths of a bake of light that the pilot can afford: twice what ``light_spp = auto`` asks for at any size."""
 TIMEOUT = 600.0
 """Seconds after which a part counts as hung: ten times what the whole pilot should take."""
-FOLDER = "plan"
 
 
 @dataclass
@@ -49,7 +50,6 @@ class Piloting:
 
     def __post_init__(self) -> None:
         self.workspace, self.settings, self.console = self.run.workspace, self.run.settings, self.run.console
-        self.run_id = self.run.id
         self.folder = self.workspace.root / FOLDER / "pilot"
         self.train, self.held_out = _views(self.workspace)
 
@@ -58,10 +58,10 @@ class Piloting:
         choice = variant_for(self.plan, self.settings)
         config = trace_config(self.workspace, self.plan, choice.variant)
         workers = 1 if choice.variant.startswith("cuda") else worker_count(self.settings.raytrace.workers)
-        warm = [self._task(self.train[0], f"warm{i}", 1, config) for i in range(workers)]
-        tasks = [self._task(view, f"train-{view.name}", SPP, config) for view in self.train]
-        tasks += [self._task(view, f"held-{view.name}", REFERENCE_SPP, config) for view in self.held_out]
-        common = {"bundle": config["bundle"], "variant": choice.variant, "threads": 1}
+        warm = [self._task(self.train[0], f"warm{i}", 1) for i in range(workers)]
+        tasks = [self._task(view, f"train-{view.name}", SPP) for view in self.train]
+        tasks += [self._task(view, f"held-{view.name}", REFERENCE_SPP) for view in self.held_out]
+        common = TracerCommon(bundle=config["bundle"], variant=choice.variant, threads=1).model_dump(mode="json")
         self._compile("dnrpipe.raytrace.tracer", common, warm[0], choice.environment)
         started = time.monotonic()
         answers = self._run(
@@ -117,11 +117,7 @@ class Piloting:
         if renderer.light is not None:
             common |= {"light": str(self._light(renderer))}
         tasks = [
-            {
-                "view": view.model_dump(mode="json"),
-                "output": str(self._base_file(kind, view)),
-                "fingerprint": self.run_id,
-            }
+            BaseTask(view=view, output=self._base_file(kind, view), fingerprint=self.run.id).model_dump(mode="json")
             for kind, views in (("train", self.train), ("held", self.held_out))
             for view in views
         ]
@@ -140,47 +136,33 @@ class Piloting:
     def training(self) -> TrainingPart:
         """Short step 2s."""
         view = self.train[0]
-        task = {
-            "kind": "train",
-            "views": [view.model_dump(mode="json") for view in self.train],
-            "base_files": [str(self._base_file("train", view)) for view in self.train],
-            "images": [str(self._image(f"train-{view.name}")) for view in self.train],
-            "folders": [str(folder) for folder in self._models()],
-            "fingerprint": self.run_id,
-            "epochs": [max(2, round(steps / self._steps_per_epoch())) for steps in STEPS],
-        }
-        ((_, result),) = self._run("pilot: training", "dnrpipe.studies.planning.worker", self._common(), [task], 1, {})
-        patch = self.settings.finetune.step2.patch or max(view.width, view.height)
-        return TrainingPart(
-            views=len(self.train),
-            spp=SPP,
-            steps=result["steps"],
-            pixels=min(patch, view.width) * min(patch, view.height),
-            seconds=result["seconds"],
-            cpu_seconds=result["cpu_seconds"],
-            between=result["between"],
-            cpu_between=result["cpu_between"],
-            startup=result["startup"],
-            threads=result["threads"],
+        task = TrainTask(
+            views=self.train,
+            base_files=[self._base_file("train", view) for view in self.train],
+            images=[self._image(f"train-{view.name}") for view in self.train],
+            folders=self._models(),
+            epochs=[max(2, round(steps / self._steps_per_epoch())) for steps in STEPS],
+            fingerprint=self.run.id,
         )
+        result = self._ask("pilot: training", task, {})
+        patch = self.settings.finetune.step2.patch or max(view.width, view.height)
+        pixels = min(patch, view.width) * min(patch, view.height)
+        return TrainingPart(views=len(self.train), spp=SPP, pixels=pixels, **result)
 
     def frames(self) -> FramePart:
         """The held-out views, by all renderers."""
         renderer = base_renderer(self.workspace, self.settings, self.plan)
-        task = {
-            "kind": "frames",
-            "views": [view.model_dump(mode="json") for view in self.held_out],
-            "folders": [str(folder) for folder in self._models()],
-            "light": str(self._light(renderer)) if renderer.light is not None else None,
-            "samples": list(RUNGS),
-            "methods": list(METHODS),
-        }
-        ((_, result),) = self._run(
-            "pilot: frames", "dnrpipe.studies.planning.worker", self._common(), [task], 1, renderer.environment
+        task = FramesTask(
+            views=self.held_out,
+            folders=self._models(),
+            light=self._light(renderer) if renderer.light is not None else None,
+            samples=list(SAMPLE_COUNTS),
+            methods=list(METHODS),
         )
+        result = self._ask("pilot: frames", task, renderer.environment)
         if lost := result.pop("unknown"):
             self.console.warn(f"pilot: {lost} pixels of the held-out views were not finite; they take no part")
-        return FramePart.model_validate(result | {"views": len(self.held_out)})
+        return FramePart(views=len(self.held_out), **result)
 
     # -- what the parts share --------------------------------------------------------------------------
 
@@ -217,23 +199,29 @@ class Piloting:
                 bar.advance()
         return found
 
-    def _task(self, view: View, name: str, spp: int, config: dict[str, Any]) -> dict[str, Any]:
-        task: dict[str, Any] = {
-            "view": view.model_dump(mode="json"),
-            "output": str(self._image(name)),
-            "spp": spp,
-            "integrator": self.plan.integrator,
-            "max_depth": self.plan.max_depth,
-            "lens": None,
-            "seed": view_seed(self.settings.raytrace.seed, "pilot", name),
-            "fingerprint": self.run_id,
-        }
-        return task | ({"denoise": True} if self.settings.raytrace.denoise else {})
-
-    def _common(self) -> dict[str, Any]:
+    def _ask(self, label: str, task: TrainTask | FramesTask, environment: dict[str, str]) -> dict[str, Any]:
+        """The answer of `pilot_worker`."""
         model = self.plan.model(self.settings.model)
-        settings = self.settings.model_copy(update={"model": model}).model_dump(mode="json")
-        return {"workspace": str(self.workspace.root), "settings": settings, "threads": 0}
+        settings = self.settings.model_copy(update={"model": model})
+        common = PilotCommon(workspace=self.workspace.root, settings=settings).model_dump(mode="json")
+        tasks = [task.model_dump(mode="json")]
+        ((_, result),) = self._run(label, "dnrpipe.studies.planning.pilot_worker", common, tasks, 1, environment)
+        return result
+
+    def _task(self, view: View, name: str, spp: int) -> dict[str, Any]:
+        """Trace a view into a picture of the pilot."""
+        assert self.plan.max_depth is not None  # the plan is resolved
+        task = TraceTask(
+            view=view,
+            output=self._image(name),
+            spp=spp,
+            integrator=self.plan.integrator,
+            max_depth=self.plan.max_depth,
+            seed=view_seed(self.settings.raytrace.seed, "pilot", name),
+            denoise=self.settings.raytrace.denoise,
+            fingerprint=self.run.id,
+        )
+        return task.model_dump(mode="json")
 
     def _steps_per_epoch(self) -> int:
         return math.ceil(len(self.train) / self.settings.finetune.step2.batch)

@@ -5,10 +5,21 @@ Seconds are on the wall clock unless ``cpu_`` says processor time. PSNR is in di
 
 from __future__ import annotations
 
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from dnrtrain.atomic import write_json
+
+from ...core.errors import UserError
+
+FOLDER = "plan"
+SCHEMA = 1
+OPTIONAL = frozenset({"routes", "routes_psnr", "break_even", "train", "carried_out", "actual"})
+"""Keys of ``plan.json`` that are absent where they were not asked for or have not happened."""
+RENDERER_STAGES = ("select", "raytrace", "finetune")
+"""Stages until the renderer is there."""
 Clock = Literal["seconds", "cpu_seconds"]
 
 
@@ -91,8 +102,11 @@ class FramePoint(Record):
 
 
 class FramePart(Record):
-    """Frames of the pilot's held-out views. neural: a point per training. deviation: of the base image's PSNR over
-    these views, dB."""
+    """Frames of the pilot's held-out views.
+
+    neural: a point per training. rival: path tracing with a denoiser, the baselines. deviation: of the base image's
+    PSNR over these views, dB.
+    """
 
     base: FramePoint
     neural: list[FramePoint]
@@ -162,3 +176,100 @@ class Route(Record):
     total: float
     psnr: float | None
     reaches: bool
+
+
+class Wanted(Record):
+    """What was asked for; all None: a table of budgets. seconds: of work from here on. frames: to be rendered."""
+
+    seconds: float | None = None
+    psnr: float | None = None
+    frames: int | None = None
+
+
+class PilotFacts(Record):
+    """The pilot that a plan counts on. load: of the machine while it ran."""
+
+    fingerprint: str
+    seconds: float
+    load: float | None
+
+
+class PriorFacts(Record):
+    """The prior that a plan counts on; see `quality.Prior`."""
+
+    source: str
+    scenes: list[str]
+    sd: float
+
+
+class Actual(Record):
+    """What carrying the plan out took and gave. seconds: by stage, ``total`` is without evaluation. ran: by stage,
+    False where it was done before."""
+
+    seconds: dict[str, float]
+    cpu_seconds: float
+    ran: dict[str, bool]
+    psnr: float | None
+
+
+class Plan(Record):
+    """``plan/plan.json``.
+
+    Args:
+        made: unix seconds.
+        base_psnr: of the base image alone, as a report would measure it.
+        gain: dB that the network adds with many views and steps.
+        chosen: None where a table was asked for, or where nothing reaches the target.
+        table: what each of a row of budgets buys.
+        settings_default: the settings as they are.
+        routes: to the wanted frames at ``routes_psnr``, the cheapest first.
+        break_even: frames from which on training is cheaper than path tracing; None where it never is.
+        train: whether the neural renderer is the cheapest route.
+        carried_out: the choice once its steps fit the time that ray tracing left.
+        actual: what that took and gave.
+    """
+
+    model_config = ConfigDict(populate_by_name=True)
+
+    schema_version: Literal[1] = Field(default=SCHEMA, alias="schema")
+    made: float
+    wanted: Wanted
+    pilot: PilotFacts
+    policy: str
+    base_psnr: float
+    gain: float
+    chosen: Prediction | None
+    table: list[Prediction]
+    prior: PriorFacts
+    settings_default: Prediction
+    routes: list[Route] | None = None
+    routes_psnr: float | None = None
+    break_even: int | None = None
+    train: bool | None = None
+    carried_out: Prediction | None = None
+    actual: Actual | None = None
+
+    def data(self) -> dict[str, Any]:
+        """As it stands in the file."""
+        return self.model_dump(mode="json", by_alias=True, exclude=set(OPTIONAL - self.model_fields_set))
+
+
+def plan_path(root: Path) -> Path:
+    """``plan/plan.json`` of a workspace's folder."""
+    return root / FOLDER / "plan.json"
+
+
+def read_plan(root: Path) -> Plan | None:
+    """The plan of a workspace's folder, None where there is none. Raises UserError: damaged, or of another version."""
+    path = plan_path(root)
+    try:
+        return Plan.model_validate_json(path.read_bytes())
+    except FileNotFoundError:
+        return None
+    except ValidationError:
+        raise UserError(f"{path}: damaged; run `dnrpipe plan` again") from None
+
+
+def write_plan(root: Path, plan: Plan) -> None:
+    """Write ``plan/plan.json``, atomically."""
+    write_json(plan_path(root), plan.data())

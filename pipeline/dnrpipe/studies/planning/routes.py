@@ -4,8 +4,8 @@ alone, and the neural renderer.
     total(N) = upfront + N * frame
     N*       = upfront of the neural renderer / (frame of path tracing - frame of the neural renderer), at equal PSNR
 
-Path tracing's frame is read off its measured ladder (:mod:`..frames.ladder`): dB is linear in log(ms) between the rungs
-that nothing beats. Beyond the last rung the last step's slope goes on, and the route says so.
+Path tracing's frame is read off the pilot's baselines (`frames.pareto_front`): dB is linear in log(ms) between those
+that nothing beats. Beyond the last one the slope of the last step goes on, and the route says so.
 """
 
 from __future__ import annotations
@@ -14,26 +14,22 @@ import math
 from collections.abc import Sequence
 
 from ...core.ledger import break_even_frames
-from ..frames.ladder import crossover, frontier
+from ..frames.pareto_front import crossover, frontier
 from .quality import with_noise
 from .records import FramePart, FramePoint, Prediction, Route
 
 FURTHEST = 64.0
-"""How many times the last rung's time the ladder is followed beyond its end."""
+"""How many times the last baseline's time the slope is followed beyond it."""
 
 
-def rival_line(part: FramePart, only: str | None = None) -> list[tuple[str, float, float]]:
-    """(name, seconds, PSNR) of the rungs that nothing beats, cheapest first.
-
-    only: the end of a method's name (``raw``), else all methods.
-    """
-    rungs = {p.name: p for p in part.rival if only is None or p.name.endswith(only)}
-    points = {name: (p.ms / 1000, p.psnr) for name, p in rungs.items()}
+def baseline_front(part: FramePart) -> list[tuple[str, float, float]]:
+    """(name, seconds, PSNR) of the baselines that nothing beats, cheapest first."""
+    points = {point.name: (point.ms / 1000, point.psnr) for point in part.rival}
     return [(name, *points[name]) for name in frontier(points)]
 
 
 def seconds_for(line: Sequence[tuple[str, float, float]], psnr: float) -> tuple[float, bool] | None:
-    """(seconds of a frame at ``psnr``, whether that lies beyond the ladder); None where it cannot be told."""
+    """(seconds of a frame at ``psnr``, whether that lies beyond the baselines); None where it cannot be told."""
     points = [(seconds, quality) for _, seconds, quality in line]
     found = crossover(points, psnr)
     if found is not None:
@@ -62,22 +58,33 @@ def as_reported(part: FramePart, reference: float) -> FramePart:
 
 
 def routes(
-    part: FramePart, neural: Prediction | None, light_seconds: float, scale: float, psnr: float, frames: int
+    part: FramePart,
+    neural: Prediction | None,
+    light_seconds: float,
+    scale: float,
+    psnr: float,
+    frames: int,
 ) -> list[Route]:
     """All routes to ``frames`` frames at ``psnr`` dB, the cheapest that reaches it first.
 
-    neural: the cheapest choice that reaches it, None where none does. scale: pixels of a frame over the pilot's.
+    Args:
+        part: frames of the pilot.
+        neural: the cheapest choice that reaches ``psnr``, None where none does.
+        light_seconds: of baking the light.
+        scale: pixels of a frame over the pilot's.
+        psnr: dB wanted.
+        frames: number of them.
     """
     found: list[Route] = []
-    line = rival_line(part)
+    line = baseline_front(part)
     answer = seconds_for(line, psnr)
     if answer is None:
         name, seconds, quality = line[-1]
-        what = f"its best rung, {name}, ends at {quality:.1f} dB"
+        what = f"its best, {name}, ends at {quality:.1f} dB"
         found.append(_route("path tracing + denoiser", what, 0.0, seconds * scale, frames, quality, quality >= psnr))
     else:
         seconds, beyond = answer
-        what = "beyond the pilot's ladder, extrapolated" if beyond else _between(line, seconds)
+        what = "beyond the pilot's samples, extrapolated" if beyond else _between(line, seconds)
         found.append(_route("path tracing + denoiser", what, 0.0, seconds * scale, frames, psnr, True))
     base = part.base.psnr
     alone = part.base.ms / 1000 * scale

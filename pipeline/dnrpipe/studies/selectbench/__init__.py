@@ -1,15 +1,15 @@
 """`dnrpipe bench-select`: policies of view selection on the same scenes, candidates, budgets, model and time.
 
-pools      sets of candidates: a workspace per scene and pool
-rigs       cameras of the pools that are no spheres
-policies   what competes, as data
-choosing   one selection, in a worker process
-active/    rivals from the literature that train renderers of their own
-run        the resumable loop: selections, ray tracing of what was chosen, cells (those of `dnrpipe ablate`)
-results    results.json: all cells and what made them
-intervals  paired differences and their confidence
-figures    numbers of a table from results.json
-tables     the report in Markdown
-plot       curves against views and against seconds
-command    options in, files out
+pools          sets of candidates: a workspace per scene and pool
+rigs           cameras of the pools that are no spheres
+policies       what competes, as data
+bench_select   options in, files out
+bench          the resumable loop: selections, ray tracing of the chosen views, cells (those of `dnrpipe ablate`)
+rule_worker    one selection by a rule, in a worker process
+active/        baselines from the literature that train renderers of their own
+bench_results  results.json: all cells and what made them
+figures        numbers of a table from results.json
+intervals      paired differences and their confidence
+bench_tables   the report in Markdown
+bench_plots    curves against views and against seconds
 """

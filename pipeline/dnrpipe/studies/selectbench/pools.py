@@ -15,11 +15,11 @@ from ...core.console import Console
 from ...core.errors import UserError
 from ...core.scene_files import read_summary
 from ...core.settings import Settings
-from ...core.workspace import Source, Workspace, file_sha256
+from ...core.workspace import Workspace, file_sha256
 from ...stages.base_images import light_path
 from ...stages.prepare import scene_and_views
 from ...stages.stage import Run
-from ..cells.scenes import Scene, prepared
+from ..cells.scenes import Scene, prepared, scene_workspace
 from .rigs import inside, walk
 
 POOLS: dict[str, str] = {
@@ -67,9 +67,8 @@ class Placed:
 
     def prepare(self, console: Console) -> Pool:
         """Render the passes that are missing. Raises UserError: fewer candidates than the largest budget."""
-        data = prepared(f"{self.scene}-{self.name}", self.workspace, self.settings, console)
-        data.run_id = data.run_id.replace("ablate", "bench-select")
-        return Pool(self.scene, self.name, data)
+        run = Run(self.workspace, self.settings, console)
+        return Pool(self.scene, self.name, prepared(f"{self.scene}-{self.name}", run, "bench-select"))
 
 
 def place_pool(source: Path, pool: str, out: Path, settings: Settings, console: Console) -> Placed:
@@ -80,7 +79,7 @@ def place_pool(source: Path, pool: str, out: Path, settings: Settings, console: 
     """
     first = _converted(source, out, settings, console)
     root = out / "scenes" / f"{source.stem}-{pool}.dnr"
-    workspace = Workspace.create(root, _source(source))
+    workspace = scene_workspace(source, root)
     for folder in ("scene", "bakes"):
         _copy_tree(first.root / folder, root / folder)
     settings = settings.model_copy(deep=True)
@@ -129,15 +128,11 @@ def share_light(pools: Sequence[Pool]) -> None:
 
 def _converted(source: Path, out: Path, settings: Settings, console: Console) -> Workspace:
     """The scene converted, once for all its pools."""
-    workspace = Workspace.create(out / "scenes" / f"{source.stem}.dnr", _source(source))
+    workspace = scene_workspace(source, out / "scenes" / f"{source.stem}.dnr")
     plain = settings.model_copy(deep=True)
     plain.cameras.source, plain.cameras.source_sha256 = "dome", ""
     scene_and_views(Run(workspace, plain, Console(json_mode=console.json_mode, quiet=True), id="bench-select"))
     return workspace
-
-
-def _source(source: Path) -> Source:
-    return Source(path=str(source), sha256=file_sha256(source))
 
 
 def _copy_tree(source: Path, target: Path) -> None:

@@ -1,8 +1,12 @@
-"""How much active learning trains; imports no torch."""
+"""How much active learning trains, and what its worker is asked; imports no torch."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+
+from ....core.settings import Settings
+from ...cells.tasks import StudyTask
 
 
 @dataclass(frozen=True)
@@ -18,3 +22,12 @@ class ActiveSettings:
     members: int = 3
     rounds: int = 2
     epochs: int = 10
+
+
+class ActiveTask(StudyTask):
+    """Choose views of a pool by active learning -> `SelectionResult`. folder: of its trainings, removed at the end."""
+
+    settings: Settings
+    policy: str
+    seed: int
+    folder: Path

@@ -1,12 +1,12 @@
 """What a workspace cost before its first frame, and what that means for N frames.
 
     total(N) = upfront + N * frame
-    N*       = upfront / (frame of the rival at our PSNR - our frame)
+    N*       = upfront / (frame of path tracing at our PSNR - our frame)
 
-Processor seconds of the ledger, which other work on the machine does not stretch: passes, tracing, baked light and base
-images over the threads, which they keep busy; training undivided, as its steps keep hardly more than one thread busy.
-All epochs do the same work and other work on the machine only ever adds to them, so each counts as much as the quarter
-that was disturbed least. The conversion of the scene, which both sides need, is left out.
+Processor seconds of the ledger (`upfront_work`), which other work on the machine does not stretch. Passes, tracing,
+baked light and base images are divided by the threads, which they keep busy; training is not, as its steps keep hardly
+more than one thread busy. All epochs do the same work, and other work on the machine only adds to them, so each counts
+as much as the least disturbed quarter. The conversion of the scene, which both sides need, is left out.
 """
 
 from __future__ import annotations
@@ -16,57 +16,59 @@ from typing import Any
 
 import numpy as np
 
-from dnrpipe.core.ledger import CostRecord, break_even_frames
-from dnrpipe.studies.frames.ladder import quality_at
+from dnrpipe.core.ledger import CostRecord, UpfrontPart, break_even_frames, total, upfront_work
 from dnrpipe.studies.frames.ours import NEURAL
+from dnrpipe.studies.frames.pareto_front import quality_at
 
 COUNTS = (200, 2000)
 """Numbers of frames that the tables speak of."""
+TRACING: tuple[UpfrontPart, ...] = ("selection", "tracing", "light", "base images")
+"""What the tables call tracing."""
 
 
 def upfront(records: Sequence[CostRecord], threads: int) -> dict[str, float]:
     """Seconds by kind of work, ``total`` among them; each unit at its last cost."""
-    latest = {
-        (r.stage, r.unit, r.name): r
-        for r in records
-        if r.purpose == "training" and not r.cache_hit and r.stage in ("prepare", "select", "raytrace", "finetune")
+    work = upfront_work(records)
+    views = [record for part in TRACING for record in work[part]]
+    epochs = [record.cpu_seconds for record in work["training"]]
+    found = {
+        "passes": total(work["passes"]).cpu_seconds / threads,
+        "tracing": total(views).cpu_seconds / threads,
+        "training": len(epochs) * float(np.quantile(epochs, 0.25)) if epochs else 0.0,
     }
-    found = {"passes": 0.0, "tracing": 0.0, "training": 0.0}
-    epochs = []
-    for (stage, unit, _), record in latest.items():
-        if unit == "epoch":
-            epochs.append(record.cpu_seconds)
-        elif (stage, unit) != ("prepare", "scene"):
-            found["passes" if stage == "prepare" else "tracing"] += record.cpu_seconds / threads
-    if epochs:
-        found["training"] = len(epochs) * float(np.quantile(epochs, 0.25))
     return {**found, "total": sum(found.values())}
 
 
 def at_equal_time(scene: Mapping[str, Any], frames: int) -> dict[str, Any]:
-    """The best of our numbers of rays for so many frames: its name, dB, ms per frame all told, and the rival's dB in
-    that time."""
+    """The best of our numbers of rays for so many frames.
+
+    Its name, dB, ms per frame all told, and as ``rival`` the dB of path tracing in that time.
+    """
     line = _line(scene)
     found = []
     for name in scene["standing"]:
         if name.startswith(NEURAL):
             row = scene["rows"][name]
             ms = row["ms"] + 1000 * scene["upfront"]["total"] / frames
-            rival = quality_at(line, ms)
-            found.append({"name": name, "psnr": row["psnr"], "ms": ms, "rival": line[0][1] if rival is None else rival})
+            traced = quality_at(line, ms)
+            traced = line[0][1] if traced is None else traced
+            found.append({"name": name, "psnr": row["psnr"], "ms": ms, "rival": traced})
     return max(found, key=lambda one: one["psnr"] - one["rival"])
 
 
 def break_even(scene: Mapping[str, Any]) -> tuple[str, int, bool] | None:
-    """(our number of rays, frames from which on ours is cheaper than the rival at equal PSNR, whether the ladder ends
-    below us, so that it is that many at most); the fewest frames of all numbers of rays. None: never."""
+    """From how many frames on ours is cheaper than path tracing at equal PSNR; None: never.
+
+    (our number of rays, frames, whether path tracing ends below us, so that it is that many at most): the fewest frames
+    of all numbers of rays.
+    """
     found = []
     for name, standing in scene["standing"].items():
         if not name.startswith(NEURAL):
             continue
         level = standing["crossover_ms"]
-        rival = standing["ladder_end_ms"] if level is None else level
-        frames = break_even_frames(scene["upfront"]["total"], rival / 1000, scene["rows"][name]["ms"] / 1000)
+        traced = standing["ladder_end_ms"] if level is None else level
+        frames = break_even_frames(scene["upfront"]["total"], traced / 1000, scene["rows"][name]["ms"] / 1000)
         if frames is not None:
             found.append((name, frames, level is None))
     return min(found, key=lambda one: one[1]) if found else None

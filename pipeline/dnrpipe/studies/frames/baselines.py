@@ -1,4 +1,4 @@
-"""The rival's ladder: path tracing at a few samples, and Open Image Denoise with what can be had for little time.
+"""The baselines: path tracing at a few samples per pixel, and Open Image Denoise with what little time can buy.
 
 Methods
     raw            as traced
@@ -13,6 +13,7 @@ are a kernel of their own, far cheaper than Mitsuba's ``aov`` integrator around 
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -54,8 +55,8 @@ METHODS: dict[str, Method] = {
 
 
 @dataclass
-class Rung:
-    """One way of rendering: milliseconds of its parts and display pictures, view by view.
+class Baseline:
+    """One way of path tracing: milliseconds of its parts and display pictures, view by view.
 
     masked: pixels of them that were not finite, and are black.
     """
@@ -75,13 +76,20 @@ class Rung:
         return float(np.median(np.sum(list(self.parts.values()), axis=0)))
 
 
-def make_rungs(samples: tuple[int, ...], methods: tuple[str, ...] = tuple(METHODS)) -> dict[str, Rung]:
-    rungs = [Rung(spp, method) for spp in samples for method in methods]
-    return {rung.name: rung for rung in rungs}
+def make_baselines(sample_counts: Sequence[int], methods: Sequence[str] = tuple(METHODS)) -> dict[str, Baseline]:
+    """Every method at every number of samples, by name; nothing is rendered yet."""
+    baselines = [Baseline(spp, method) for spp in sample_counts for method in methods]
+    return {baseline.name: baseline for baseline in baselines}
 
 
-def climb(scene: BenchScene, view: View, seed: int, clock: Clock, rungs: dict[str, Rung]) -> None:
-    """Render the view on every rung. What rungs share (paths, primary rays) is rendered once and booked on each.
+def render_baselines(
+    scene: BenchScene,
+    view: View,
+    seed: int,
+    clock: Clock,
+    baselines: Mapping[str, Baseline],
+) -> None:
+    """Render the view by every baseline. What they share (paths, primary rays) is rendered once and counts for each.
 
     Kernels and filters must be warm: call once and forget the result. Pictures are kept as float16, display over white.
     """
@@ -91,22 +99,22 @@ def climb(scene: BenchScene, view: View, seed: int, clock: Clock, rungs: dict[st
 
     paths: dict[int, tuple[tuple[np.ndarray, int], float]] = {}
     guides: dict[int, tuple[Any, float]] = {0: (None, 0.0)}
-    for rung in rungs.values():
-        method = METHODS[rung.method]
-        if rung.spp not in paths:
-            paths[rung.spp] = clock.time(partial(traced, rung.spp))
-        rays = rung.spp if method.rays < 0 else method.rays
+    for baseline in baselines.values():
+        method = METHODS[baseline.method]
+        if baseline.spp not in paths:
+            paths[baseline.spp] = clock.time(partial(traced, baseline.spp))
+        rays = baseline.spp if method.rays < 0 else method.rays
         if rays not in guides:
             guides[rays] = clock.time(partial(scene.frames.auxiliary, view, rays, seed + 7919 * rays))
-        ((image, lost), path_ms), (guide, rays_ms), denoiser_ms = paths[rung.spp], guides[rays], 0.0
-        rung.masked += lost
+        ((image, lost), path_ms), (guide, rays_ms), denoiser_ms = paths[baseline.spp], guides[rays], 0.0
+        baseline.masked += lost
         if method.denoise:
             image, denoiser_ms = clock.time(partial(_denoised, image, guide, method, rays))
         if guide is not None:
             image = np.concatenate([image[..., :3], guide.coverage[..., None]], axis=-1)
         for part, ms in (("path", path_ms), ("primary rays", rays_ms), ("denoiser", denoiser_ms)):
-            rung.parts.setdefault(part, []).append(ms)
-        rung.pictures.append(scene.shown(image).half())
+            baseline.parts.setdefault(part, []).append(ms)
+        baseline.pictures.append(scene.shown(image).half())
 
 
 def _denoised(image: np.ndarray, guide: Any, method: Method, rays: int) -> np.ndarray:

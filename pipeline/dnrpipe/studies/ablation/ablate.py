@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,12 +14,13 @@ from ...core.settings import merge, parse_assignment, resolve
 from ...core.workspace import locked
 from ..cells.measure import pictured
 from ..cells.scenes import find_scenes
+from ..cells.tasks import read_cell
 from ..cells.worker_pool import check_amounts
-from .plot import contact_sheet, plot
-from .results import gather
+from .ablation_plots import contact_sheet, plot
+from .ablation_results import gather
+from .ablation_tables import markdown
+from .cell_loop import Ablation, Request
 from .rows import choose_rows
-from .run import Ablation, Request
-from .tables import markdown
 
 SMOKE: dict[str, Any] = {
     "cameras": {"train": 6, "val": 1, "test": 2, "width": 32, "height": 32},
@@ -95,8 +95,7 @@ def run_ablation(
 def _write(ablation: Ablation, facts: dict[str, Any]) -> dict[str, Any]:
     """Results, tables, plot and pictures of the cells that are there."""
     request = ablation.request
-    files = {place: request.out / "cells" / place[0] / f"{key}.json" for place, key in ablation.cells.items()}
-    results = gather(files, request.rows, {**facts, "device": ablation.device, "threads": ablation.threads})
+    results = gather(ablation.cells, request.rows, {**facts, "device": ablation.device, "threads": ablation.threads})
     if not results["cells"]:
         return results
     write_json(request.out / "results.json", results)
@@ -107,8 +106,7 @@ def _write(ablation: Ablation, facts: dict[str, Any]) -> dict[str, Any]:
         pictures = [("reference", folder / "truth.png")]
         for cell in results["cells"]:
             if cell["scene"] == scene and cell["seed"] == 0:
-                tests = json.loads((folder / f"{cell['key']}.json").read_text(encoding="utf-8"))["tests"]
-                psnr = pictured(tests)["psnr"]
+                psnr = pictured(read_cell(folder / f"{cell['key']}.json").tests)["psnr"]
                 pictures.append((f"{cell['row']} {psnr:.1f} dB", folder / f"{cell['key']}.png"))
         if len(pictures) > 1 and all(path.exists() for _, path in pictures):
             contact_sheet(pictures, request.out / "pictures" / f"{scene}.png")

@@ -1,4 +1,4 @@
-"""The report of a benchmark from its ``results.json``: ``python -m dnrpipe.studies.selectbench.tables results.json``.
+"""The Markdown report of a benchmark: ``python -m dnrpipe.studies.selectbench.bench_tables results.json``.
 
 With several files, runs on other scenes with the same pools, one table of all of them.
 """
@@ -11,11 +11,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..cells.tables import NONE, code_of, spread, table
+from ..cells.markdown import NONE, code_of, spread, table
+from .bench_results import read_results
 from .figures import SPHERICAL, Figures
 from .intervals import LEVEL, Difference
 from .pools import POOLS
-from .results import read_results
 
 METRICS = (("psnr", "PSNR", 2), ("psnr_mask", "PSNR in mask", 2), ("ssim", "SSIM", 4), ("lpips_vgg", "LPIPS VGG", 4))
 TIMES = (("select_seconds", "selection, s", 2), ("total_seconds", "total, s", 0))

@@ -1,4 +1,4 @@
-"""Markdown tables of an ablation: ``python -m dnrpipe.studies.ablation.tables results.json``."""
+"""Markdown tables of an ablation: ``python -m dnrpipe.studies.ablation.ablation_tables results.json``."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..cells.markdown import NONE, code_of, spread, table
 from ..cells.scenes import HARD_LIGHT
-from ..cells.tables import NONE, code_of, spread, table
-from .results import known_rows, read_results
+from .ablation_results import known_rows, read_results
 from .rows import ROWS
 
 # Wu, Li, Wei: DNRSelect, table I (25 views, NeRF-Synthetic, 800²): PSNR, SSIM, LPIPS.

@@ -1,34 +1,34 @@
-"""The sweep: every point is a row of an ablation, so that workers, shared coarse models and resuming are those of
-:mod:`..ablation.run`. Views, references and base images are traced once, into the workspace itself.
+"""The sweep: every point is a row of an ablation, so that it shares its workers, coarse models and resuming.
+
+Views, references and base images are traced once, into the workspace itself.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ...core.console import Console
 from ...core.errors import UserError
 from ...core.settings import Settings
 from ...core.workspace import Workspace
-from ..ablation.rows import CLASSIC, ROWS, Row
-from ..ablation.run import Ablation, Request
+from ...stages.stage import Run
+from ..ablation.cell_loop import Ablation, Request
+from ..ablation.rows import CLASSIC, ROWS, Row, ViewChoice
 from ..cells.scenes import Scene, prepared
 
-RIVALS = ("random", "all", "paper")
+OTHERS = ("random", "all", "paper")
 """Other ways to train, compared at the settings' own samples and epochs."""
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """budgets (views), samples per pixel, optimiser steps: every combination is trained. also: of RIVALS."""
+    """budgets (views), samples per pixel, optimiser steps: every combination is trained. also: of OTHERS."""
 
     budgets: tuple[int, ...]
     samples: tuple[int, ...]
     steps: tuple[int, ...]
-    also: tuple[str, ...] = RIVALS
+    also: tuple[str, ...] = OTHERS
 
     def rows(self, settings: Settings) -> list[Row]:
         """All points as rows; the base image alone last. Raises UserError: no paper row at these sizes."""
@@ -58,9 +58,9 @@ class Sweep:
         return found
 
     @staticmethod
-    def _row(name: str, views: int | None, spp: int, epochs: int, views_by: str = "farthest") -> Row:
+    def _row(name: str, views: int | None, spp: int, epochs: int, views_by: ViewChoice = "farthest") -> Row:
         changes = {"finetune": {"step2": {"epochs": epochs}}}
-        return Row(name, name, "dnr", changes, views_by, budget=views, spp=spp)  # type: ignore[arg-type]
+        return Row(name, name, "dnr", changes, views_by, budget=views, spp=spp)
 
 
 @dataclass
@@ -71,23 +71,27 @@ class Frontier(Ablation):
 
     def _open(self, source: Path) -> Scene:
         assert self.workspace is not None
-        scene = prepared(source.stem, self.workspace, self.request.base, self.console)
-        scene.run_id = f"frontier-{int(time.time()):x}"
-        return scene
+        return prepared(source.stem, Run(self.workspace, self.request.base, self.console), "frontier")
 
     @property
     def scene(self) -> Scene:
-        """The scene, once :meth:`run` has prepared it."""
+        """The scene, once `run` has prepared it."""
         return self.scenes[0]
 
 
-def make_frontier(
-    workspace: Workspace, settings: Settings, rows: Sequence[Row], out: Path, jobs: int, seeds: int, console: Console
-) -> Frontier:
-    """The run over ``rows``; cells go to ``out``."""
+def make_frontier(run: Run, rows: Sequence[Row], out: Path, jobs: int, seeds: int) -> Frontier:
+    """The sweep over ``rows``.
+
+    Args:
+        run: workspace, settings and console.
+        rows: all points.
+        out: cells go there.
+        jobs: cells side by side; 0: one per core.
+        seeds: trainings of every point.
+    """
     largest = max((row.budget or 1 for row in rows), default=1)
-    base = settings.model_copy(deep=True)
+    base = run.settings.model_copy(deep=True)
     base.select.budget = largest
-    source = Path(f"{workspace.root.name.removesuffix('.dnr')}.blend")
+    source = Path(f"{run.workspace.root.name.removesuffix('.dnr')}.blend")
     request = Request([source], list(rows), seeds, base, {}, None, out, jobs)
-    return Frontier(request, console, workspace=workspace)
+    return Frontier(request, run.console, workspace=run.workspace)

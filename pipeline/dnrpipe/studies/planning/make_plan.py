@@ -1,84 +1,63 @@
-"""`dnrpipe plan` behind its options: pilot, prediction, choice; ``plan/plan.json``."""
+"""`dnrpipe plan` behind its options: pilot, prediction, choice; writes ``plan/plan.json``."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
-from dnrtrain.atomic import write_json
-from dnrtrain.contract import DamagedFile
 from dnrtrain.selector.names import TRAINED_NAMES
 
-from ...core.console import Console
 from ...core.errors import UserError
-from ...core.scene_files import read_json, split_views
+from ...core.scene_files import split_views
 from ...core.settings import Settings
 from ...core.workspace import Workspace
 from ...effects.store import plan_of
 from ...stages.base_images import base_renderer
+from ...stages.stage import Run
 from .choose import Predictor, best_within, budgets, cheapest_reaching
-from .pilot import FOLDER, run_pilot
+from .pilot import run_pilot
 from .quality import Gain, Prior, load_prior, measured_gains, scene_gain, views_error, with_noise
-from .records import Pilot, Prediction, Route
+from .records import Choice, Pilot, PilotFacts, Plan, Prediction, PriorFacts, Route, Wanted, read_plan, write_plan
 from .routes import as_reported, break_even, routes
 from .seconds import Costs, Work, noise_at
 
-SCHEMA = 1
 BLIND_POLICY = "farthest"
 RULE_SECONDS = 2.0
 """Wall seconds allowed for a choice of views that trains nothing."""
 
 
-@dataclass(frozen=True)
-class Wanted:
-    """What was asked for; all None: a table of budgets. seconds: of work from here on. frames: to be rendered."""
-
-    seconds: float | None = None
-    psnr: float | None = None
-    frames: int | None = None
-
-
-def plan_path(workspace: Workspace) -> Path:
-    """``plan/plan.json``."""
-    return workspace.root / FOLDER / "plan.json"
-
-
-def make_plan(
-    workspace: Workspace, settings: Settings, console: Console, wanted: Wanted, prior: Prior | None = None
-) -> dict[str, Any]:
-    """Run the pilot where it is missing and write ``plan/plan.json`` -> its content. prior: by default the package's.
+def make_plan(run: Run, wanted: Wanted, prior: Prior | None = None) -> Plan:
+    """Run the pilot where it is missing, write ``plan/plan.json`` and return it. prior: by default the package's.
 
     Raises UserError: a budget that not even the smallest choice fits in, or a target that nothing reaches.
     """
-    pilot = run_pilot(workspace, settings, console)
+    workspace, settings = run.workspace, run.settings
+    pilot = run_pilot(run)
     prior = prior or load_prior()
     predictor = make_predictor(workspace, settings, pilot, prior)
     candidates = len(split_views(workspace)["train"])
     grid = list(predictor.grid(candidates))
     chosen = _choose(grid, wanted)
-    record: dict[str, Any] = {
-        "schema": SCHEMA,
-        "made": time.time(),
-        "wanted": {"seconds": wanted.seconds, "psnr": wanted.psnr, "frames": wanted.frames},
-        "pilot": {"fingerprint": pilot.fingerprint, "seconds": pilot.seconds, "load": pilot.load},
-        "policy": policy_of(workspace, settings),
-        "base_psnr": with_noise(predictor.base, predictor.reference),
-        "gain": predictor.gain.most,
-        "chosen": chosen.model_dump(mode="json") if chosen else None,
-        "table": [p.model_dump(mode="json") for p in budgets(grid)],
-        "prior": {"source": prior.source, "scenes": prior.scenes, "sd": prior.sd},
-        "settings_default": predictor.predict(_default(predictor, settings, candidates)).model_dump(mode="json"),
-    }
+    plan = Plan(
+        made=time.time(),
+        wanted=wanted,
+        pilot=PilotFacts(fingerprint=pilot.fingerprint, seconds=pilot.seconds, load=pilot.load),
+        policy=policy_of(workspace, settings),
+        base_psnr=with_noise(predictor.base, predictor.reference),
+        gain=predictor.gain.most,
+        chosen=chosen,
+        table=budgets(grid),
+        prior=PriorFacts(source=prior.source, scenes=prior.scenes, sd=prior.sd),
+        settings_default=predictor.predict(_default(predictor, settings, candidates)),
+    )
     if wanted.frames is not None:
-        found, at = whether_to_train(predictor, grid, settings, wanted, chosen)
-        record |= {"routes": [r.model_dump(mode="json") for r in found], "routes_psnr": at}
-        record |= {"break_even": break_even(found), "train": found[0].reaches and found[0].name == "neural renderer"}
-    if carried_out := _carried_out(plan_path(workspace), record):
-        record["carried_out"] = carried_out
-    write_json(plan_path(workspace), record)
-    return record
+        found, at = whether_to_train(predictor, grid, wanted, chosen)
+        train = found[0].reaches and found[0].name == "neural renderer"
+        answer = {"routes": found, "routes_psnr": at, "break_even": break_even(found), "train": train}
+        plan = plan.model_copy(update=answer)
+    if carried_out := _carried_out(workspace, plan):
+        plan = plan.model_copy(update={"carried_out": carried_out})
+    write_plan(workspace.root, plan)
+    return plan
 
 
 def make_predictor(workspace: Workspace, settings: Settings, pilot: Pilot, prior: Prior) -> Predictor:
@@ -132,10 +111,15 @@ def _reference_noise(settings: Settings, pilot: Pilot) -> float:
 
 
 def whether_to_train(
-    predictor: Predictor, grid: list[Prediction], settings: Settings, wanted: Wanted, chosen: Prediction | None
+    predictor: Predictor,
+    grid: list[Prediction],
+    wanted: Wanted,
+    chosen: Prediction | None,
 ) -> tuple[list[Route], float]:
-    """(routes, the cheapest first; the PSNR they are compared at): what was wanted, else what the choice, else what
-    the settings as they are, are expected to give."""
+    """(routes, the cheapest first; the PSNR they are compared at).
+
+    That PSNR is what was wanted, else what the choice is expected to give, else the highest of the grid.
+    """
     assert wanted.frames is not None and predictor.pilot.frames is not None
     best = max(grid, key=lambda p: p.psnr.expected)
     at = wanted.psnr or (chosen or best).psnr.expected
@@ -148,8 +132,10 @@ def whether_to_train(
 
 
 def policy_of(workspace: Workspace, settings: Settings) -> str:
-    """The policy that the plan counts on: the settings', or farthest points in place of a trained one that nobody
-    asked for by name."""
+    """The policy that the plan counts on.
+
+    It is the settings', or farthest points in place of a trained one that nobody asked for by name.
+    """
     named = workspace.manifest.overrides.get("select", {}).get("policy")
     trained = settings.select.policy in TRAINED_NAMES
     return BLIND_POLICY if trained and named is None else settings.select.policy
@@ -182,19 +168,21 @@ def _choose(grid: list[Prediction], wanted: Wanted) -> Prediction | None:
     return None
 
 
-def _carried_out(path: Path, record: dict[str, Any]) -> dict[str, Any] | None:
+def _carried_out(workspace: Workspace, plan: Plan) -> Prediction | None:
     """What the plan in the file was carried out as, if it is the same plan: its training may have been interrupted."""
     try:
-        before = read_json(path)
-        same = all(before[key] == record[key] for key in ("wanted", "policy"))
-        same = same and before["pilot"]["fingerprint"] == record["pilot"]["fingerprint"]
-        same = same and before["chosen"]["choice"] == record["chosen"]["choice"]
-    except (UserError, DamagedFile, KeyError, TypeError):  # none, torn, of another version, or without a choice
+        before = read_plan(workspace.root)
+    except UserError:  # truncated, or of another version
         return None
-    return before.get("carried_out") if same else None
+    if before is None or before.chosen is None or plan.chosen is None:
+        return None
+    same = before.wanted == plan.wanted and before.policy == plan.policy
+    same = same and before.pilot.fingerprint == plan.pilot.fingerprint
+    return before.carried_out if same and before.chosen.choice == plan.chosen.choice else None
 
 
-def _default(predictor: Predictor, settings: Settings, candidates: int) -> Any:
+def _default(predictor: Predictor, settings: Settings, candidates: int) -> Choice:
+    """The settings as they are."""
     views = min(settings.select.budget, candidates)
     steps = settings.finetune.step2.epochs * -(-views // predictor.batch)
     return predictor.choice(views, settings.raytrace.spp, steps)

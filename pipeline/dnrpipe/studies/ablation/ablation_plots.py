@@ -9,7 +9,7 @@ from typing import Any
 
 from dnrtrain.atomic import atomic_path
 
-from .tables import Figures
+from .ablation_tables import Figures
 
 PANELS = (("psnr", "PSNR, dB (higher is better)"), ("lpips_vgg", "LPIPS VGG (lower is better)"))
 SIDE, GAP, HEAD, COLUMNS = 256, 6, 22, 5

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..cells.measure import METRICS, mean_of
 from ..cells.provenance import made_by, read_made
+from ..cells.tasks import read_cell
 from .rows import ROWS, Row
 
 SCHEMA = 1
@@ -25,24 +25,25 @@ def gather(cells: Mapping[tuple[str, str, int], Path], rows: Sequence[Row], fact
     for (scene, row, seed), path in cells.items():
         if not path.exists():
             continue
-        cell = json.loads(path.read_text(encoding="utf-8"))
-        training = cell["training"]
+        cell = read_cell(path)
+        training = cell.training
+        step1 = training and training.step1
         found.append(
             {
                 "scene": scene,
                 "row": row,
                 "seed": seed,
-                "key": cell["key"],
-                **{name: mean_of(cell["tests"], name) for name in METRICS},
-                "views": len(cell["views"]),
-                "epochs": training and training["epochs"],
-                "steps": training and training["step2"]["steps"],
-                "train_seconds": training and round(training["seconds"], 2),
-                "train_cpu_seconds": training and round(training["cpu_seconds"], 2),
-                "step1_cpu_seconds": training and training["step1"] and round(training["step1"]["cpu_seconds"], 2),
-                "frame_ms": cell["frame_ms"] and round(cell["frame_ms"], 2),
-                "base_ms": cell["base_ms"] and round(cell["base_ms"], 2),
-                "commit": cell["code"]["commit"],
+                "key": cell.key,
+                **{name: mean_of(cell.tests, name) for name in METRICS},
+                "views": len(cell.views),
+                "epochs": training and training.epochs,
+                "steps": training and training.step2.steps,
+                "train_seconds": training and round(training.seconds, 2),
+                "train_cpu_seconds": training and round(training.cpu_seconds, 2),
+                "step1_cpu_seconds": step1 and round(step1.cpu_seconds, 2),
+                "frame_ms": cell.frame_ms and round(cell.frame_ms, 2),
+                "base_ms": cell.base_ms and round(cell.base_ms, 2),
+                "commit": cell.code["commit"],
             }
         )
     return {
@@ -55,7 +56,7 @@ def gather(cells: Mapping[tuple[str, str, int], Path], rows: Sequence[Row], fact
 
 
 def read_results(path: Path) -> dict[str, Any]:
-    """Results that :func:`gather` made. Raises UserError: missing, damaged or of another schema."""
+    """Results that `gather` made. Raises UserError: missing, damaged or of another schema."""
     return read_made(path, "ablate", SCHEMA, "cells")
 
 

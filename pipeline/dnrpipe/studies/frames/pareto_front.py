@@ -1,4 +1,4 @@
-"""The rival's best picture by milliseconds, and where the rival draws level.
+"""The best picture by milliseconds among several renderers, and where they draw level with another.
 
 Notation
     point     (ms, dB) of one way of rendering

@@ -18,17 +18,16 @@ from dnrtrain.selector.protocol import Choice
 from dnrtrain.settings import ModelSettings, Step1Settings
 from dnrtrain.step1 import run_step1
 
-from ....core.settings import Settings
-from ....core.workspace import Workspace
 from ...cells.cell import load_cell_views, training_cost
+from ...cells.tasks import SelectionResult
 from .batches import choose_actively
-from .settings import ActiveSettings
+from .settings import ActiveSettings, ActiveTask
 
 CLOCKS = ("seconds", "cpu_seconds")
 
 
 class Worker:
-    """Task {"key", "workspace", "settings", "policy", "seed", "folder", "output"} -> what its file holds."""
+    """Answers an `ActiveTask`."""
 
     def __init__(self, common: dict[str, Any]) -> None:
         import torch
@@ -38,26 +37,27 @@ class Worker:
         self.device = common["device"]
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
-        """{"views": names in order, "gains", "why", "details", "seconds", "cpu_seconds"}."""
-        settings = Settings.model_validate(task["settings"])
-        workspace = Workspace.open(Path(task["workspace"]))
-        views = load_cell_views(workspace, "train", None, raytraced=False, base="none")
-        members = Members(
-            views, settings.model, settings.select.step1, ActiveSettings(), task["seed"], self.device,
-            Path(task["folder"]), task["key"],
-        )  # fmt: skip
-        choice, cost = members.choose(task["policy"], settings.select.budget)
-        made = {
-            "key": task["key"],
-            "views": [views.names[i] for i in choice.views],
-            "gains": choice.gains,
-            "why": choice.why,
-            "details": choice.details,
-            **cost,
-        }
+        made = self._choose(ActiveTask.model_validate(task)).model_dump(mode="json", exclude_none=True)
         write_json(Path(task["output"]), made)
-        shutil.rmtree(members.folder, ignore_errors=True)
+        shutil.rmtree(Path(task["folder"]), ignore_errors=True)
         return made
+
+    def _choose(self, task: ActiveTask) -> SelectionResult:
+        settings = task.settings
+        views = load_cell_views(task.workspace, "train", raytraced=False, base="none")
+        members = Members(
+            views, settings.model, settings.select.step1, ActiveSettings(), task.seed, self.device, task.folder,
+            task.fingerprint,
+        )  # fmt: skip
+        choice, cost = members.choose(task.policy, settings.select.budget)
+        return SelectionResult(
+            key=task.fingerprint,
+            views=[views.names[i] for i in choice.views],
+            gains=choice.gains,
+            why=choice.why,
+            details=choice.details,
+            **cost,
+        )
 
 
 class Members:
@@ -100,7 +100,7 @@ class Members:
         cost = {}
         for name, clock, start in zip(CLOCKS, clocks, started, strict=True):
             looking = max(0.0, clock() - start - self.trained[name])
-            cost[name] = looking + sum(training_cost(folder)[name] for folder in self.folders)
+            cost[name] = looking + sum(getattr(training_cost(folder), name) for folder in self.folders)
         return choice, cost
 
     def train(self, views: list[int], batch: int, member: int) -> DNR:

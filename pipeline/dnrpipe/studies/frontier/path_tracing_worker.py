@@ -1,7 +1,7 @@
-"""The rival in the same run: path tracing of the test views, raw and denoised, and our frames beside it, by one clock.
+"""The baseline in the same run: path tracing of the test views, raw and denoised, and our frames, by one clock.
 
-A worker (see `dnrpipe.workers.processes`) renders them; their pictures are measured against the references that the
-cells are measured against.
+A worker (see `dnrpipe.workers.processes`) renders them. Their pictures are measured against the same references as the
+cells are.
 """
 
 from __future__ import annotations
@@ -14,20 +14,15 @@ import numpy as np
 from dnrtrain.atomic import write_json
 from dnrtrain.exr import read_exr
 
-from ...core.settings import Settings
 from ...core.workspace import Workspace
+from .records import BaselineFile, BaselinePoint, PathTracingTask
 
 METHODS = ("raw", "colour-fast", "clean16-fast", "clean16")
 WARM = 2
 
 
 class Worker:
-    """common: {"threads"}; task: {"workspace", "settings", "samples", "output", "key"} -> what its output file holds:
-
-    {"key", "threads", "rungs": [{"name", "spp", "denoised", "ms", "masked", metrics}], "base_ms"}; metrics as in cells,
-    means over the test views; base_ms: of a base image with its G-buffer, by the same clock, None where none is
-    rendered.
-    """
+    """Answers a `PathTracingTask`; milliseconds are medians of processor time over the threads."""
 
     def __init__(self, common: dict[str, Any]) -> None:
         import torch
@@ -37,49 +32,50 @@ class Worker:
         self.threads = torch.get_num_threads()
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
+        made = self._measure(PathTracingTask.model_validate(task)).data()
+        write_json(Path(task["output"]), made)
+        return made
+
+    def _measure(self, task: PathTracingTask) -> BaselineFile:
         from ...core.scene_files import split_views
+        from ..frames.baselines import METHODS as ALL
+        from ..frames.baselines import make_baselines, render_baselines
         from ..frames.ours import BASE, TIMED, Ours
-        from ..frames.rival import METHODS as ALL
-        from ..frames.rival import climb, make_rungs
         from ..frames.scene import Clock, open_scene
 
-        workspace = Workspace.open(Path(task["workspace"]))
-        settings = Settings.model_validate(task["settings"])
+        workspace, settings = Workspace.open(task.workspace), task.settings
         views = split_views(workspace)["test"]
         scene = open_scene(workspace.root, views, self.threads, settings)
         clock = Clock("cpu", self.threads)
-        samples = tuple(int(n) for n in task["samples"])
         for turn in range(WARM):
-            climb(scene, views[0], turn, clock, make_rungs(samples, METHODS))
-        rungs = make_rungs(samples, METHODS)
+            render_baselines(scene, views[0], turn, clock, make_baselines(task.samples, METHODS))
+        baselines = make_baselines(task.samples, METHODS)
         for number, view in enumerate(views):
-            climb(scene, view, 10_007 * (number + 1), clock, rungs)
+            render_baselines(scene, view, 10_007 * (number + 1), clock, baselines)
         names = [view.name for view in views]
         truth = [scene.shown(read_rgba(workspace.raytraced("test", name))) for name in names]
         masks = masks_of(workspace, names)
         lpips = load_lpips()
-        found = [
-            {
-                "name": rung.name,
-                "spp": rung.spp,
-                "denoised": ALL[rung.method].denoise,
-                "ms": rung.ms(),
-                "masked": rung.masked,
-                **quality_of([picture.float() for picture in rung.pictures], truth, masks, lpips),
-            }
-            for rung in rungs.values()
+        points = [
+            BaselinePoint(
+                name=baseline.name,
+                spp=baseline.spp,
+                denoised=ALL[baseline.method].denoise,
+                ms=baseline.ms(),
+                masked=baseline.masked,
+                **quality_of([picture.float() for picture in baseline.pictures], truth, masks, lpips),
+            )
+            for baseline in baselines.values()
         ]
         base_ms = None
         if settings.model.base == "baked" and settings.model.base in TIMED:
-            ours = Ours(scene, (), Path(task["output"]).parent / "no-model")
+            ours = Ours(scene, (), task.output.parent / "no-model")
             ours.frame(views[0], clock)
             frames = [next(iter(ours.frame(view, clock).items())) for view in views]
             base_ms = float(
                 np.median([sum(frame["parts"].values()) for name, frame in frames if name.startswith(BASE)])
             )
-        made = {"key": task["key"], "threads": self.threads, "rungs": found, "base_ms": base_ms}
-        write_json(Path(task["output"]), made)
-        return made
+        return BaselineFile(key=task.fingerprint, threads=self.threads, baselines=points, base_ms=base_ms)
 
 
 def read_rgba(path: Path) -> np.ndarray:
@@ -107,7 +103,7 @@ def load_lpips() -> Any:
         return None
 
 
-def quality_of(pictures: list[Any], truth: list[Any], masks: list[Any], lpips: Any) -> dict[str, float | None]:
+def quality_of(pictures: list[Any], truth: list[Any], masks: list[Any], lpips: Any) -> dict[str, Any]:
     """Means over the views of the metrics that cells have."""
     from dnrtrain.metrics import image_metrics
 

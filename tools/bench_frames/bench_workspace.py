@@ -10,18 +10,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from dnrpipe.studies.frames.ladder import frontier
+from dnrpipe.studies.frames.baselines import METHODS, Baseline, make_baselines, render_baselines
 from dnrpipe.studies.frames.ours import Ours
-from dnrpipe.studies.frames.rival import METHODS, climb, make_rungs
+from dnrpipe.studies.frames.pareto_front import frontier
 from dnrpipe.studies.frames.scene import BenchScene, Clock, open_scene
 from dnrtrain.metrics import image_metrics
 from dnrtrain.perceptual import build_lpips
 from dnrtrain.weights import WeightsMissing, load_weights
 
+from .equal_time import upfront
 from .reference import Reference, make_references
 from .stability import measure
 from .standing import classes, standing
-from .upfront import upfront
 
 CLASSES = (0.03, 0.07, 0.3)
 """Seconds per 128² pixels that the classes are named by; their limits grow with the pixel count."""
@@ -65,26 +65,30 @@ def bench(root: Path, options: Options, tell: Callable[[str], None]) -> dict[str
     ours = Ours(scene, options.rays)
     reference = make_references(scene, scene.views, "test", options.reference_spp, options.reference, folder, tell)
     for turn in range(WARM):
-        climb(scene, scene.views[0], turn, clock, make_rungs(options.samples))
+        render_baselines(scene, scene.views[0], turn, clock, make_baselines(options.samples))
         ours.frame(scene.views[-1], clock)
-    rungs = make_rungs(options.samples)
+    baselines = make_baselines(options.samples)
     own: dict[str, Ran] = {}
     for number, view in enumerate(scene.views):
-        climb(scene, view, 10_007 * (number + 1), clock, rungs)
+        render_baselines(scene, view, 10_007 * (number + 1), clock, baselines)
         for name, frame in ours.frame(view, clock).items():
             ran = own.setdefault(name, Ran())
             ran.pictures.append(frame["picture"])
             for part, ms in frame["parts"].items():
                 ran.parts.setdefault(part, []).append(ms)
         tell(f"{scene.name}: view {number + 1} of {len(scene.views)}")
-    for rung in rungs.values():
-        if rung.masked and rung.method == "raw":
-            tell(f"{scene.name}: repaired: {rung.masked} pixels of {rung.name} were not finite and are black")
+    for baseline in baselines.values():
+        if baseline.masked and baseline.method == "raw":
+            tell(f"{scene.name}: repaired: {baseline.masked} pixels of {baseline.name} were not finite and are black")
     truth = [scene.shown(picture) for picture in reference.pictures]
-    result = _figures(scene, options, reference, truth, rungs, own)
+    result = _figures(scene, options, reference, truth, baselines, own)
     result["upfront"] = upfront(scene.workspace.ledger.read(), options.threads)
     if options.orbit > 1:
-        shown = [(rungs[name].spp, rungs[name].method) for name in result["frontier"] if rungs[name].method != "raw"]
+        shown = [
+            (baselines[name].spp, baselines[name].method)
+            for name in result["frontier"]
+            if baselines[name].method != "raw"
+        ]
         result["stability"] = measure(
             scene,
             ours,
@@ -104,11 +108,11 @@ def _figures(
     options: Options,
     reference: Reference,
     truth: list[Any],
-    rungs: dict[str, Any],
+    baselines: dict[str, Baseline],
     own: dict[str, Ran],
 ) -> dict[str, Any]:
     masks = [torch.from_numpy(picture[..., 3] > 0.5).float()[None, None] for picture in reference.pictures]
-    everything = {**rungs, **own}
+    everything = {**baselines, **own}
     rows = {
         name: {
             "ms": ran.ms(),
@@ -117,7 +121,7 @@ def _figures(
         }
         for name, ran in everything.items()
     }
-    points = {name: (rows[name]["ms"], rows[name]["psnr"]) for name in rungs}
+    points = {name: (rows[name]["ms"], rows[name]["psnr"]) for name in baselines}
     try:
         lpips = {"vgg": build_lpips(load_weights())["vgg"]}
     except WeightsMissing:
@@ -153,7 +157,7 @@ def _figures(
 
 
 def _quality(pictures: list[Any], truth: list[Any], masks: list[Any], lpips: Any) -> dict[str, float | None]:
-    """Means over the views of :func:`dnrtrain.metrics.image_metrics`; keys without a value are left out."""
+    """Means over the views of `dnrtrain.metrics.image_metrics`; keys without a value are left out."""
     found = [
         image_metrics(picture.float(), target, mask, lpips)
         for picture, target, mask in zip(pictures, truth, masks, strict=True)

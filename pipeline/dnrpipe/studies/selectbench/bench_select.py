@@ -14,12 +14,12 @@ from ...core.settings import merge, parse_assignment, resolve
 from ...core.workspace import locked
 from ..cells.scenes import find_scenes
 from ..cells.worker_pool import check_amounts, make_pool
-from .plot import plot
+from .bench import Bench, Request
+from .bench_plots import plot
+from .bench_results import gather
+from .bench_tables import markdown
 from .policies import choose_policies
 from .pools import choose_pools
-from .results import gather
-from .run import Bench, Request
-from .tables import markdown
 
 SMOKE: dict[str, Any] = {
     "cameras": {"train": 10, "test": 2, "width": 32, "height": 32},

@@ -3,7 +3,7 @@
 Notation
     A, B      two independent path-traced pictures of a held-out view in display space, as they were traced
     D         a picture to be judged, made without their samples
-    mse(D)    mean of (D - A)(D - B): the noise of A and that of B cancel in the product (:func:`without_reference`)
+    mse(D)    mean of (D - A)(D - B): the noise of A and that of B cancel in the product (`without_reference`)
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from dnrtrain.contract import View
 from ...core.scene_files import read_frame
 from ...core.settings import Settings
 from ...core.workspace import Workspace
+from .records import Record
 
 if TYPE_CHECKING:
     from dnrtrain.dataset import ViewSet
@@ -28,38 +29,74 @@ if TYPE_CHECKING:
 
 WARM = 2
 HALVES, REFERENCE_SPP = 2, 64
-"""A and B are means of so many pictures of so many samples: a kernel that the ladder has anyway."""
+"""A and B are means of so many pictures of so many samples: a kernel that the baselines need anyway."""
 SEED = 0x5EED0000
-"""Far from the ladder's seeds, so that A and B share no samples with what they judge."""
+"""Far from the baselines' seeds, so that A and B share no samples with what they judge."""
 LEAST_MSE = 1e-6
 
 
-class Worker:
-    """Answers the pilot's tasks.
+class PilotCommon(Record):
+    """What all tasks share. threads: of torch, 0 = its own choice."""
 
-    common: {"workspace", "settings", "threads"}
-    task "train": {"views", "base_files", "images", "fingerprint", "folders", "epochs": a training each}
-        -> {"seconds", "cpu_seconds": of a step of the last, "between", "cpu_between": of its epochs, "startup",
-        "steps": of each, "threads"}
-    task "frames": {"views", "folders": of the models, "light", "samples", "methods": the ladder}
-        -> {"base", "rival": rows {"name", "ms", "psnr"}, "neural": a row per model, "unknown": pixels that no
-        reference knows}; PSNR by :func:`without_reference`
+    workspace: Path
+    settings: Settings
+    threads: int = 0
+
+
+class TrainTask(Record):
+    """Train short step 2s on the same views -> fields of `records.TrainingPart`.
+
+    Args:
+        base_files, images: base images with their G-buffers, and path-traced pictures, a file per view.
+        folders, epochs: of each training.
     """
+
+    kind: Literal["train"] = "train"
+    views: list[View]
+    base_files: list[Path]
+    images: list[Path]
+    folders: list[Path]
+    epochs: list[int]
+    fingerprint: str
+
+
+class FramesTask(Record):
+    """Render and judge frames by every model, by the base image alone and by the baselines.
+
+    The answer holds fields of `records.FramePart`, and "unknown": pixels that no reference knows.
+
+    Args:
+        folders: of the models.
+        light: file of the baked light, None where there is none.
+        samples, methods: of the baselines.
+    """
+
+    kind: Literal["frames"] = "frames"
+    views: list[View]
+    folders: list[Path]
+    light: Path | None
+    samples: list[int]
+    methods: list[str]
+
+
+class Worker:
+    """Answers the pilot's tasks. common: a `PilotCommon`; task: a `TrainTask` or a `FramesTask`."""
 
     def __init__(self, common: dict[str, Any]) -> None:
         import torch
 
-        if common["threads"]:
-            torch.set_num_threads(int(common["threads"]))
+        shared = PilotCommon.model_validate(common)
+        if shared.threads:
+            torch.set_num_threads(shared.threads)
         self.threads = torch.get_num_threads()
-        self.workspace = Workspace.open(Path(common["workspace"]))
-        self.settings = Settings.model_validate(common["settings"])
+        self.workspace, self.settings = Workspace.open(shared.workspace), shared.settings
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
-        views = [View.model_validate(view) for view in task["views"]]
-        return self._train(task, views) if task["kind"] == "train" else self._frames(task, views)
+        if task["kind"] == "train":
+            return self._train(TrainTask.model_validate(task))
+        return self._frames(FramesTask.model_validate(task))
 
-    def _train(self, task: dict[str, Any], views: list[View]) -> dict[str, Any]:
+    def _train(self, task: TrainTask) -> dict[str, Any]:
         from dnrtrain.weights import WeightsMissing, load_weights
 
         try:
@@ -67,14 +104,12 @@ class Worker:
         except WeightsMissing:  # training will do without, too
             weights = None
         found = [
-            self._train_one(task, views, weights, Path(folder), epochs)
-            for folder, epochs in zip(task["folders"], task["epochs"], strict=True)
+            self._train_one(task, weights, folder, epochs)
+            for folder, epochs in zip(task.folders, task.epochs, strict=True)
         ]
         return found[-1] | {"steps": [one["steps"] for one in found], "threads": self.threads}
 
-    def _train_one(
-        self, task: dict[str, Any], views: list[View], weights: Any, folder: Path, epochs: int
-    ) -> dict[str, Any]:
+    def _train_one(self, task: TrainTask, weights: Any, folder: Path, epochs: int) -> dict[str, Any]:
         from dnrtrain.checkpoint import read_record
         from dnrtrain.events import EpochEnd
         from dnrtrain.step2 import run_step2
@@ -86,7 +121,7 @@ class Worker:
             update={"epochs": epochs, "start": "fresh", "validation_views": 0}
         )
         events = run_step2(
-            self._load(views, task),
+            self._load(task),
             None,
             folder,
             self.settings.model,
@@ -94,7 +129,7 @@ class Worker:
             seed=self.settings.finetune.seed,
             device=torch_device(self.settings),
             checkpoints=folder,
-            fingerprint=task["fingerprint"],
+            fingerprint=task.fingerprint,
             weights=weights,
         )
         gaps, last = [], None
@@ -122,41 +157,39 @@ class Worker:
             "steps": sum(entry.steps for entry in history),
         }
 
-    def _load(self, views: list[View], task: dict[str, Any]) -> ViewSet:
+    def _load(self, task: TrainTask) -> ViewSet:
         from dnrtrain.dataset import load_views
 
-        files = [Path(path) for path in task["base_files"]]
         return load_views(
-            files,  # base images bring their G-buffer along
-            [Path(path) for path in task["images"]],
+            task.base_files,  # base images bring their G-buffer along
+            task.images,
             read_frame(self.workspace),
-            cameras=views,
+            cameras=task.views,
             folder=self.workspace.scene,
             base=self.settings.model.base,
-            base_files=files,
+            base_files=task.base_files,
         )
 
-    def _frames(self, task: dict[str, Any], views: list[View]) -> dict[str, Any]:
+    def _frames(self, task: FramesTask) -> dict[str, Any]:
         from dnrtrain.checkpoint import load_model
 
+        from ..frames.baselines import make_baselines, render_baselines
         from ..frames.ours import BASE, NEURAL, Ours
-        from ..frames.rival import climb, make_rungs
         from ..frames.scene import Clock, open_scene
 
+        views = task.views
         scene = open_scene(self.workspace.root, views, self.threads, self.settings)
-        light = Path(task["light"]) if task["light"] else None
-        folders = [Path(folder) for folder in task["folders"]]
-        ours = Ours(scene, (), folders[-1], light)
-        models = [load_model(folder) for folder in folders]
+        ours = Ours(scene, (), task.folders[-1], task.light)
+        models = [load_model(folder) for folder in task.folders]
         truth = [_references(scene, view, number) for number, view in enumerate(views)]
-        clock, samples, methods = Clock("cpu", self.threads), tuple(task["samples"]), tuple(task["methods"])
+        clock = Clock("cpu", self.threads)
         for _ in range(WARM):
-            climb(scene, views[0], 1, clock, make_rungs(samples, methods))
+            render_baselines(scene, views[0], 1, clock, make_baselines(task.samples, task.methods))
             ours.frame(views[0], clock)
-        rungs = make_rungs(samples, methods)
+        baselines = make_baselines(task.samples, task.methods)
         base, neural = _Row(), [_Row() for _ in models]
         for number, view in enumerate(views):
-            climb(scene, view, 10_007 * (number + 1), clock, rungs)
+            render_baselines(scene, view, 10_007 * (number + 1), clock, baselines)
             for row, ours.model in zip(neural, models, strict=True):
                 frames = ours.frame(view, clock)
                 for name, frame in frames.items():
@@ -165,12 +198,12 @@ class Worker:
                     elif row is neural[-1]:
                         base.add(frame["picture"], truth[number], frame["parts"])
         rival = []
-        for rung in rungs.values():
+        for baseline in baselines.values():
             row = _Row()
-            for number, picture in enumerate(rung.pictures):
-                parts = {name: values[number] for name, values in rung.parts.items()}
+            for number, picture in enumerate(baseline.pictures):
+                parts = {name: values[number] for name, values in baseline.parts.items()}
                 row.add(picture.float(), truth[number], parts)
-            rival.append({"name": rung.name, **row.summary()})
+            rival.append({"name": baseline.name, **row.summary()})
         return {
             "base": {"name": BASE, **base.summary()},
             "neural": [{"name": NEURAL, **row.summary()} for row in neural],

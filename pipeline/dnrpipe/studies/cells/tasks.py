@@ -1,0 +1,171 @@
+"""What the studies' workers are asked, and what their files hold.
+
+Tasks travel as JSON. A task's answer is written to its ``output``, so that a task whose file is there is done.
+Seconds are wall seconds of training; ``cpu_seconds`` are the processor's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict
+
+from ...core.settings import Settings
+
+
+class PoolTask(BaseModel):
+    """What `WorkerPool` needs of any task. label: in messages."""
+
+    model_config = ConfigDict(frozen=True)
+
+    output: Path
+    label: str
+
+
+class StudyTask(PoolTask):
+    """fingerprint: of all that decides the answer; it names the files."""
+
+    fingerprint: str
+    workspace: Path
+
+
+Fingerprinted = TypeVar("Fingerprinted", bound=StudyTask)
+
+
+def once(tasks: Iterable[Fingerprinted]) -> list[Fingerprinted]:
+    """The first task of each fingerprint."""
+    found: dict[str, Fingerprinted] = {}
+    for task in tasks:
+        found.setdefault(task.fingerprint, task)
+    return list(found.values())
+
+
+class Step1Task(StudyTask):
+    """Train step 1 into ``folder`` -> `Step1Result`.
+
+    Args:
+        policy: chooses the views.
+        seconds: of training at most; None: the settings' epochs.
+        pace: file of the seconds of an epoch; needed where ``seconds`` limit them.
+    """
+
+    kind: Literal["step1"] = "step1"
+    settings: Settings
+    policy: str
+    seed: int
+    seconds: float | None
+    pace: Path | None = None
+    folder: Path
+
+
+class TrainingCost(BaseModel):
+    """Sums over all epochs. steps: optimiser steps; skipped: those without an update."""
+
+    seconds: float
+    cpu_seconds: float
+    steps: int
+    skipped: int
+
+
+class Step1Result(TrainingCost):
+    """selected: the views that the policy chose. key: the task's fingerprint."""
+
+    key: str
+    selected: list[str]
+    epochs: int
+
+
+class CellTask(StudyTask):
+    """Train step 2, measure all test views -> `CellResult`.
+
+    Args:
+        network: False measures the base image alone.
+        views: of training.
+        targets: folder under raytraced/ of their pictures.
+        coarse, coarse_cost: folder of step 1 and what that took; None where the network starts fresh.
+        seconds: of both steps; None: the settings' epochs.
+        full_step1: step 1 counts as its whole share of the seconds, whatever it took.
+        pace: file of the seconds of an epoch, where ``seconds`` limit them.
+        folder: of the model, removed once it is measured.
+        picture: where one test view is kept, None: nowhere.
+        code: of `provenance.code_state`.
+    """
+
+    kind: Literal["cell"] = "cell"
+    scene: str
+    seed: int
+    settings: Settings
+    network: bool
+    views: list[str]
+    targets: str = "train"
+    coarse: Path | None
+    coarse_cost: Step1Result | None
+    seconds: float | None
+    full_step1: bool
+    pace: Path
+    folder: Path
+    picture: Path | None
+    code: dict[str, Any]
+
+
+class Training(BaseModel):
+    """What a cell's training took. seconds_per_epoch: of step 2, where seconds limited it."""
+
+    epochs: int
+    seconds_per_epoch: float | None
+    step1: Step1Result | None
+    step2: TrainingCost
+    seconds: float
+    cpu_seconds: float
+    perceptual: bool
+
+
+class CellResult(BaseModel):
+    """A cell's file.
+
+    Args:
+        key: the task's fingerprint.
+        settings: "model" and "step2", as they were given.
+        frame_ms, base_ms: median milliseconds of the network's frame and of a base image.
+        tests: a row of metrics per test view.
+        finished: unix seconds.
+    """
+
+    key: str
+    scene: str
+    seed: int
+    settings: dict[str, dict[str, Any]]
+    views: list[str]
+    training: Training | None
+    frame_ms: float | None
+    base_ms: float | None
+    threads: int
+    device: str
+    tests: list[dict[str, Any]]
+    code: dict[str, Any]
+    finished: float
+
+    @property
+    def base(self) -> str:
+        """Kind of its base images."""
+        return self.settings["model"]["base"]
+
+
+def read_cell(path: Path) -> CellResult:
+    """A cell's file."""
+    return CellResult.model_validate_json(path.read_bytes())
+
+
+class SelectionResult(BaseModel):
+    """A selection's file, by a rule or by active learning. views: names in order. peak_mb: of the process."""
+
+    key: str
+    views: list[str]
+    gains: list[float]
+    why: list[str]
+    details: dict[str, Any]
+    seconds: float
+    cpu_seconds: float
+    peak_mb: float | None = None

@@ -1,0 +1,60 @@
+"""The artist's own renderer as a baseline: frames of Cycles, measured against Cycles' own reference.
+
+The two path tracers do not agree to the last decibel (docs/fidelity.md), so each is judged by its own converged
+picture: Cycles by a reference with as many samples as ours, raw, with another seed.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dnrtrain.atomic import write_json
+from dnrtrain.display import DisplayTransform
+
+from ...blender.tasks import CyclesAnswer
+from ...core.scene_files import read_frame, read_record
+from ...core.workspace import Workspace
+from ..frames.scene import shown
+from .path_tracing_worker import load_lpips, masks_of, quality_of, read_rgba
+from .records import CYCLES_PREFIX, BaselineFile, BaselinePoint, CyclesMeasureTask
+
+REFERENCE = "reference"
+
+
+class Worker:
+    """Answers a `CyclesMeasureTask`; names begin with ``Cycles``."""
+
+    def __init__(self, common: dict[str, Any]) -> None:
+        import torch
+
+        if common["threads"]:
+            torch.set_num_threads(int(common["threads"]))
+
+    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
+        made = self._measure(CyclesMeasureTask.model_validate(task)).data()
+        write_json(Path(task["output"]), made)
+        return made
+
+    def _measure(self, task: CyclesMeasureTask) -> BaselineFile:
+        workspace = Workspace.open(task.workspace)
+        frames = read_record(task.frames, CyclesAnswer)
+        display = DisplayTransform(read_frame(workspace), workspace.scene)
+
+        def pictures(name: str) -> list[Any]:
+            return [shown(display, read_rgba(task.folder / name / f"{view}.exr")) for view in task.views]
+
+        truth, masks, lpips = pictures(REFERENCE), masks_of(workspace, task.views), load_lpips()
+        points = [
+            BaselinePoint(
+                name=CYCLES_PREFIX + name,
+                spp=int(name.split()[0]),
+                denoised=not name.endswith("raw"),
+                ms=float(np.median(ms)),
+                **quality_of(pictures(name), truth, masks, lpips),
+            )
+            for name, ms in frames.ms.items()
+        ]
+        return BaselineFile(threads=frames.threads, baselines=points)

@@ -1,0 +1,224 @@
+"""`dnrpipe frontier` behind its options: the sweep, the baselines, and what it writes into ``frontier/``.
+
+results.json  results.csv  frontier-<N>.png (one per number of frames)  report.md
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from dnrtrain.atomic import atomic_path, write_json, write_text
+
+from ...core.errors import UserError
+from ...core.scene_files import scene_fingerprint, split_views
+from ...core.settings import Settings
+from ...core.workspace import digest
+from ...stages.stage import Run
+from ...workers.view_tasks import worker_count
+from ..cells.provenance import made_by
+from ..cells.worker_pool import check_amounts
+from .frontier_plots import plot
+from .frontier_report import markdown
+from .point_costs import break_evens, pareto, point_of, settle_frames
+from .records import (
+    SCHEMA,
+    BaselineFile,
+    BaselinePoint,
+    CyclesFramesTask,
+    CyclesMeasureTask,
+    FrontierResults,
+    PathTracingTask,
+)
+from .sweep import OTHERS, Frontier, Sweep, make_frontier
+
+BASELINE_VERSION, CYCLES_VERSION = 1, 1
+CYCLES = "cycles"
+SAMPLE_COUNTS = (1, 2, 4, 8, 16, 64)
+COLUMNS: tuple[str, ...] = (
+    "name", "kind", "seed", "views", "spp", "steps", "upfront", "frame_ms", "psnr", "ssim", "lpips_vgg", "flip",
+    "rival_ms", "break_even",
+)  # fmt: skip
+
+
+def numbers(text: str | None, option: str, default: Sequence[int], most: int | None = None) -> tuple[int, ...]:
+    """``"6,12,25"`` in rising order; the default where not given.
+
+    Raises UserError: not positive whole numbers, or more than ``most``.
+    """
+    if text is None:
+        return tuple(sorted({n if most is None else min(n, most) for n in default}))
+    found = set()
+    for part in text.split(","):
+        if not part.strip().isdecimal() or int(part) < 1 or (most is not None and int(part) > most):
+            limit = "" if most is None else f" from 1 to {most}"
+            raise UserError(f"{option} {text}: expected whole numbers{limit}, e.g. {','.join(map(str, default))}")
+        found.add(int(part))
+    return tuple(sorted(found))
+
+
+def run_frontier(
+    run: Run,
+    *,
+    budgets: str | None,
+    spp: str | None,
+    iterations: str | None,
+    frames: str | None,
+    also: str,
+    ladder: str | None,
+    seeds: int,
+    jobs: int,
+) -> FrontierResults:
+    """Measure what is due and write it -> the results.
+
+    Args:
+        run: workspace, settings and console.
+        budgets, spp, iterations: views, samples and optimiser steps of our points, as the options have them.
+        frames: numbers of frames to compare for.
+        also: names of other ways to train, and Cycles.
+        ladder: samples of the baselines.
+        seeds: trainings of every point.
+        jobs: cells side by side; 0: one per core.
+
+    Raises:
+        UserError: unknown names, numbers that do not fit. TasksFailed: some cells failed; the others are written.
+    """
+    workspace, settings = run.workspace, run.settings
+    check_amounts(None, seeds, jobs)
+    candidates = len(split_views(workspace)["train"])
+    counts = numbers(frames, "--frames", (200, 2000))
+    others = _others(also)
+    sweep = Sweep(
+        budgets=numbers(budgets, "--budgets", (6, 12, settings.select.budget), candidates),
+        samples=numbers(spp, "--spp", (16, settings.raytrace.spp)),
+        steps=numbers(iterations, "--iterations", (150, 600)),
+        also=tuple(name for name in others if name != CYCLES),
+    )
+    samples = numbers(ladder, "--ladder", SAMPLE_COUNTS)
+    rows = sweep.rows(settings)
+    out = workspace.root / "frontier"
+    swept = make_frontier(run, rows, out, jobs, seeds)
+    swept.check()
+    swept.run()
+    cores = worker_count(0)
+    traced = _trace_baselines(swept, settings, samples, cores)
+    baselines = traced.baselines
+    if CYCLES in others:
+        baselines = [*baselines, *_cycles_baselines(swept, settings, samples, cores)]
+    points = [
+        point
+        for seed in range(seeds)
+        for row in rows
+        if (row.network or seed == 0) and (point := point_of(swept, row, seed, traced.base_ms, cores))
+    ]
+    if seeds > 1:
+        points = [
+            point if point.kind == "base" else point.model_copy(update={"name": f"{point.name}, seed {point.seed}"})
+            for point in points
+        ]
+    points = break_evens(settle_frames(points), baselines)
+    results = FrontierResults(
+        schema_version=SCHEMA,
+        **made_by(),
+        scene=workspace.root.name.removesuffix(".dnr"),
+        preset=settings.preset,
+        resolution=f"{settings.cameras.width}x{settings.cameras.height}",
+        sweep=asdict(sweep),
+        frames=list(counts),
+        cores=cores,
+        test_views=len(swept.scene.test),
+        evaluation_spp=settings.raytrace.evaluation_spp,
+        threads=swept.threads,
+        baseline_threads=traced.threads,
+        points=points,
+        baselines=baselines,
+        pareto={str(count): pareto([*points, *baselines], count) for count in counts},
+    )
+    _write(results, out)
+    return results
+
+
+def _others(text: str) -> tuple[str, ...]:
+    """Names of other ways to train, and Cycles."""
+    names = tuple(filter(None, (part.strip() for part in text.split(","))))
+    if text.strip() == "none":
+        return ()
+    if unknown := set(names) - {*OTHERS, CYCLES}:
+        raise UserError(f"--also {', '.join(sorted(unknown))}: choose of {', '.join((*OTHERS, CYCLES))}, or none")
+    return names
+
+
+def _trace_baselines(swept: Frontier, settings: Settings, samples: tuple[int, ...], cores: int) -> BaselineFile:
+    """Path tracing of the test views, rendered where it is not on disk."""
+    references = sorted(swept.references[swept.scene.name].values())
+    model = swept.settings_of(swept.request.rows[0], swept.scene).model
+    base = settings.base.model_dump()
+    fingerprint = digest([BASELINE_VERSION, references, samples, model.base, base, cores, swept.perceptual])
+    task = PathTracingTask(
+        fingerprint=fingerprint,
+        workspace=swept.scene.workspace.root,
+        settings=settings.model_copy(update={"model": model}),
+        samples=list(samples),
+        output=swept.request.out / "rivals" / f"{fingerprint}.json",
+        label="path tracing",
+    )
+    worker_pool = replace(swept.worker_pool, threads=cores, workers=1)
+    worker_pool.work("path tracing of the test views", "dnrpipe.studies.frontier.path_tracing_worker", [task])
+    found = BaselineFile.model_validate_json(task.output.read_bytes())
+    if lost := sum(one.masked for one in found.baselines if not one.denoised):
+        worker_pool.console.warn(f"repaired: {lost} pixels of the path-traced test views were not finite and are black")
+    return found
+
+
+def _cycles_baselines(
+    swept: Frontier,
+    settings: Settings,
+    samples: tuple[int, ...],
+    cores: int,
+) -> list[BaselinePoint]:
+    """Cycles on the test views, rendered and measured where that is not on disk."""
+    workspace, views = swept.scene.workspace, split_views(swept.scene.workspace)["test"]
+    reference_spp, folder = settings.raytrace.evaluation_spp, swept.request.out / "rivals"
+    fingerprint = digest(
+        [CYCLES_VERSION, scene_fingerprint(workspace), [v.model_dump() for v in views], samples, reference_spp, cores]
+    )
+    pictures = folder / f"cycles-{fingerprint}"
+    render = CyclesFramesTask(
+        scene_dir=workspace.scene,
+        views=tuple(views),
+        samples=samples,
+        reference_spp=reference_spp,
+        folder=pictures,
+        output=pictures / "frames.json",
+        label="Cycles",
+    )
+    worker_pool = replace(swept.worker_pool, threads=cores, workers=1)
+    worker_pool.work("Cycles on the test views", "dnrpipe.blender.passes.cycles_frames", [render])
+    measure = CyclesMeasureTask(
+        workspace=workspace.root,
+        views=[view.name for view in views],
+        frames=render.output,
+        folder=pictures,
+        output=folder / f"{digest([fingerprint, swept.perceptual])}.json",
+        label="Cycles",
+    )
+    worker_pool.work("measuring Cycles", "dnrpipe.studies.frontier.cycles_worker", [measure])
+    return BaselineFile.model_validate_json(measure.output.read_bytes()).baselines
+
+
+def _write(results: FrontierResults, out: Path) -> None:
+    data = results.data()
+    write_json(out / "results.json", data)
+    with atomic_path(out / "results.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, COLUMNS, extrasaction="ignore", restval="")
+        writer.writeheader()
+        writer.writerows(data["points"])
+        for baseline in results.baselines:
+            tracer = "Cycles" if baseline.by_cycles else "path tracing"
+            kind = f"{tracer} + denoiser" if baseline.denoised else tracer
+            writer.writerow({**baseline.data(), "kind": kind, "frame_ms": baseline.ms, "upfront": baseline.upfront})
+    for count in results.frames:
+        plot(results, count, out / f"frontier-{count}.png")
+    write_text(out / "report.md", markdown(results))
