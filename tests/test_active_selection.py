@@ -206,8 +206,8 @@ def test_the_worker_writes_a_selection(tmp_path: Path) -> None:
     small = {"texture_size": 16, "width": 4, "depth": 1}
     settings = resolve(None, {"model": small, "select": {"budget": 3}}, environment={})
     task = {
-        "key": "k", "workspace": str(workspace.root), "settings": settings.model_dump(mode="json"),
-        "policy": "variance", "seed": 0, "folder": str(tmp_path / "models"), "output": str(tmp_path / "k.json"),
+        "fingerprint": "k", "workspace": str(workspace.root), "settings": settings.model_dump(mode="json"), "seed": 0,
+        "policy": "variance", "folder": str(tmp_path / "models"), "output": str(tmp_path / "k.json"), "label": "k",
     }  # fmt: skip
     made = active_worker.Worker({"threads": 1, "device": "cpu"})(task)
     assert json.loads((tmp_path / "k.json").read_text()) == made

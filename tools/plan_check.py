@@ -52,6 +52,7 @@ def check(scene: str, results: FrontierResults, predictor: Predictor) -> list[di
     for point in results.points:
         if point.kind != "ours":
             continue
+        assert point.spp is not None and point.steps is not None  # it was trained
         choice = predictor.choice(point.views, point.spp, point.steps)
         traced = predictor.processor.raytrace(choice.views, choice.spp) - predictor.processor.light()
         trained = predictor.processor.finetune(choice.steps, choice.epochs)

@@ -87,7 +87,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--out", type=Path, default=Path(".cache/frames/frames.json"), help="JSON; Markdown beside it")
     parser.add_argument("--cache", type=Path, default=Path(".cache/frames"), help="where references are kept")
     parser.add_argument("--views", type=int, default=6, help="test views measured")
-    parser.add_argument("--samples", type=int, nargs="+", default=[1, 2, 4, 8, 16, 64], help="the rival's ladder")
+    parser.add_argument("--samples", type=int, nargs="+", default=[1, 2, 4, 8, 16, 64], help="of path tracing")
     parser.add_argument("--rays", type=int, nargs="+", default=[], help="rays per pixel of our base images")
     parser.add_argument("--keep", action="store_true", help="scenes that --out has from before stay in it")
     parser.add_argument("--reference-spp", type=int, default=1024, help="samples of a reference, in two halves")

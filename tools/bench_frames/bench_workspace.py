@@ -84,11 +84,8 @@ def bench(root: Path, options: Options, tell: Callable[[str], None]) -> dict[str
     result = _figures(scene, options, reference, truth, baselines, own)
     result["upfront"] = upfront(scene.workspace.ledger.read(), options.threads)
     if options.orbit > 1:
-        shown = [
-            (baselines[name].spp, baselines[name].method)
-            for name in result["frontier"]
-            if baselines[name].method != "raw"
-        ]
+        best = [baselines[name] for name in result["frontier"]]
+        shown = [(baseline.spp, baseline.method) for baseline in best if baseline.method != "raw"]
         result["stability"] = measure(
             scene,
             ours,

@@ -58,7 +58,7 @@ def _processor() -> str:
 
 
 def markdown(record: dict[str, Any]) -> str:
-    """The tables of a record of :func:`write`."""
+    """The tables of a record of `write`."""
     made, scenes = record["made"], record["scenes"]
     first = scenes[0]["options"]
     lines = [

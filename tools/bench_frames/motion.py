@@ -70,8 +70,8 @@ def changes(images: list[np.ndarray], surfaces: list[Surface]) -> list[tuple[np.
     """Per pair of frames one after the other: (after - reprojected before [H, W, C], where valid [H, W])."""
     pairs = zip(images, images[1:], surfaces, surfaces[1:], strict=False)
     found = []
-    for before, after, surface, following in pairs:
-        picture, valid = reproject(before, surface, following)
+    for before, after, surface, next_surface in pairs:
+        picture, valid = reproject(before, surface, next_surface)
         found.append((np.where(valid[..., None], after - picture, 0), valid))
     return found
 

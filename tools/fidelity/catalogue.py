@@ -1,4 +1,4 @@
-"""The list of fidelity scenes. Builders register themselves with :func:`scene`."""
+"""The list of fidelity scenes. Builders register themselves with `scene`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Case:
     name: of the builder; title: what a reader calls the feature; group: heading in the table.
     build: fills the open, empty Blender file. size: width, height in pixels.
     samples: factor on both renderers' samples per pixel, for scenes that converge slowly.
-    formulas: names in :mod:`.formulas` of what another exporter does here.
+    formulas: names in `formulas` of what another exporter does here.
     source: all code that decides the scene, the builder's own and the shared studio's; layout does not count.
     """
 

@@ -80,7 +80,7 @@ def make_references(cases: Sequence[Case], plan: Plan, console: Console) -> dict
 
 
 def run_cases(cases: Sequence[Case], plan: Plan, console: Console) -> list[dict[str, Any]]:
-    """The record of every case (see :func:`measure_case`), in order; also kept as results/<name>.json."""
+    """The record of every case (see `measure_case`), in order; also kept as results/<name>.json."""
     failed = make_references(cases, plan, console)
     choose_variant("auto")  # probed once, before threads ask for it
     records: dict[str, dict[str, Any]] = {}

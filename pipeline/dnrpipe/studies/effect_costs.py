@@ -1,4 +1,4 @@
-"""`dnrpipe effects`: the plan as a table, its overrides, and its columns measured."""
+"""`dnrpipe effects`: the plan as a table, its overrides, and what each effect costs and changes, measured."""
 
 from __future__ import annotations
 
@@ -50,8 +50,9 @@ def override_settings(
 
 def show_effects(session: Session, *, measure: bool) -> None:
     """Print the plan; with ``measure``, fill its columns first."""
-    workspace, settings, console = session.workspace, session.settings, session.console
-    _require_scene(session)
+    run = session.run
+    workspace, settings, console = run.workspace, run.settings, run.console
+    _require_scene(run)
     plan = plan_of(workspace, settings)
     for name in settings.effects.disable:
         if plan.on(name):
@@ -61,34 +62,34 @@ def show_effects(session: Session, *, measure: bool) -> None:
             raise UserError(f"--enable {name}: there is nothing to simulate ({plan.effect(name).evidence[0]})")
     workspace.save()
     if measure:
-        run = replace(session.run, id=f"effects-{int(time.time()):x}")
-        plan = measure_plan(session, run, resolve_plan(run))
+        run = replace(run, id=f"effects-{int(time.time()):x}")
+        plan = measure_plan(run, resolve_plan(run))
         keep_plan(workspace, plan)
     if not console.json_mode:
         console.say(table(plan))
     console.result({"workspace": str(workspace.root), **plan.model_dump(mode="json")})
 
 
-def _require_scene(session: Session) -> None:
+def _require_scene(run: Run) -> None:
     from ..stages.pipeline import STAGES, state
 
-    found = state(STAGES["prepare"], session.workspace, session.settings)
+    found = state(STAGES["prepare"], run.workspace, run.settings)
     if found in ("missing", "stale"):
         why = {"missing": "has not run", "stale": "is out of date"}[found]
-        raise UserError(f"effects: prepare {why} for {session.workspace.root}; run `dnrpipe prepare` first")
+        raise UserError(f"effects: prepare {why} for {run.workspace.root}; run `dnrpipe prepare` first")
 
 
-def measure_plan(session: Session, run: Run, plan: EffectPlan) -> EffectPlan:
+def measure_plan(run: Run, plan: EffectPlan) -> EffectPlan:
     """The plan with cost and error of every effect that changes how views are traced.
 
     Each effect is compared with the same plan but for that effect, on a few training views with the same seeds.
     """
-    workspace, settings, console = session.workspace, session.settings, session.console
+    workspace, settings = run.workspace, run.settings
     choice = variant_for(plan, settings)
     base = trace_config(workspace, plan, choice.variant)
     rows: list[tuple[EffectName, dict[str, Any]]] = []
     for effect in plan.effects:
-        other = _toggled(session, plan, effect)
+        other = _toggled(run, plan, effect)
         if other is None:
             continue
         config = trace_config(workspace, other, choice.variant)
@@ -105,7 +106,7 @@ def measure_plan(session: Session, run: Run, plan: EffectPlan) -> EffectPlan:
         }
         rows.append((effect.name, task))
     log = workspace.log("effects")
-    results = run_pilots([task for _, task in rows], choice, console, "measuring effects", log)
+    results = run_pilots([task for _, task in rows], choice, run.console, "measuring effects", log)
     measured = {}
     for (name, _), result in zip(rows, results, strict=True):
         measured[name] = {key: Measured.model_validate(result[key]) for key in ("cost", "error")}
@@ -115,18 +116,18 @@ def measure_plan(session: Session, run: Run, plan: EffectPlan) -> EffectPlan:
     return plan.model_copy(update={"effects": effects})
 
 
-def _toggled(session: Session, plan: EffectPlan, effect: Effect) -> EffectPlan | None:
+def _toggled(run: Run, plan: EffectPlan, effect: Effect) -> EffectPlan | None:
     """The plan with one light effect the other way round; None where there is nothing to switch."""
     if effect.part == "neural" or not (effect.present or effect.name in FORCEABLE):
         return None
-    chosen = session.settings.effects
+    chosen = run.settings.effects
     enable: tuple[EffectName, ...] = tuple(name for name in chosen.enable if name != effect.name)
     disable: tuple[EffectName, ...] = tuple(name for name in chosen.disable if name != effect.name)
     if effect.on:
         disable = (*disable, effect.name)
     else:
         enable = (*enable, effect.name)
-    return plan_of(session.workspace, session.settings, enable=enable, disable=disable, pilot=plan.pilot)
+    return plan_of(run.workspace, run.settings, enable=enable, disable=disable, pilot=plan.pilot)
 
 
 def table(plan: EffectPlan) -> str:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..cells.markdown import NONE, code_of, spread, table
+from ..cells.markdown import NONE, made_line, spread, table
 from ..cells.scenes import HARD_LIGHT
 from .ablation_results import known_rows, read_results
 from .rows import ROWS
@@ -36,7 +36,7 @@ COLUMNS: tuple[tuple[str, str, int], ...] = (
 )
 PER_SCENE = (("psnr", "PSNR, dB", 2), ("psnr_mask", "PSNR inside the mask, dB", 2), ("ssim", "SSIM", 4),
              ("lpips_vgg", "LPIPS (VGG)", 4))  # fmt: skip
-RIVALS = ("vanilla", "paper")
+BASELINES = ("vanilla", "paper")
 
 
 class Figures:
@@ -106,12 +106,9 @@ def _mean_title(scenes: Sequence[str]) -> str:
 
 
 def _provenance(results: Mapping[str, Any], figures: Figures) -> str:
-    box = results["machine"]
     time = f"about {results['seconds']:g} s of training for every row" if results["seconds"] else "the preset's epochs"
     return (
-        f"`{results['command']}`, {results['date'][:10]}, {code_of(results)}; {box['processor']},"
-        f" {box['cores']} cores, torch {results['versions']['torch']}. Preset"
-        f" {results['preset']}, {results['resolution']}, {results['budget']}"
+        f"{made_line(results)}, {results['budget']}"
         f" training views, {len(figures.seeds)} seed(s), {time}. PSNR and SSIM over white; ± is the standard deviation"
         " over seeds; training time includes step 1 where a row has it."
     )
@@ -143,16 +140,16 @@ def _per_scene(figures: Figures, metric: str, title: str, digits: int) -> str:
 
 
 def _gains(figures: Figures) -> str:
-    rivals = [row for row in RIVALS if row in figures.rows]
-    if "dnr" not in figures.rows or not rivals:
+    baselines = [row for row in BASELINES if row in figures.rows]
+    if "dnr" not in figures.rows or not baselines:
         return ""
-    head = ["scene", *[f"{what} `{rival}`" for rival in rivals for what in ("ΔPSNR over", "LPIPS VGG over")]]
+    head = ["scene", *[f"{what} `{baseline}`" for baseline in baselines for what in ("ΔPSNR over", "LPIPS VGG over")]]
     rows = []
     for name, scenes in [*[(scene, [scene]) for scene in figures.scenes], ("**mean**", figures.scenes)]:
         line = [name]
-        for rival in rivals:
-            line.append(spread(figures.difference("dnr", rival, "psnr", scenes), 2, signed=True))
-            line.append(spread(figures.ratio("dnr", rival, "lpips_vgg", scenes), 2))
+        for baseline in baselines:
+            line.append(spread(figures.difference("dnr", baseline, "psnr", scenes), 2, signed=True))
+            line.append(spread(figures.ratio("dnr", baseline, "lpips_vgg", scenes), 2))
         rows.append(line)
     return f"### `dnr` against its rivals\n\n{table(head, rows)}"
 

@@ -6,7 +6,6 @@ paper's, at the sizes of the preset; rows of the family ``dnr`` start from the p
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -15,6 +14,7 @@ from pydantic import ValidationError
 
 from ...core.errors import UserError
 from ...core.settings import Settings, merge
+from ..cells.names import choose_names
 
 Family = Literal["classic", "dnr"]
 ViewChoice = Literal["farthest", "random", "rl", "all"]
@@ -134,16 +134,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 
 def choose_rows(text: str) -> list[Row]:
     """``"vanilla,dnr"`` or groups of rows, in the order of the table. Raises UserError for unknown names."""
-    names: set[str] = set()
-    for name in filter(None, (part.strip() for part in text.split(","))):
-        if name not in GROUPS and name not in ROWS:
-            near = difflib.get_close_matches(name, [*ROWS, *GROUPS], n=1)
-            hint = f"did you mean '{near[0]}'?" if near else f"groups: {', '.join(GROUPS)}"
-            raise UserError(f"--rows {name}: no such row or group; {hint} (rows: {', '.join(ROWS)})")
-        names.update(GROUPS.get(name, (name,)))
-    if not names:
-        raise UserError(f"--rows: names no row; choose of {', '.join([*GROUPS, *ROWS])}")
-    return [row for row in _ROWS if row.name in names]
+    return [ROWS[name] for name in choose_names("--rows", "row", text, ROWS, GROUPS)]
 
 
 def settings_of(row: Row, base: Settings, overrides: Mapping[str, Any]) -> Settings:

@@ -23,6 +23,16 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
+def made_line(results: Mapping[str, Any]) -> str:
+    """How the results were made: command, date, code, machine, preset and resolution."""
+    box = results["machine"]
+    return (
+        f"`{results['command']}`, {results['date'][:10]}, {code_of(results)}; {box['processor']},"
+        f" {box['cores']} cores, torch {results['versions']['torch']}. Preset"
+        f" {results['preset']}, {results['resolution']}"
+    )
+
+
 def code_of(results: Mapping[str, Any]) -> str:
     """The commit that made the results, and those of its cells where they differ."""
     commits = sorted({cell["commit"] for cell in results["cells"] if cell["commit"]})

@@ -20,8 +20,15 @@ NEAR = 0.02
 
 @dataclass(frozen=True)
 class Predictor:
-    """Costs and quality of any choice. base, gain, judged, reference: of the pilot (:mod:`.quality`); batch: views a
-    step."""
+    """Costs and quality of any choice.
+
+    Args:
+        pilot: of the workspace.
+        wall, processor: costs by either clock.
+        prior: of all scenes.
+        base, gain, judged, reference: of the pilot; see `quality`.
+        batch: views a step.
+    """
 
     pilot: Pilot
     wall: Costs

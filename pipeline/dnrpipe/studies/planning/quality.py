@@ -10,7 +10,7 @@ Notation
     base        PSNR of the base image alone against the truth, dB; the pilot measures it
     G           dB that the network adds with many views and steps; the scene's own
     b           part of G that 500 steps still lack; the scene's own: some are learned in a hundred steps, some go on
-    noise(S)    RMSE of a training picture in display space (:func:`.seconds.noise_at`)
+    noise(S)    RMSE of a training picture in display space (`seconds.noise_at`)
     learned     RMSE of what the network takes of that noise for the truth: more, the longer it sees the fewer pictures
     reference   RMSE of the test views' references, likewise: what the report will measure counts it
     a, alpha, beta, kappa, gamma, delta   shared by all scenes: the prior, ``prior.json``, by
@@ -40,8 +40,11 @@ LEAST_MSE = 1e-6
 
 
 class Prior(Record):
-    """Shared parameters; b is the median over scenes, b_spread the standard deviation of its logarithm; ``sd`` of a
-    prediction by leaving scenes out, dB; where they come from."""
+    """Shared parameters.
+
+    b is the median over scenes, b_spread the standard deviation of its logarithm. gain_mean, gain_sd: of G. sd: of a
+    prediction, by leaving scenes out, dB. scenes, source: where they come from.
+    """
 
     a: float
     alpha: float
@@ -155,8 +158,17 @@ def predict(
     judged: float = 0.0,
     reference: float = 0.0,
 ) -> Interval:
-    """PSNR, dB. gain: of :func:`scene_gain`. noise: RMSE of the training pictures. judged: of :func:`views_error`.
-    reference: RMSE of the references."""
+    """PSNR that a choice is expected to give, dB.
+
+    Args:
+        prior: of all scenes.
+        base: PSNR of the base image alone.
+        gain: of `scene_gain`.
+        views, steps: of the choice.
+        noise: RMSE of the training pictures.
+        judged: of `views_error`.
+        reference: RMSE of the references.
+    """
     added, unsure = gain.at(prior, views, steps)
     expected = with_noise(base + added, math.hypot(learned_noise(prior, noise, views, steps), reference))
     spread = NINE_IN_TEN * math.hypot(prior.sd, unsure, judged)

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..cells.markdown import NONE, code_of, spread, table
+from ..cells.markdown import NONE, made_line, spread, table
 from .bench_results import read_results
 from .figures import SPHERICAL, Figures
 from .intervals import LEVEL, Difference
@@ -56,12 +56,9 @@ def together(runs: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _provenance(results: Mapping[str, Any], figures: Figures) -> str:
-    box = results["machine"]
     time = f"about {results['seconds']:g} s of training for every cell" if results["seconds"] else "the preset's epochs"
     return (
-        f"`{results['command']}`, {results['date'][:10]}, {code_of(results)}; {box['processor']},"
-        f" {box['cores']} cores, torch {results['versions']['torch']}. Preset"
-        f" {results['preset']}, {results['resolution']}, {results['candidates']}"
+        f"{made_line(results)}, {results['candidates']}"
         f" candidates a pool, {len(figures.scenes)} scene(s) ({', '.join(figures.scenes)}), {len(figures.seeds)}"
         f" seed(s), {time}, {len(results['cells'])} cells."
     )

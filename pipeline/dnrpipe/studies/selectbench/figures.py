@@ -49,24 +49,24 @@ class Figures:
             return None
         return max(found, key=lambda name: statistics.fmean(found[name][place] for place in shared))
 
-    def rival(self, kind: str, pool: str, budget: int) -> str | None:
+    def baseline(self, kind: str, pool: str, budget: int) -> str | None:
         """``random``, or the name of the best simple rule here for ``simple``."""
         return self.best_simple(pool, budget) if kind == "simple" else kind
 
     def against(self, policy: str, kind: str, pools: Sequence[str], budget: int, metric: str) -> Difference | None:
-        """policy - rival, each pool with its own rival; over several pools the mean of each (scene, seed) over them.
+        """policy - baseline, each pool with its own baseline.
 
-        None where they share nothing, or where the policy is the rival everywhere; where it is the rival in some
-        pools, these count as 0.
+        Over several pools it is the mean of each (scene, seed) over them. None where they share nothing, or where the
+        policy is the baseline everywhere; where it is the baseline in some pools, these count as 0.
         """
-        rivals = {pool: self.rival(kind, pool, budget) for pool in pools}
-        rivals = {pool: rival for pool, rival in rivals.items() if rival is not None}
-        if all(rival == policy for rival in rivals.values()):
+        baselines = {pool: self.baseline(kind, pool, budget) for pool in pools}
+        baselines = {pool: baseline for pool, baseline in baselines.items() if baseline is not None}
+        if all(baseline == policy for baseline in baselines.values()):
             return None
         found: dict[tuple[str, int], list[float]] = {}
-        for pool, rival in rivals.items():
-            ours, theirs = (self.values(pool, budget, name, metric) for name in (policy, rival))
+        for pool, baseline in baselines.items():
+            ours, theirs = (self.values(pool, budget, name, metric) for name in (policy, baseline))
             for place in ours.keys() & theirs.keys():
                 found.setdefault(place, []).append(ours[place] - theirs[place])
-        whole = {place: statistics.fmean(pairs) for place, pairs in found.items() if len(pairs) == len(rivals)}
+        whole = {place: statistics.fmean(pairs) for place, pairs in found.items() if len(pairs) == len(baselines)}
         return summarise({place: whole[place] for place in sorted(whole)})

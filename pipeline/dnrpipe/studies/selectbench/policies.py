@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import functools
 import hashlib
 from collections.abc import Mapping
@@ -10,8 +9,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from ...core.errors import UserError
 from ...core.settings import Settings, merge
+from ..cells.names import choose_names
 
 LEARNED = "rl-paper"
 """The policy that the trainer's step 1 trains."""
@@ -58,7 +57,7 @@ _CONTENDERS = (
 )
 CONTENDERS: dict[str, Contender] = {contender.name: contender for contender in _CONTENDERS}
 SIMPLE = ("farthest", "kmedoids", "coverage")
-"""The simple rules; the best of them in a pool is the rival."""
+"""The simple rules; the best of them in a pool is the baseline."""
 GROUPS: dict[str, tuple[str, ...]] = {
     "core": tuple(c.name for c in _CONTENDERS if c.kind == "rule"),
     "simple": ("random", *SIMPLE),
@@ -70,16 +69,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 
 def choose_policies(text: str) -> list[Contender]:
     """``"random,kmedoids"`` or groups, in the table's order. Raises UserError for unknown names."""
-    names: set[str] = set()
-    for name in filter(None, (part.strip() for part in text.split(","))):
-        if name not in GROUPS and name not in CONTENDERS:
-            near = difflib.get_close_matches(name, [*CONTENDERS, *GROUPS], n=1)
-            hint = f"did you mean '{near[0]}'?" if near else f"groups: {', '.join(GROUPS)}"
-            raise UserError(f"--policies {name}: no such policy or group; {hint} (policies: {', '.join(CONTENDERS)})")
-        names.update(GROUPS.get(name, (name,)))
-    if not names:
-        raise UserError(f"--policies: names none; choose of {', '.join([*GROUPS, *CONTENDERS])}")
-    return [contender for contender in _CONTENDERS if contender.name in names]
+    return [CONTENDERS[name] for name in choose_names("--policies", "policy", text, CONTENDERS, GROUPS)]
 
 
 def settings_of(contender: Contender, base: Settings, budget: int) -> Settings:
