@@ -1,4 +1,4 @@
-"""Findings of the conversion as lines for people: what recurs is said once, with names."""
+"""Findings of the conversion as lines for people: a line for what recurs, with names."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ def scratch_folder(pixels: int) -> Iterator[Path]:
 
 
 def _sweep(parent: Path) -> None:
-    """Remove scratch folders whose process was killed: nobody else frees the memory that they hold."""
+    """Remove temporary folders whose process was killed: nothing else frees the memory that they hold."""
     for folder in parent.glob(f"{PREFIX}*-*"):
         owner = folder.name.removeprefix(PREFIX).partition("-")[0]
         if owner.isdigit() and not Path("/proc", owner).exists():
