@@ -14,12 +14,11 @@ from dnrtrain.exr import write_exr
 
 from .base_renderer import BaseRenderer
 from .denoise import denoise
-from .engine import Engine
-from .finite import masked
+from .engine import Engine, masked
 from .frames import Frames
 from .light_worker import read_light
+from .sensors import scaled_view
 from .tasks import BakedCommon, BaseAnswer, BaseTask, SampledCommon
-from .units import scaled_view
 
 COLOUR = ("base.R", "base.G", "base.B", "base.A")
 MIRROR = 0.02

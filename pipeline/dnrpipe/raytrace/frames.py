@@ -22,10 +22,11 @@ from dnrtrain.contract import View
 
 from .auxiliary import shown_first
 from .engine import Engine
-from .frames_rays import lets_through, pinhole, seen_first
+from .lobes import lets_through
 from .recorded import Recorded, prepare_emitters
+from .sensors import scaled_view
 from .texels import ATTRIBUTE
-from .units import scaled_view
+from .visibility import first_visible_of
 
 MAX_EDGE_RAYS = 1 << 24
 """Of a launch that looks at silhouettes: bounds its memory."""
@@ -293,3 +294,49 @@ def _differs(mask: np.ndarray) -> np.ndarray:
     height, width = mask.shape
     shifted = [padded[i : i + height, j : j + width] for i in range(3) for j in range(3)]
     return np.any(shifted, axis=0) & ~np.all(shifted, axis=0)
+
+
+def pinhole(mi: Any, camera: list[Any], pixel: Any, offset: Any, width: int) -> Any:
+    """Rays through places (0..1, 0..1) of pixels, numbered row by row.
+
+    camera: c2w's first three rows, focal length, principal point (x, y), lengths of the latter in pixels.
+    """
+    import drjit as dr
+
+    x = (mi.Float(pixel % width) + offset.x - camera[13]) / camera[12]
+    y = (mi.Float(pixel // width) + offset.y - camera[14]) / camera[12]
+    # Camera axes are OpenGL's: y up, looking along -z.
+    world = [camera[4 * row] * x - camera[4 * row + 1] * y - camera[4 * row + 2] for row in range(3)]
+    return mi.Ray3f(mi.Point3f(camera[3], camera[7], camera[11]), dr.normalize(mi.Vector3f(*world)))
+
+
+def seen_first(mi: Any, scene: Any) -> Any:
+    """Function (scene, ray, sampler) -> what the pixel shows there first.
+
+    Lamps are passed, and what surfaces let straight through is passed with its probability; where there are no such
+    surfaces, the sampler may be None.
+    """
+    import drjit as dr
+
+    visible, transparent = first_visible_of(mi, scene), lets_through(mi, scene)
+
+    def seen(scene: Any, ray: Any, sampler: Any) -> Any:
+        ray, hit = visible(scene, ray, mi.Bool(True))
+        if not transparent:
+            return hit
+
+        def passes(hit: Any, sampler: Any, active: Any) -> Any:
+            bsdf = hit.bsdf()
+            null = active & hit.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
+            share = dr.mean(bsdf.eval_null_transmission(hit, null))
+            return null & (sampler.next_1d(active) < share)
+
+        def onwards(hit: Any, direction: Any, sampler: Any, active: Any) -> tuple[Any, ...]:
+            _, next_hit = visible(scene, hit.spawn_ray(direction), active)
+            hit = dr.select(active, next_hit, hit)
+            return hit, direction, sampler, passes(hit, sampler, active)
+
+        state = (hit, mi.Vector3f(ray.d), sampler, passes(hit, sampler, mi.Bool(True)))
+        return dr.while_loop(state, lambda hit, direction, sampler, active: active, onwards)[0]
+
+    return seen

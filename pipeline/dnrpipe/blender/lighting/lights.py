@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import bpy
@@ -18,7 +19,6 @@ from ..findings import Findings
 from ..shading.sockets import Scope, resolve
 from ..shading.textures import ImageReader, Textured, TextureStore
 from ..shading.values import Evaluator
-from .visible_lights import visible_lights
 
 FAR_DISC = 100.0
 """Distance of a soft sun's disc, in radii of the scene."""
@@ -32,6 +32,13 @@ POINT_RADIUS = 1e-3
 """Radius, in radii of the scene, of a sphere that stands for a point."""
 SPOT_TEXELS = 513
 """Side of the image that carries a spot's cross-section."""
+KINDS = {
+    "visible_diffuse": "diffuse",
+    "visible_glossy": "glossy",
+    "visible_transmission": "transmission",
+    "visible_volume_scatter": "volume scatter",
+    "visible_shadow": "shadow",
+}
 
 
 def export_lights(
@@ -323,3 +330,56 @@ def _frame(axis: np.ndarray) -> np.ndarray:
     helper = np.array([1.0, 0.0, 0.0]) if abs(axis[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     x = _unit(np.cross(helper, axis))
     return np.stack([x, np.cross(axis, x), axis], axis=1)
+
+
+def visible_lights(scene: bpy.types.Scene) -> Iterator[tuple[Any, np.ndarray]]:
+    """Lamp objects that renders see, instances included, with their world matrices (float64 [4, 4])."""
+    layer = next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
+    hidden = _hidden_objects(layer.layer_collection)
+    depsgraph = layer.depsgraph if layer.depsgraph is not None else bpy.context.evaluated_depsgraph_get()
+    for obj in sorted(layer.objects, key=lambda o: o.name):
+        if obj.type == "LIGHT" and not obj.hide_render and obj.name not in hidden:
+            evaluated = obj.evaluated_get(depsgraph)
+            yield evaluated, np.array(evaluated.matrix_world, dtype=np.float64)
+    for instance in depsgraph.object_instances:
+        if instance.is_instance and instance.object.type == "LIGHT" and instance.show_self:
+            parent = instance.parent
+            if parent is not None and (parent.hide_render or parent.name in hidden):
+                continue
+            yield instance.object, np.array(instance.matrix_world, dtype=np.float64)
+
+
+def _hidden_objects(collection: bpy.types.LayerCollection, hidden: bool = False) -> set[str]:
+    """Names of objects that only lie in excluded or render-hidden collections."""
+    shown: set[str] = set()
+    masked: set[str] = set()
+
+    def visit(layer: bpy.types.LayerCollection, above: bool) -> None:
+        off = above or layer.collection.hide_render
+        target = masked if off or layer.exclude else shown
+        target.update(obj.name for obj in layer.collection.objects)
+        for child in layer.children:
+            visit(child, off)
+
+    visit(collection, hidden)
+    return masked - shown
+
+
+def report_ray_visibility(names: Iterable[str], findings: Findings) -> None:
+    """A finding for each object that is hidden from some rays, a shadow catcher, a holdout, or has linked light.
+
+    names: objects of the frozen scene. Camera rays are not among them: those are obeyed.
+    """
+    objects = {obj.name_full: obj for obj in bpy.data.objects}
+    for name in sorted(set(names) & set(objects)):
+        obj = objects[name]
+        hidden = [kind for flag, kind in KINDS.items() if not getattr(obj, flag, True)]
+        if hidden:
+            findings.add("ignored", "ray visibility", f"{', '.join(hidden)} rays see it", object=name)
+        if obj.is_shadow_catcher:
+            findings.add("ignored", "shadow catcher", "an ordinary surface", object=name)
+        if obj.is_holdout:
+            findings.add("ignored", "holdout object", "an ordinary surface", object=name)
+        linking = getattr(obj, "light_linking", None)
+        if linking is not None and (linking.receiver_collection or linking.blocker_collection):
+            findings.add("ignored", "light linking", "it lights and shades everything", object=name)

@@ -5,7 +5,7 @@ Notation
     f(c) the node's output; one row for the front of the surface, one for its back
 
 A table is a `Textured` of its own placement, so that arithmetic on it (Math, ColorRamp, Mix, ...) is exact;
-texture plugin ``dnr_view`` (dnrpipe/raytrace/plugins/views.py) looks it up while rendering.
+texture plugin ``dnr_view`` (dnrpipe/raytrace/plugins/lookups.py) looks it up while rendering.
 """
 
 from __future__ import annotations
