@@ -78,7 +78,8 @@ class Textured:
         """Texels as float32, linear."""
         if self.texels.dtype != np.uint8:
             return self.texels
-        return _decode_table(self.srgb)[self.texels]
+        codes = np.arange(256, dtype=np.float32) / 255
+        return (srgb_to_linear(codes) if self.srgb else codes)[self.texels]
 
     @property
     def mean(self) -> np.ndarray:
@@ -138,11 +139,6 @@ def srgb_to_linear(x: np.ndarray) -> np.ndarray:
 def linear_to_srgb(x: np.ndarray) -> np.ndarray:
     """Linear light -> sRGB code values, float32."""
     return encode(x).astype(np.float32)
-
-
-def _decode_table(srgb: bool) -> np.ndarray:
-    codes = np.arange(256, dtype=np.float32) / 255
-    return srgb_to_linear(codes) if srgb else codes
 
 
 @dataclass
@@ -252,7 +248,9 @@ class TextureStore:
         xmltree.flag(element, "raw", raw or not value.srgb)
         affine = np.asarray(value.placement.to_uv, dtype=np.float64)
         if not np.allclose(affine, np.eye(3)):
-            xmltree.matrix(element, "to_uv", embed_affine(affine))
+            full = np.eye(4)  # Mitsuba reduces it to a planar map, whose translation is in the last column
+            full[:2, :2], full[:2, 3] = affine[:2, :2], affine[:2, 2]
+            xmltree.matrix(element, "to_uv", full)
         return element
 
     def save(self, texels: np.ndarray, srgb: bool, label: str) -> str:
@@ -268,14 +266,6 @@ class TextureStore:
             write_png(path, texels) if texels.dtype == np.uint8 else write_colour_exr(path, texels)
             self._written[key] = relative
         return self._written[key]
-
-
-def embed_affine(affine: np.ndarray) -> np.ndarray:
-    """A 3x3 planar affine map as the 4x4 that Mitsuba reduces to it (translation in the last column)."""
-    full = np.eye(4)
-    full[:2, :2] = affine[:2, :2]
-    full[:2, 3] = affine[:2, 2]
-    return full
 
 
 def write_png(path: Path, texels: np.ndarray) -> None:

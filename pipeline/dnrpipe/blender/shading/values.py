@@ -189,7 +189,7 @@ class Evaluator:
         result = operation.evaluate(source.node, source.socket, arrays)
         if result is None:
             self._inexact(f"{source.node.bl_label} node", "this mode is not converted: first input used")
-            result = arrays[operation.fallback(source.node)]
+            result = arrays[operation.fallback]
         result = np.asarray(result, dtype=np.float32)
         if lead is None:
             return constant(result.reshape(-1, result.shape[-1])[0] * np.ones(3, dtype=np.float32))
