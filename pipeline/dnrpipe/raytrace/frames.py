@@ -11,6 +11,7 @@ Notation
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -66,22 +67,16 @@ class Frames:
         prepare_emitters(self.mi, self.scene)
         self.integrator, self.name = engine.integrator(bundle, integrator, max_depth)
         self.passing = lets_through(self.mi, self.scene)
-        self._path: dict[int, Any] = {}
-        self._auxiliary: dict[int, Any] = {}
-        self._centre: Any = None
+        self._kernels: dict[tuple[str, int], Any] = {}
         self._cover: dict[int, Any] = {}
 
     def path(self, view: View, spp: int, seed: int) -> np.ndarray:
         """Path-traced RGBA, linear Rec.709, premultiplied, box filter, float32 [H, W, 4]; NaN where Mitsuba gave it."""
-        if spp not in self._path:
-            self._path[spp] = self._warmed(self._path_kernel(spp), view, spp)
-        return self._image(self._path[spp](*self._inputs(view, seed, spp)))
+        return self._image(self._kernel(self._path_kernel, view, spp)(*self._inputs(view, seed, spp)))
 
     def auxiliary(self, view: View, rays: int, seed: int) -> Auxiliary:
         """Means over ``rays`` primary rays a pixel; a square number of them is stratified, one per cell."""
-        if rays not in self._auxiliary:
-            self._auxiliary[rays] = self._warmed(self._auxiliary_kernel(rays), view, rays)
-        image = self._image(self._auxiliary[rays](*self._inputs(view, seed, rays)))
+        image = self._image(self._kernel(self._auxiliary_kernel, view, rays)(*self._inputs(view, seed, rays)))
         return Auxiliary(image[..., :3], image[..., 3:6], image[..., 6])
 
     def gbuffer(self, view: View, rays: int = 16) -> dict[str, np.ndarray]:
@@ -89,9 +84,7 @@ class Frames:
 
         coverage: as of `coverage`. The rest is of the ray through the pixel's centre.
         """
-        if self._centre is None:
-            self._centre = self._warmed(self._centre_kernel(), view, 1)
-        image = self._image(self._centre(*self._inputs(view, 0, 1)))
+        image = self._image(self._kernel(self._centre_kernel, view, 1)(*self._inputs(view, 0, 1)))
         axis = view.matrix[:3, 2]
         position, mask = image[..., 5:8] / self.engine.unit_scale, image[..., 8] > 0
         names = ("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "position.X", "position.Y", "position.Z", "mask")
@@ -165,7 +158,7 @@ class Frames:
 
         return kernel
 
-    def _centre_kernel(self) -> Any:
+    def _centre_kernel(self, count: int) -> Any:
         import drjit as dr
 
         mi, scene, seen = self.mi, self.scene, seen_first(self.mi, self.scene)
@@ -174,7 +167,7 @@ class Frames:
         @Recorded
         def kernel(camera: list[Any], seed: Any, samples: Any) -> list[Any]:
             sampler = prototype.fork()
-            ray = rays(sampler, camera, seed, samples, 1, 0)
+            ray = rays(sampler, camera, seed, samples, count, 0)
             hit = seen(scene, ray, sampler)
             found = hit.is_valid()
             place = hit.shape.eval_attribute_3(ATTRIBUTE, hit, found & hit.shape.has_attribute(ATTRIBUTE, found))
@@ -275,6 +268,13 @@ class Frames:
         numbers = (*moved.matrix[:3].ravel(), moved.fl_x, moved.cx, moved.cy)
         camera = [dr.opaque(mi.Float, float(number)) for number in numbers]
         return camera, dr.opaque(mi.UInt32, seed), dr.opaque(mi.UInt32, samples)
+
+    def _kernel(self, make: Callable[[int], Any], view: View, rays: int) -> Any:
+        """The kernel that ``make`` makes for so many rays a pixel: made once, and warm."""
+        key = make.__name__, rays
+        if key not in self._kernels:
+            self._kernels[key] = self._warmed(make(rays), view, rays)
+        return self._kernels[key]
 
     def _warmed(self, kernel: Any, view: View, samples: int) -> Any:
         """``kernel`` after frames of several cameras and seeds: each input that changes is then known to."""

@@ -48,10 +48,9 @@ def export_lights(
     findings: Findings,
     center: np.ndarray,
     radius: float,
-) -> int:
-    """Append all lamps to ``root``; return their number. center, radius: bounds of the geometry."""
+) -> None:
+    """Append all lamps to ``root``. center, radius: bounds of the geometry."""
     ids = xmltree.Ids()
-    count = 0
     for obj, matrix in visible_lights(scene):
         light = obj.data
         strength = _strength(light, obj.name, findings)
@@ -71,8 +70,6 @@ def export_lights(
         else:
             element = _area(light, matrix, strength, identity)
         root.append(element)
-        count += 1
-    return count
 
 
 def _unplaceable(light: Any, matrix: np.ndarray) -> str | None:
@@ -111,15 +108,15 @@ def _node_colour(tree: bpy.types.NodeTree, name: str, findings: Findings) -> np.
         return np.ones(3)
     trial = Findings()
     evaluator = Evaluator(None, ImageReader(trial), trial)
-    colour = evaluator.colour(source.node.inputs["Color"], source.scope).mean
+    colour = evaluator.colour(source.node.inputs["Color"], source.scope)
     strength = _falloff(source.node.inputs["Strength"], source.scope, name, findings)
     if strength is None:
         strength = evaluator.scalar(source.node.inputs["Strength"], source.scope).scalar
     for finding in trial:
         findings.add(finding.kind, f"lamp's {finding.feature}", finding.note, object=name)
-    if isinstance(evaluator.colour(source.node.inputs["Color"], source.scope), Textured):
+    if isinstance(colour, Textured):
         findings.add("approximated", "textured lamp", "its mean colour shines in all directions", object=name)
-    return np.asarray(colour, dtype=np.float64) * strength
+    return np.asarray(colour.mean, dtype=np.float64) * strength
 
 
 def _falloff(socket: Any, scope: Scope, name: str, findings: Findings) -> float | None:
@@ -128,12 +125,8 @@ def _falloff(socket: Any, scope: Scope, name: str, findings: Findings) -> float 
     if not source.linked or source.node.type != "LIGHT_FALLOFF":
         return None
     if source.socket.name != "Quadratic":
-        findings.add(
-            "approximated",
-            f"{source.socket.name.lower()} light falloff",
-            "falls off with the square of the distance",
-            object=name,
-        )
+        feature = f"{source.socket.name.lower()} light falloff"
+        findings.add("approximated", feature, "falls off with the square of the distance", object=name)
     return float(source.node.inputs["Strength"].default_value)
 
 
@@ -144,9 +137,14 @@ def _note_ignored(obj: Any, light: Any, findings: Findings) -> None:
     hidden = [ray for ray in ("diffuse", "glossy", "transmission") if not getattr(obj, f"visible_{ray}")]
     if hidden:
         findings.add("ignored", "lamp's ray visibility", f"{', '.join(hidden)} rays see it", object=obj.name)
-    linking = getattr(obj, "light_linking", None)
-    if linking is not None and (linking.receiver_collection or linking.blocker_collection):
+    if _is_linked(obj):
         findings.add("ignored", "light linking", "the lamp lights everything", object=obj.name)
+
+
+def _is_linked(obj: Any) -> bool:
+    """Whether light linking says what the object lights or shades."""
+    linking = getattr(obj, "light_linking", None)
+    return linking is not None and bool(linking.receiver_collection or linking.blocker_collection)
 
 
 def _point(light: Any, matrix: np.ndarray, power: np.ndarray, identity: str, scene_radius: float) -> ET.Element:
@@ -161,16 +159,20 @@ def _point(light: Any, matrix: np.ndarray, power: np.ndarray, identity: str, sce
         _position(element, "position", position)
         xmltree.rgb(element, "intensity", power / (4 * math.pi))
         return element
-    element = xmltree.plugin("shape", "sphere", id=identity)
-    _position(element, "center", position)
-    xmltree.number(element, "radius", radius)
+    element = _sphere(position, radius, identity)
     area = 4 * math.pi * radius**2 if light.normalize else 1.0
-    if _softens(light, scene_radius):
-        emitter = _emit(element, power / (math.pi * area), "dnr_lamp")
+    softens = _softens(light, scene_radius)
+    emitter = _emit(element, power / (math.pi * area), "dnr_lamp" if softens else "area")
+    if softens:
         xmltree.text(emitter, "profile", "point")
         xmltree.number(emitter, "soft", radius)
-    else:
-        _emit(element, power / (math.pi * area))
+    return element
+
+
+def _sphere(center: np.ndarray, radius: float, identity: str) -> ET.Element:
+    element = xmltree.plugin("shape", "sphere", id=identity)
+    _position(element, "center", center)
+    xmltree.number(element, "radius", radius)
     return element
 
 
@@ -241,9 +243,7 @@ def _spot(
     if radius > 1e-5 or half > WIDEST_SPOT:
         radius = radius if radius > 1e-5 else POINT_RADIUS * scene_radius
         area = 4 * math.pi * radius**2 if light.normalize or light.shadow_soft_size <= 1e-5 else 1.0
-        element = xmltree.plugin("shape", "sphere", id=identity)
-        _position(element, "center", matrix[:3, 3])
-        xmltree.number(element, "radius", radius)
+        element = _sphere(matrix[:3, 3], radius, identity)
         emitter = _emit(element, power / (math.pi * area), "dnr_lamp")
         xmltree.text(emitter, "profile", "spot")
         xmltree.vector(emitter, "axis", direction)
@@ -349,7 +349,7 @@ def visible_lights(scene: bpy.types.Scene) -> Iterator[tuple[Any, np.ndarray]]:
             yield instance.object, np.array(instance.matrix_world, dtype=np.float64)
 
 
-def _hidden_objects(collection: bpy.types.LayerCollection, hidden: bool = False) -> set[str]:
+def _hidden_objects(collection: bpy.types.LayerCollection) -> set[str]:
     """Names of objects that only lie in excluded or render-hidden collections."""
     shown: set[str] = set()
     masked: set[str] = set()
@@ -361,7 +361,7 @@ def _hidden_objects(collection: bpy.types.LayerCollection, hidden: bool = False)
         for child in layer.children:
             visit(child, off)
 
-    visit(collection, hidden)
+    visit(collection, False)
     return masked - shown
 
 
@@ -380,6 +380,5 @@ def report_ray_visibility(names: Iterable[str], findings: Findings) -> None:
             findings.add("ignored", "shadow catcher", "an ordinary surface", object=name)
         if obj.is_holdout:
             findings.add("ignored", "holdout object", "an ordinary surface", object=name)
-        linking = getattr(obj, "light_linking", None)
-        if linking is not None and (linking.receiver_collection or linking.blocker_collection):
+        if _is_linked(obj):
             findings.add("ignored", "light linking", "it lights and shades everything", object=name)
