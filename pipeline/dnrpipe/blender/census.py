@@ -15,7 +15,7 @@ from dnrpipe.core.scene_records import Census, ImageFacts, LightFacts, MaterialF
 from .census_materials import describe_material
 from .findings import Findings
 from .geometry.frozen import FrozenMesh
-from .lighting.visible_lights import visible_lights
+from .lighting.lights import visible_lights
 from .reading.names import find_material
 from .shading.sockets import find_input, resolve, surface_source, walk
 

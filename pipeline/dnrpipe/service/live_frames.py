@@ -25,8 +25,7 @@ from dnrpipe.core.images import flip_error
 from dnrpipe.core.settings import Settings
 from dnrpipe.raytrace.base_renderer import BaseRenderer
 from dnrpipe.raytrace.base_worker import Worker as BaseWorker
-from dnrpipe.raytrace.engine import Engine
-from dnrpipe.raytrace.finite import masked, masked_channels
+from dnrpipe.raytrace.engine import Engine, masked, masked_channels
 from dnrpipe.raytrace.frames import Frames
 from dnrpipe.raytrace.light_worker import read_light
 from dnrpipe.stages.trainer import torch_device
