@@ -35,7 +35,7 @@ def _client(server: str | None, token_file: Path | None) -> Client:
     import os
 
     from ..service.client import DEFAULT_SERVER, Client
-    from ..service.tokens import read_token
+    from ..service.config import read_token
 
     named = token_file or os.environ.get("DNRPIPE_TOKEN_FILE")
     token = read_token(Path(named)) if named else None
@@ -85,7 +85,7 @@ def submit(
     import pydantic
 
     from ..core.console import Console
-    from ..service.models import JobRequest, Limits
+    from ..service.models import JobRequest, Limits, first_fault
 
     console = Console(json_mode=as_json)
     path = Path(scene)
@@ -105,8 +105,7 @@ def submit(
         limits = Limits(seconds=3600 * hours if hours is not None else None, memory_mb=memory_mb, disk_mb=disk_mb)
         request = JobRequest(**fields, force=force, priority=priority, limits=limits)  # type: ignore[arg-type]
     except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        raise UserError(f"submit: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        raise UserError(f"submit: {first_fault(error)}") from None
     with _client(server, token_file) as client:
         if upload is not None:
             with console.bar(f"uploading {path.name}", path.stat().st_size) as bar:

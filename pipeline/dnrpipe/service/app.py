@@ -4,24 +4,28 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 from collections.abc import AsyncIterator
 from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
 from .. import __version__
 from ..core.errors import UserError
 from . import routes_jobs, routes_live, routes_server, routes_workspaces
-from .config import LOOPBACK, ServerConfig
+from .config import LOOPBACK
 from .guard import Guard
-from .pruning import prune_regularly
+from .models import first_fault
 from .queue import QueueFull, WrongState
 from .root import UnknownName
 from .state import State
 
+LOG = logging.getLogger("dnrpipe.pruning")
+PRUNE_INTERVAL = 3600.0
 _STATUS: dict[type[Exception], int] = {QueueFull: 429, WrongState: 409, UnknownName: 404, UserError: 422}
 
 
@@ -30,7 +34,7 @@ def create_app(state: State, token: str | None) -> FastAPI:
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        chores = (state.feed.watch(), state.live.close_idle(), prune_regularly(state.queue, state.root, state.config))
+        chores = (state.feed.watch(), state.live.close_idle(), _prune_regularly(state))
         tasks = [asyncio.create_task(chore) for chore in chores]
         yield
         for task in tasks:
@@ -56,7 +60,7 @@ def create_app(state: State, token: str | None) -> FastAPI:
     app.add_exception_handler(HTTPException, _refused)
     app.add_middleware(
         Guard,
-        hosts=hosts_of(state.config),
+        hosts=LOOPBACK if state.config.loopback else (),
         token=token,
         rate=state.config.rate,
         burst=state.config.burst,
@@ -66,9 +70,16 @@ def create_app(state: State, token: str | None) -> FastAPI:
     return app
 
 
-def hosts_of(config: ServerConfig) -> set[str]:
-    """Host names that requests may address: those of the loopback interface; any, if the server has another one."""
-    return set(LOOPBACK) if config.loopback else set()
+async def _prune_regularly(state: State) -> None:
+    """Delete old logs and events at the start and every hour, for as long as the server runs."""
+    while True:
+        try:
+            pruned = await run_in_threadpool(state.queue.prune, state.root, state.config)
+            if pruned:
+                LOG.info("old logs and events removed", extra={"facts": {"jobs": len(pruned)}})
+        except Exception:  # a full disk, a busy queue: the server goes on and tries again
+            LOG.exception("old logs and events could not be removed")
+        await asyncio.sleep(PRUNE_INTERVAL)
 
 
 def _answer(status: int) -> Any:
@@ -86,9 +97,7 @@ async def _refused(_: Request, error: Exception) -> JSONResponse:
 async def _invalid(_: Request, error: Exception) -> JSONResponse:
     """The first fault of a request in one line, without what was sent (it may be anything)."""
     assert isinstance(error, RequestValidationError)
-    first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"])
-    return JSONResponse({"detail": f"{where}: {first['msg']}"}, 422)
+    return JSONResponse({"detail": first_fault(error)}, 422)
 
 
 def _describe_token(app: FastAPI) -> None:

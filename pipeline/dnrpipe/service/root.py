@@ -28,6 +28,7 @@ class ServiceRoot:
     def __init__(self, folder: Path) -> None:
         self.folder = folder.resolve()
         self.private = self.folder / ".service"
+        self.queue = self.private / "queue.sqlite"
         self.scenes = self.folder / "scenes"
 
     def create(self) -> ServiceRoot:
@@ -37,14 +38,6 @@ class ServiceRoot:
         for folder in (self.scenes, self.private / "logs", self.private / "events"):
             folder.mkdir(exist_ok=True)
         return self
-
-    @property
-    def queue(self) -> Path:
-        return self.private / "queue.sqlite"
-
-    @property
-    def lock(self) -> Path:
-        return self.private / "lock"
 
     def log(self, job: int) -> Path:
         return self.private / "logs" / f"{job}.log"

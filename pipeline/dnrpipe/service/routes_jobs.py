@@ -11,11 +11,8 @@ from fastapi import APIRouter, Header, HTTPException, Path, Query
 from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
-from ..core.errors import UserError
 from ..core.settings import merge, parse_assignment, resolve
 from .models import FINAL, TAKES_SCENE, Job, JobEvent, JobPage, JobRequest, LogPage, Name, Problem, State
-from .queue import QueueFull, WrongState
-from .root import UnknownName
 from .state import Shared
 from .state import State as Service
 
@@ -210,6 +207,3 @@ def check_request(request: JobRequest, service: Service) -> None:
 
     if settings.cameras.source not in KEYWORDS:
         raise HTTPException(422, f"settings: cameras.source must be one of {', '.join(KEYWORDS)} on a server")
-
-
-__all__ = ["NOT_FOUND", "REFUSED", "QueueFull", "UnknownName", "UserError", "WrongState", "router"]

@@ -10,9 +10,9 @@ from fastapi.responses import FileResponse, PlainTextResponse
 
 from .. import __version__
 from .models import Health
-from .processes import folder_mb
 from .routes_jobs import NOT_FOUND, REFUSED
 from .state import Shared
+from .worker import folder_mb
 
 STATIC = Path(__file__).parent / "static"
 REPORT = Path(__file__).parents[1] / "report"

@@ -12,8 +12,8 @@ import time
 from pathlib import Path
 
 from .config import ServerConfig
-from .processes import GRACE
 from .queue import Queue
+from .worker import GRACE
 
 LOG = logging.getLogger("dnrpipe.workers")
 POLL = 0.3
