@@ -126,7 +126,7 @@ def set_thread_waiting(environment: MutableMapping[str, str]) -> None:
         idle machine               86       49        42
         four other processes      288      361       878
 
-    One run each. Beside other processes it varies by half; there spinning a little costs some, spinning on threefold.
+    One run each. Beside other processes it varies by half; spinning a little costs some there, spinning on threefold.
     """
     if "OMP_WAIT_POLICY" in environment or "GOMP_SPINCOUNT" in environment:
         return

@@ -48,7 +48,8 @@ def runtime() -> Path:
 
     Raises UserError: no npm, no network, or other bytes than expected.
     """
-    folder = _cache() / f"onnxruntime-web-{VERSION}"
+    cache = Path(os.environ.get("DNRPIPE_CACHE") or Path.home() / ".cache" / "dnrpipe")
+    folder = cache / f"onnxruntime-web-{VERSION}"
     if all((folder / name).is_file() for name in (*FILES, "LICENSE")):
         return folder
     npm = shutil.which("npm")
@@ -72,7 +73,3 @@ def runtime() -> Path:
                     temporary.write_bytes(member.read())
     write_text(folder / "LICENSE", LICENCE.format(version=VERSION))
     return folder
-
-
-def _cache() -> Path:
-    return Path(os.environ.get("DNRPIPE_CACHE") or Path.home() / ".cache" / "dnrpipe")

@@ -21,13 +21,12 @@ from ..core.ledger import CostRecord, CostSummary, Ledger, break_even_frames, su
 from ..core.scene_files import read_census, read_summary
 from ..core.scene_records import FindingKind
 from ..stages.records import METRICS, Metrics
-from .advice import missing, notes
+from .advice import missing, notes, verdict
 from .budget import build_budget
 from .coverage import coverage_maps
 from .data import ChosenView, FindingGroup, ReportData, Selection, Sphere, SphereView, Training
 from .pictures import ExrPictures
 from .quality import build_quality
-from .words import verdict
 
 KINDS: dict[FindingKind, tuple[str, bool]] = {
     "missing": ("The file refers to something that is not there.", True),

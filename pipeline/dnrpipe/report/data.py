@@ -203,14 +203,11 @@ class PlannedRow(_Frozen):
     actual: str
 
 
-class FrontierSummary(_Frozen):
-    """pictures: (caption, data URI) of each number of frames."""
-
-    pictures: list[tuple[str, str]] = Field(repr=False)
-
-
 class Budget(_Frozen):
-    """Cost and benefit, in sentences. following: what the next minute would buy."""
+    """Cost and benefit, in sentences.
+
+    following: what the next minute would buy. pictures: (caption, data URI) of the frontier for each number of frames.
+    """
 
     cost: str
     bought: str
@@ -218,7 +215,7 @@ class Budget(_Frozen):
     rows: list[PlannedRow]
     why: list[str]
     routes: list[str]
-    frontier: FrontierSummary | None
+    pictures: list[tuple[str, str]] = Field(repr=False)
 
 
 class ReportData(BaseModel):

@@ -28,7 +28,6 @@ LOSS_NAMES = {
     "regularisation": "L_reg(T)",
     "total": "weighted sum",
 }
-PURPOSE_NAMES = {"training": "training", "evaluation": "evaluation", "inference": "inference"}
 
 
 def render_html(data: ReportData) -> str:
@@ -127,11 +126,7 @@ def _stage_chart(data: ReportData) -> Markup:
     bars = []
     for stage, purposes in data.costs.by_stage_and_purpose.items():
         segments = [
-            charts.Segment(
-                f"bar-{purpose}",
-                value.wall_seconds,
-                f"{stage}, {PURPOSE_NAMES[purpose]}: {duration(value.wall_seconds)}",
-            )
+            charts.Segment(f"bar-{purpose}", value.wall_seconds, f"{stage}, {purpose}: {duration(value.wall_seconds)}")
             for purpose, value in purposes.items()
         ]
         whole = sum(segment.value for segment in segments)
@@ -145,11 +140,7 @@ def _tracing_chart(data: ReportData) -> Markup:
         return Markup("")
     chosen = [
         charts.Segment("bar-training", tracing.actual_seconds, f"ray tracing: {duration(tracing.actual_seconds)}"),
-        charts.Segment(
-            "bar-choosing",
-            tracing.selection_seconds,
-            f"choosing: {duration(tracing.selection_seconds)}",
-        ),
+        charts.Segment("bar-choosing", tracing.selection_seconds, f"choosing: {duration(tracing.selection_seconds)}"),
     ]
     everything = charts.Segment("bar-training", tracing.all_seconds, f"ray tracing: {duration(tracing.all_seconds)}")
     spent = tracing.actual_seconds + tracing.selection_seconds

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from ..report.data import SphereView
+
 if TYPE_CHECKING:
     from fastapi.exceptions import RequestValidationError
 
@@ -151,16 +153,6 @@ class Curve(_Wire):
     psnr: list[tuple[int, float]]
 
 
-class PlacedView(_Wire):
-    """A camera, relative to the scene's centre, divided by the distance of the farthest one."""
-
-    name: str
-    role: Literal["candidate", "chosen", "test"]
-    order: int | None
-    position: tuple[float, float, float]
-    psnr: float | None
-
-
 class TestPicture(_Wire):
     """A held-out view with pictures of the evaluation."""
 
@@ -219,7 +211,7 @@ class WorkspaceDetail(_Wire):
 
     name: str
     stages: list[StageState]
-    views: list[PlacedView]
+    views: list[SphereView]
     sphere: str | None
     eye: tuple[float, float]
     training: list[Curve]

@@ -59,6 +59,13 @@ class ServiceRoot:
             raise UnknownName(f"{name}: no such scene; upload it with PUT /scenes/{name}")
         return path
 
+    def result(self, name: str, file: str, problem: str) -> Path:
+        """A file of a workspace. Raises UnknownName with `problem`: it is not there, or leads out of the root."""
+        path = self.workspace(name) / file
+        if not path.is_file() or not path.resolve().is_relative_to(self.folder):
+            raise UnknownName(problem)
+        return path
+
     def workspaces(self) -> list[str]:
         """Names of the workspaces, sorted; links that lead out of the root are none."""
         names = []
