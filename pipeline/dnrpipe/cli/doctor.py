@@ -17,6 +17,11 @@ APT_LINE = (
     " libatomic1 libllvm19 libegl1 libgl1-mesa-dri"
 )
 MIN_FREE_GB = 2
+TORCH_CODE = (
+    "import torch; g = torch.cuda.is_available();"
+    "where = torch.cuda.get_device_name() if g else f'{torch.get_num_threads()} CPU threads';"
+    "print(torch.__version__, 'on', where)"
+)
 
 
 def examine() -> list[dict[str, Any]]:
@@ -33,7 +38,7 @@ def examine() -> list[dict[str, Any]]:
             "import mitsuba_oidn as o; print('Open Image Denoise', o.oidn_version(), 'on the CPU')",
             "render",
         ),
-        _torch(),
+        _import_check("torch", TORCH_CODE, "train"),
         _weights(),
         _module("OpenEXR", "OpenEXR"),
         _module("flip-evaluator", "flip_evaluator"),
@@ -86,15 +91,6 @@ def _mitsuba() -> dict[str, Any]:
         return _row("mitsuba", "fail", f"{error}; try: {APT_LINE}")
     slow = choice.variant == "scalar_rgb"
     return _row("mitsuba", "warn" if slow else "ok", choice.reason + (f"; faster with: {APT_LINE}" if slow else ""))
-
-
-def _torch() -> dict[str, Any]:
-    code = (
-        "import torch; g = torch.cuda.is_available();"
-        "where = torch.cuda.get_device_name() if g else f'{torch.get_num_threads()} CPU threads';"
-        "print(torch.__version__, 'on', where)"
-    )
-    return _import_check("torch", code, "train")
 
 
 def _weights() -> dict[str, Any]:

@@ -88,7 +88,7 @@ def _view(root: Path, view: ViewMetrics, side: int) -> TestView:
         share = min(1.0, 10.0 ** ((view.psnr - view.ceiling_psnr) / 10.0))
     stem = f"evaluation/{view.name}"
     return TestView(
-        **view.model_dump(exclude={"reference_noise", "reference_noise_error"}),
+        **view.model_dump(),
         noise_share=share,
         truth=load_png(root, f"{stem}.truth.png", side=side),
         prediction=load_png(root, f"{stem}.prediction.png", side=side),

@@ -26,7 +26,7 @@ from .state import State
 
 LOG = logging.getLogger("dnrpipe.pruning")
 PRUNE_INTERVAL = 3600.0
-_STATUS: dict[type[Exception], int] = {QueueFull: 429, WrongState: 409, UnknownName: 404, UserError: 422}
+_STATUS: dict[type[UserError], int] = {QueueFull: 429, WrongState: 409, UnknownName: 404, UserError: 422}
 
 
 def create_app(state: State, token: str | None) -> FastAPI:
@@ -54,10 +54,8 @@ def create_app(state: State, token: str | None) -> FastAPI:
     app.state.service = state
     for module in (routes_server, routes_jobs, routes_workspaces, routes_live):
         app.include_router(module.router)
-    for kind, status in _STATUS.items():
-        app.add_exception_handler(kind, _answer(status))
-    app.add_exception_handler(RequestValidationError, _invalid)
-    app.add_exception_handler(HTTPException, _refused)
+    for kind in (*_STATUS, RequestValidationError, HTTPException):
+        app.add_exception_handler(kind, _answer)
     app.add_middleware(
         Guard,
         hosts=LOOPBACK if state.config.loopback else (),
@@ -82,22 +80,14 @@ async def _prune_regularly(state: State) -> None:
         await asyncio.sleep(PRUNE_INTERVAL)
 
 
-def _answer(status: int) -> Any:
-    async def handle(_: Request, error: Exception) -> JSONResponse:
-        return JSONResponse({"detail": " ".join(str(error).split())}, status)
-
-    return handle
-
-
-async def _refused(_: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, HTTPException)
-    return JSONResponse({"detail": str(error.detail)}, error.status_code, headers=error.headers)
-
-
-async def _invalid(_: Request, error: Exception) -> JSONResponse:
-    """The first fault of a request in one line, without what was sent (it may be anything)."""
-    assert isinstance(error, RequestValidationError)
-    return JSONResponse({"detail": first_fault(error)}, 422)
+async def _answer(_: Request, error: Exception) -> JSONResponse:
+    """What is wrong, in one line."""
+    if isinstance(error, HTTPException):
+        return JSONResponse({"detail": str(error.detail)}, error.status_code, headers=error.headers)
+    if isinstance(error, RequestValidationError):
+        return JSONResponse({"detail": first_fault(error)}, 422)
+    status = next(status for kind, status in _STATUS.items() if isinstance(error, kind))
+    return JSONResponse({"detail": " ".join(str(error).split())}, status)
 
 
 def _describe_token(app: FastAPI) -> None:

@@ -12,7 +12,7 @@ from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
 from ..core.settings import merge, parse_assignment, resolve
-from .models import FINAL, TAKES_SCENE, Job, JobEvent, JobPage, JobRequest, LogPage, Name, Problem, State
+from .models import FINAL, TAKES_SCENE, Job, JobPage, JobRequest, LogPage, Name, Problem, State
 from .state import Shared
 from .state import State as Service
 
@@ -156,7 +156,8 @@ async def events(
                 found = await run_in_threadpool(service.queue.events, job, last)
                 for event in found:
                     last = event.id
-                    yield _line(event)
+                    data = json.dumps({"time": event.time, **event.data})
+                    yield f"id: {event.id}\nevent: {event.kind}\ndata: {data}\n\n"
                 if found:
                     continue
                 if ended:
@@ -169,11 +170,6 @@ async def events(
             stream.__exit__(None, None, None)
 
     return StreamingResponse(lines(), media_type="text/event-stream")
-
-
-def _line(event: JobEvent) -> str:
-    data = json.dumps({"time": event.time, **event.data})
-    return f"id: {event.id}\nevent: {event.kind}\ndata: {data}\n\n"
 
 
 def known_job(service: Service, job: int) -> Job:
