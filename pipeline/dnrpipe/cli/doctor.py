@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+import importlib.util
 import os
 import platform
 import shutil
@@ -106,10 +108,6 @@ def _weights() -> dict[str, Any]:
 
 
 def _module(name: str, module: str) -> dict[str, Any]:
-    import importlib.metadata
-    import importlib.util
-
     if importlib.util.find_spec(module) is None:
         return _row(name, "fail", "not installed; try: pip install 'dnrpipe[render]'")
-    version = importlib.metadata.version(module.replace("_", "-"))
-    return _row(name, "ok", version)
+    return _row(name, "ok", importlib.metadata.version(module.replace("_", "-")))

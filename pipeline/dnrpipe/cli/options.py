@@ -131,10 +131,7 @@ def tracing_overrides(noise: str | None, time: str | None, spp: int | None, deno
 
     raytrace: dict[str, Any] = {}
     if noise is not None or time is not None:
-        raytrace = {
-            "noise": amount("--noise", noise, parse_share),
-            "time": amount("--time", time, parse_seconds),
-        }
+        raytrace = {"noise": amount("--noise", noise, parse_share), "time": amount("--time", time, parse_seconds)}
         if spp is not None:
             if spp < SAMPLES_AT_ONCE:
                 raise UserError(f"--spp {spp}: with --noise or --time at least {SAMPLES_AT_ONCE}, one in each group")

@@ -81,17 +81,14 @@ def notes(
         )
     if quality and quality.noise_share_mean is not None and quality.noise_share_mean >= 0.1:
         spp = f" ({several(quality.spp)} samples per pixel)" if quality.spp else ""
+        limited = ""
+        if quality.noise_limited:
+            limited = f", and at least half of it in {quality.noise_limited} of {len(quality.views)} views"
         found.append(
             f"The reference images are noisy themselves{spp}: a perfect renderer would measure about "
             f"{quality.ceiling_mean:.1f} dB against them. That noise makes up "
-            f"{100 * quality.noise_share_mean:.0f} % of the measured squared error"
-            + (
-                f", and at least half of it in {quality.noise_limited} of {len(quality.views)} views."
-                if quality.noise_limited
-                else "."
-            )
-            + " Raise raytrace.evaluation_spp, or set raytrace.evaluation_noise, before reading more into small "
-            "differences."
+            f"{100 * quality.noise_share_mean:.0f} % of the measured squared error{limited}. Raise "
+            "raytrace.evaluation_spp, or set raytrace.evaluation_noise, before reading more into small differences."
         )
     tracing = summary.tracing_all
     if tracing and tracing.net_saved_seconds < 0:

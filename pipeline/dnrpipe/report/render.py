@@ -56,9 +56,7 @@ def render_html(data: ReportData) -> str:
         rows=_headline_rows(quality),
         featured=_featured(quality) if quality else [],
         median=next(v for v in quality.views if v.name == quality.median_view) if quality else None,
-        projections=[(name, sphere_svg(data.sphere, name)) for name in ("top", "front", "oblique")]
-        if data.sphere
-        else [],
+        projections=[(n, sphere_svg(data.sphere, n)) for n in ("top", "front", "oblique")] if data.sphere else [],
         quality_chart=_quality_chart(quality) if quality else "",
         loss_charts=[(t, [_loss_chart(t), _psnr_chart(t), _agent_chart(t)]) for t in data.training],
         stage_chart=_stage_chart(data),
@@ -107,8 +105,7 @@ def _loss_chart(training: Training) -> Markup:
 
 
 def _agent_chart(training: Training) -> Markup:
-    names = {"reward": "reward", "q": "Q"}
-    series = [charts.Series(names[name], points) for name, points in training.agent.items()]
+    series = [charts.Series({"q": "Q"}.get(name, name), points) for name, points in training.agent.items()]
     title = "Reward and action value of the view selector"
     return charts.line_chart(series, title, "epoch", "selector: mean reward and action value Q")
 
