@@ -38,10 +38,9 @@ from torch import Tensor, nn
 
 from .atomic import atomic_path
 from .contract import ContractError, SceneFrame
-from .correction import correct
+from .correction import correct, guide_maps
 from .dataset import Batch
 from .display import ALPHA_FLOOR, DisplayTransform
-from .guides import guide_maps
 from .model import DNR, compose
 from .settings import ModelSettings
 from .textures import SH_COUNT, SH_FIRST_CHANNEL, TexturePyramid, depth_coordinate, octahedral, spherical_harmonics

@@ -20,7 +20,7 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -63,8 +63,8 @@ class StageRecord(BaseModel):
         return self.detail.get("perceptual")
 
 
-class Prepared(BaseModel):
-    """What stage `prepare` did.
+class PrepareDetail(BaseModel):
+    """What stage `prepare` tells of itself.
 
     Args:
         raster_engine, raster_reason: what draws rasterised colour, and why.
@@ -80,8 +80,8 @@ class Prepared(BaseModel):
     triangles: int = 0
 
 
-class Raytraced(BaseModel):
-    """What stage `raytrace` did. views: their names. spp: samples per pixel, of each view where they have their own."""
+class RaytraceDetail(BaseModel):
+    """What stage `raytrace` tells of itself. views: their names. spp: samples per pixel; a list where views differ."""
 
     model_config = ConfigDict(extra="ignore", strict=True)
 
@@ -115,24 +115,24 @@ class Manifest(BaseModel):
     @classmethod
     def _readable(cls, stages: dict[str, StageRecord]) -> dict[str, StageRecord]:
         """What other commands read of a record is there."""
-        for name, kind in (("prepare", Prepared), ("raytrace", Raytraced)):
+        for name, kind in (("prepare", PrepareDetail), ("raytrace", RaytraceDetail)):
             try:
                 found = kind.model_validate(stages[name].detail) if name in stages else None
             except ValidationError as error:
                 raise ValueError(f"stage {name}: {error.errors()[0]['msg']}") from None
-            if isinstance(found, Prepared) and "train" not in found.views:
+            if isinstance(found, PrepareDetail) and "train" not in found.views:
                 raise ValueError("stage prepare does not say how many views it has")
         return stages
 
     @property
-    def prepared(self) -> Prepared | None:
+    def prepared(self) -> PrepareDetail | None:
         """What stage `prepare` did; None before it has."""
-        return Prepared.model_validate(self.stages["prepare"].detail) if "prepare" in self.stages else None
+        return PrepareDetail.model_validate(self.stages["prepare"].detail) if "prepare" in self.stages else None
 
     @property
-    def raytraced(self) -> Raytraced | None:
+    def raytraced(self) -> RaytraceDetail | None:
         """What stage `raytrace` did; None before it has."""
-        return Raytraced.model_validate(self.stages["raytrace"].detail) if "raytrace" in self.stages else None
+        return RaytraceDetail.model_validate(self.stages["raytrace"].detail) if "raytrace" in self.stages else None
 
 
 class DamagedManifest(UserError):
@@ -221,23 +221,9 @@ class Workspace:
         """Write the manifest atomically."""
         write_json(self.root / "manifest.json", self.manifest.model_dump(mode="json", by_alias=True))
 
-    def finish_stage(
-        self,
-        name: str,
-        *,
-        fingerprint: str,
-        output: str,
-        seconds: float,
-        detail: Mapping[str, Any] | None = None,
-    ) -> None:
-        """Record that a stage is done; the last thing a stage does."""
-        self.manifest.stages[name] = StageRecord(
-            fingerprint=fingerprint,
-            output=output,
-            finished=time.time(),
-            seconds=seconds,
-            detail=dict(detail or {}),
-        )
+    def finish_stage(self, name: str, **facts: Any) -> None:
+        """Record that a stage is done, the last thing a stage does. facts: fields of `StageRecord` but ``finished``."""
+        self.manifest.stages[name] = StageRecord(finished=time.time(), **facts)
         self.save()
 
 

@@ -47,23 +47,23 @@ def evaluate(run: Run) -> Outcome:
     lpips = {name: Lpips(name, weights) for name, weights in perceptual.items()} if perceptual else None
     rendered = settings.model.base in RENDERED
     rows: list[ViewMetrics] = []
-    neural_seconds: list[float] = []
     with console.bar("test views", len(views)) as bar:
         for view in views:
             data = load(workspace, [view], "test", raytraced=True, base=settings.model.base).to(device)
             seconds, prediction = _timed_render(lambda data=data: render_views(model, data), device)
-            assert data.target is not None  # loaded with raytraced=True
-            measured = image_metrics(prediction, data.target.cpu(), data.mask.cpu(), lpips)
-            truth = _image(data.target)
+            assert data.tensors.target is not None  # loaded with raytraced=True
+            measured = image_metrics(prediction, data.tensors.target.cpu(), data.tensors.mask.cpu(), lpips)
+            truth = _image(data.tensors.target)
             predicted = _image(prediction)
-            error, heat = flip_error(truth, predicted)
+            flip, heat = flip_error(truth, predicted)
             traced = read_metadata(workspace.raytraced("test", view.name)) or {}
             base = read_metadata(base_path(workspace, "test", view.name)) or {} if rendered else {}
+            noise_rmse = traced.get("noise_rmse")
             row = ViewMetrics(
                 name=view.name,
                 **measured,
-                flip=error,
-                ceiling_psnr=_ceiling(traced.get("noise_rmse")),
+                flip=flip,
+                ceiling_psnr=-20 * math.log10(noise_rmse) if noise_rmse else None,  # a denoiser's bias is not in it
                 reference_noise=traced.get("noise"),
                 reference_noise_error=traced.get("noise_error"),
                 seconds_traced=traced.get("seconds"),
@@ -72,21 +72,13 @@ def evaluate(run: Run) -> Outcome:
                 spp=traced.get("spp"),
             )
             rows.append(row)
-            neural_seconds.append(seconds)
             files = {}
             for kind, picture in (("truth", truth), ("prediction", predicted), ("flip", heat)):
                 write_png(workspace.evaluation / f"{view.name}.{kind}.png", picture)
                 files[kind] = f"evaluation/{view.name}.{kind}.png"
             console.events.send("picture", split="test", view=view.name, files=files, psnr=row.psnr)
-            run.book(
-                "evaluation",
-                "view",
-                f"neural/{view.name}",
-                seconds,
-                device=device,
-                width=view.width,
-                height=view.height,
-            )
+            size = {"width": view.width, "height": view.height}
+            run.book("evaluation", "view", f"neural/{view.name}", seconds, device=device, **size)
             bar.advance(note=_figure(row.psnr, ".2f", " dB"))
     mean = _mean(rows)
     metrics = Metrics(
@@ -96,9 +88,12 @@ def evaluate(run: Run) -> Outcome:
         trained_with_perceptual=workspace.manifest.stages["finetune"].perceptual or False,
         device=torch.cuda.get_device_name() if device.startswith("cuda") else "cpu",
         reference_noise_target=settings.raytrace.evaluation_noise,
-        neural_ms=1000 * float(np.median(neural_seconds)),
+        neural_ms=1000 * float(np.median([row.seconds_neural for row in rows])),
     )
-    _remove_other_pictures(workspace, {view.name for view in views})
+    names = {view.name for view in views}
+    for path in workspace.evaluation.glob("[!.]*.png"):
+        if path.name.rsplit(".", 2)[0] not in names:  # of other cameras
+            path.unlink()
     write(workspace.evaluation / METRICS, metrics)
     ceiling = f" (ceiling {mean['ceiling_psnr']:.1f} dB)" if mean["ceiling_psnr"] is not None else ""
     console.say(
@@ -143,11 +138,6 @@ def _image(tensor: Any) -> np.ndarray:
     return tensor[0].float().clamp(0, 1).permute(1, 2, 0).cpu().numpy()
 
 
-def _ceiling(noise_rmse: float | None) -> float | None:
-    """The PSNR that a perfect renderer would measure against this noisy reference, dB; a denoiser's bias not in it."""
-    return None if not noise_rmse else -20 * math.log10(noise_rmse)
-
-
 def _mean(rows: list[ViewMetrics]) -> dict[str, float | None]:
     """The mean of each figure, over the views that have it."""
     result: dict[str, float | None] = {}
@@ -160,9 +150,3 @@ def _mean(rows: list[ViewMetrics]) -> dict[str, float | None]:
 
 def _figure(value: float | None, form: str, unit: str = "") -> str:
     return "not defined" if value is None else f"{value:{form}}{unit}"
-
-
-def _remove_other_pictures(workspace: Workspace, names: set[str]) -> None:
-    for path in workspace.evaluation.glob("[!.]*.png"):
-        if path.name.rsplit(".", 2)[0] not in names:
-            path.unlink()
