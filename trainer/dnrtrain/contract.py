@@ -44,7 +44,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
+from pydantic import AfterValidator, BaseModel, Field, field_validator
 
 from .atomic import write_json
 
@@ -98,13 +98,11 @@ def _finite(value: float) -> float:
 Finite = Annotated[float, AfterValidator(_finite)]
 
 
-class View(BaseModel):
+class View(BaseModel, extra="forbid", frozen=True):
     """One pinhole camera. Lengths in pixels (intrinsics) and scene units (c2w).
 
     ``name`` is unique within its split and is the stem of its files.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str = Field(pattern=r"^[A-Za-z0-9_.-]+$")
     width: int = Field(ge=1, le=16384)
@@ -280,7 +278,7 @@ def _focal(length: float, angle: float) -> float:
     return 0.5 * length / math.tan(0.5 * angle)
 
 
-class SceneFrame(BaseModel):
+class SceneFrame(BaseModel, extra="forbid"):
     """What the trainer must know of the scene beside pixels (``scene/frame.json``).
 
     near, far: planar depth range, scene units, that normalises depth to [0, 1].
@@ -289,8 +287,6 @@ class SceneFrame(BaseModel):
     view_transform: name of the scene's view transform ("Standard", "AgX", ...).
     display_lut: file beside this one with the baked display transform, or None for plain sRGB.
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     near: Finite = Field(gt=0)
     far: Finite = Field(gt=0)

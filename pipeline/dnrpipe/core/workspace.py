@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from dnrtrain.atomic import write_json
 
@@ -38,7 +38,7 @@ SUFFIX = ".dnr"
 LOCK_FILES = (".lock", ".lock-owner")
 
 
-class StageRecord(BaseModel):
+class StageRecord(BaseModel, extra="forbid"):
     """What a finished stage leaves in the manifest.
 
     Args:
@@ -48,8 +48,6 @@ class StageRecord(BaseModel):
         seconds: wall time of the run that finished it.
         detail: what ``--json`` tells of it. `Manifest` reads back what other stages need.
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     fingerprint: str
     output: str
@@ -63,7 +61,7 @@ class StageRecord(BaseModel):
         return self.detail.get("perceptual")
 
 
-class PrepareDetail(BaseModel):
+class PrepareDetail(BaseModel, strict=True):
     """What stage `prepare` tells of itself.
 
     Args:
@@ -72,36 +70,28 @@ class PrepareDetail(BaseModel):
         triangles: of the scene.
     """
 
-    model_config = ConfigDict(extra="ignore", strict=True)
-
     raster_engine: str = ""
     raster_reason: str = ""
     views: dict[str, int]
     triangles: int = 0
 
 
-class RaytraceDetail(BaseModel):
+class RaytraceDetail(BaseModel, strict=True):
     """What stage `raytrace` tells of itself. views: their names. spp: samples per pixel; a list where views differ."""
-
-    model_config = ConfigDict(extra="ignore", strict=True)
 
     views: list[str]
     spp: int | list[int | None] | None = None
 
 
-class Source(BaseModel):
+class Source(BaseModel, extra="forbid"):
     """The scene file a workspace was made from. ``path`` is absolute; the workspace lives without it."""
-
-    model_config = ConfigDict(extra="forbid")
 
     path: str
     sha256: str
 
 
-class Manifest(BaseModel):
+class Manifest(BaseModel, extra="forbid", populate_by_name=True):
     """``manifest.json``. overrides: the flags given so far. settings: the last resolved copy."""
-
-    model_config = ConfigDict(extra="forbid", populate_by_name=True)
 
     schema_version: int = Field(default=SCHEMA, alias="schema")
     source: Source

@@ -33,7 +33,7 @@ def evaluate(run: Run) -> Outcome:
     from dnrtrain.checkpoint import load_model
     from dnrtrain.metrics import image_metrics
     from dnrtrain.model import render_views
-    from dnrtrain.perceptual import Lpips
+    from dnrtrain.perceptual import build_lpips
 
     workspace, settings, console = run.workspace, run.settings, run.console
     views = split_views(workspace)["test"]
@@ -44,7 +44,7 @@ def evaluate(run: Run) -> Outcome:
     device = torch_device(settings)
     model = load_model(workspace.checkpoints("step2"), device)
     perceptual = perceptual_weights(console)
-    lpips = {name: Lpips(name, weights) for name, weights in perceptual.items()} if perceptual else None
+    lpips = build_lpips(perceptual) if perceptual else None
     rendered = settings.model.base in RENDERED
     rows: list[ViewMetrics] = []
     with console.bar("test views", len(views)) as bar:
