@@ -18,7 +18,7 @@ from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from dnrtrain.settings import Strict
 
@@ -33,7 +33,7 @@ STAGE_ORDER: tuple[str, ...] = get_args(StageName)
 PURPOSE_ORDER: tuple[str, ...] = get_args(Purpose)
 
 
-class CostRecord(Strict, frozen=True):
+class CostRecord(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """One unit of work that cost time.
 
     Args:

@@ -47,6 +47,7 @@ def evaluate(run: Run) -> Outcome:
     lpips = build_lpips(perceptual) if perceptual else None
     rendered = settings.model.base in RENDERED
     rows: list[ViewMetrics] = []
+    neural_seconds: list[float] = []
     with console.bar("test views", len(views)) as bar:
         for view in views:
             data = load(workspace, [view], "test", raytraced=True, base=settings.model.base).to(device)
@@ -72,6 +73,7 @@ def evaluate(run: Run) -> Outcome:
                 spp=traced.get("spp"),
             )
             rows.append(row)
+            neural_seconds.append(seconds)
             files = {}
             for kind, picture in (("truth", truth), ("prediction", predicted), ("flip", heat)):
                 write_png(workspace.evaluation / f"{view.name}.{kind}.png", picture)
@@ -88,7 +90,7 @@ def evaluate(run: Run) -> Outcome:
         trained_with_perceptual=workspace.manifest.stages["finetune"].perceptual or False,
         device=torch.cuda.get_device_name() if device.startswith("cuda") else "cpu",
         reference_noise_target=settings.raytrace.evaluation_noise,
-        neural_ms=1000 * float(np.median([row.seconds_neural for row in rows])),
+        neural_ms=1000 * float(np.median(neural_seconds)),
     )
     names = {view.name for view in views}
     for path in workspace.evaluation.glob("[!.]*.png"):
