@@ -223,7 +223,7 @@ def test_pieces_are_the_visible_cells_by_direction(raster: ViewSet) -> None:
     views = raster.subset([0, 1])
     view = synthetic.dome(10, 32)[1]
     seen = look_at(synthetic.gbuffer(view), view)
-    count = int(views.mask[1].sum())
+    count = int(views.tensors.mask[1].sum())
     found = pieces_of(views, 1, np.full(count, 2.0))
     assert found.pixels.sum() == pytest.approx(seen.seen) and found.unsure == pytest.approx(2 * found.pixels)
     assert np.unique(found.keys // 32).tolist() == np.unique(cells_of(views, 1)).tolist()
@@ -255,7 +255,7 @@ def test_disagreement_is_the_variance_and_unseen_surface_counts_as_one(raster: V
     assert other == pytest.approx(np.var([0.2, 0.4, 0.9]) + new, rel=1e-5)
     facts = doubt.facts()
     assert facts["disagreement"] == pytest.approx(np.std([0.2, 0.4, 0.9]), rel=1e-5)
-    assert facts["unseen"] == pytest.approx(new.sum() / (len(new) + int(raster.mask[0].sum())))
+    assert facts["unseen"] == pytest.approx(new.sum() / (len(new) + int(raster.tensors.mask[0].sum())))
 
 
 def piece(keys: list[int], pixels: float, unsure: float) -> Pieces:
@@ -305,7 +305,7 @@ def test_the_head_learns_where_the_renderer_errs(raster: ViewSet) -> None:
         for level in dnr.aggregator.texture_uv.levels:
             level[:, 0] = torch.where(torch.arange(level.shape[-1]) < level.shape[-1] // 2, -0.1, 0.1)
     generator = torch.Generator().manual_seed(0)
-    sphere = (raster.uv[:, :1] < 0).float() * raster.mask
+    sphere = (raster.tensors.uv[:, :1] < 0).float() * raster.tensors.mask
     deviation = 0.02 + 0.18 * sphere
     colours = render_views(dnr, raster)
     noisy = colours + deviation * torch.randn(colours.shape, generator=generator)
@@ -313,7 +313,7 @@ def test_the_head_learns_where_the_renderer_errs(raster: ViewSet) -> None:
     head = train_head(dnr, views.subset(list(range(1, 10))), 0)
     with torch.no_grad():
         found = head(features_of(dnr, views.batch([0]))[0]).exp().sqrt()
-    ball = sphere[0, 0][raster.mask[0, 0] > 0] > 0
+    ball = sphere[0, 0][raster.tensors.mask[0, 0] > 0] > 0
     assert float(found[ball].median()) == pytest.approx(0.2, rel=0.25)
     assert float(found[~ball].median()) == pytest.approx(0.02, rel=0.25)
 

@@ -30,7 +30,7 @@ from dnrpipe.blender.tasks import BakeTask, PendingBakes  # noqa: E402
 from dnrpipe.core.console import Console  # noqa: E402
 from dnrpipe.core.settings import Settings  # noqa: E402
 from dnrpipe.core.workspace import Source, Workspace  # noqa: E402
-from dnrpipe.stages.baking import FOLDER, bake  # noqa: E402
+from dnrpipe.stages.prepare import BAKES, bake  # noqa: E402
 from dnrpipe.stages.stage import Run  # noqa: E402
 
 SIZE = 128
@@ -350,7 +350,7 @@ def test_bake_processes_fill_the_cache_and_name_what_failed(tmp_path: Path) -> N
     meshes = scene_of(material_of("m", lambda tree: add_node(tree, "TexNoise").outputs["Fac"]))
     source, geometry = tmp_path / "scene.blend", tmp_path / "geometry.npz"
     workspace = Workspace.create(tmp_path / "w.dnr", Source(path=str(source), sha256="0"))
-    book = BakeCache.open(meshes, workspace.root / FOLDER, SIZE)
+    book = BakeCache.open(meshes, workspace.root / BAKES, SIZE)
     book.value("m", "colour", source_of(bpy.data.materials["m"]), "Base Color", Findings())
     bpy.ops.wm.save_as_mainfile(filepath=str(source))
     save_geometry(geometry, meshes)
@@ -360,4 +360,4 @@ def test_bake_processes_fill_the_cache_and_name_what_failed(tmp_path: Path) -> N
     pending = PendingBakes(layers=(tuple(layer), (gone,)), frame=1)
     run = Run(workspace, Settings.model_validate({"passes": {"bake_size": SIZE, "workers": 1}}), Console(quiet=True))
     assert bake(run, source, geometry, pending) == ["k"]
-    assert [path.stem for path in (workspace.root / FOLDER).glob("*.npy")] == list(book.missing)
+    assert [path.stem for path in (workspace.root / BAKES).glob("*.npy")] == list(book.missing)

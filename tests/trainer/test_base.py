@@ -85,8 +85,8 @@ def test_a_view_in_memory_is_as_one_from_files(scene: Scene, base: str) -> None:
 
 def test_the_raster_colour_as_base(scene: Scene) -> None:
     batch = load(scene, "raster").batch([1])
-    assert scene.raster.target is not None
-    assert torch.allclose(base_over_white(batch), scene.raster.target[1:2], atol=1e-5)
+    assert scene.raster.tensors.target is not None
+    assert torch.allclose(base_over_white(batch), scene.raster.tensors.target[1:2], atol=1e-5)
     assert batch.albedo is batch.diffuse is batch.chain_uv is None
     assert scene.traced.tensors.base is None and scene.traced.tensors.display is None
 
@@ -173,7 +173,7 @@ def test_radiance_of_whole_view_sets(baked: ViewSet) -> None:
     radiance = render_radiance(hdr, views, batch=2)
     assert radiance is not None and views.tensors.base is not None and views.tensors.display is not None
     assert torch.allclose(radiance, views.tensors.base, rtol=1e-3, atol=1e-5)
-    over_white = compose(views.tensors.display(radiance), views.coverage)
+    over_white = compose(views.tensors.display(radiance), views.tensors.coverage)
     assert torch.allclose(over_white, render_views(hdr, views), atol=1e-5)
     assert render_radiance(DNR(WHOLE, seed=0), views) is None
 

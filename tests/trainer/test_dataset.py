@@ -17,13 +17,13 @@ from dnrtrain.exr import read_exr, write_exr
 
 def test_values_follow_the_contract(scene: Scene) -> None:
     views = scene.traced
-    inside = views.mask > 0.5
+    inside = views.tensors.mask > 0.5
     assert views.size == (32, 32) and len(views) == 10 and views.names[0] == "0000"
-    assert torch.allclose(views.normal.norm(dim=1, keepdim=True)[inside], torch.ones(1), atol=1e-5)
-    assert torch.allclose(views.view_dir.norm(dim=1), torch.ones(1), atol=1e-5)
-    assert views.depth.min() >= 0 and views.depth.max() <= 1 and views.uv.abs().max() <= 1
-    assert (views.uv[~inside.expand_as(views.uv)] == 0).all()
-    assert views.target is not None and views.target.min() >= 0 and views.target.max() <= 1
+    assert torch.allclose(views.tensors.normal.norm(dim=1, keepdim=True)[inside], torch.ones(1), atol=1e-5)
+    assert torch.allclose(views.tensors.view_dir.norm(dim=1), torch.ones(1), atol=1e-5)
+    assert views.tensors.depth.min() >= 0 and views.tensors.depth.max() <= 1 and views.tensors.uv.abs().max() <= 1
+    assert (views.tensors.uv[~inside.expand_as(views.tensors.uv)] == 0).all()
+    assert views.tensors.target is not None and views.tensors.target.min() >= 0 and views.tensors.target.max() <= 1
 
 
 def test_view_direction_points_from_surface_to_camera(scene: Scene) -> None:
@@ -32,15 +32,15 @@ def test_view_direction_points_from_surface_to_camera(scene: Scene) -> None:
     index = scene.traced.index("0003")
     towards = scene.traced.camera_positions[index][:, None, None] - position
     towards /= np.linalg.norm(towards, axis=0)
-    error = np.abs(towards - scene.traced.view_dir[index].numpy()).max(axis=0)
+    error = np.abs(towards - scene.traced.tensors.view_dir[index].numpy()).max(axis=0)
     assert error[channels["mask"] > 0].max() < 1e-5
 
 
 def test_background_is_white_and_raster_differs(scene: Scene) -> None:
-    assert scene.traced.target is not None and scene.raster.target is not None
-    empty = (scene.traced.coverage == 0).expand(-1, 3, -1, -1)
-    assert (scene.traced.target[empty] == 1).all()
-    assert (scene.traced.target - scene.raster.target).abs().mean() > 0.01
+    assert scene.traced.tensors.target is not None and scene.raster.tensors.target is not None
+    empty = (scene.traced.tensors.coverage == 0).expand(-1, 3, -1, -1)
+    assert (scene.traced.tensors.target[empty] == 1).all()
+    assert (scene.traced.tensors.target - scene.raster.tensors.target).abs().mean() > 0.01
 
 
 def test_augmentation_moves_inputs_and_target_alike(scene: Scene) -> None:
@@ -71,7 +71,7 @@ def test_quarter_turn_of_a_wide_image(scene: Scene) -> None:
 def test_names_and_subsets(scene: Scene) -> None:
     part = scene.traced.subset([4, 1])
     assert part.names == ("0004", "0001")
-    assert torch.equal(part.uv[1], scene.traced.uv[1])
+    assert torch.equal(part.tensors.uv[1], scene.traced.tensors.uv[1])
     assert np.array_equal(part.c2w[0], scene.traced.c2w[4])
     with pytest.raises(ContractError, match="nobody"):
         scene.traced.index("nobody")
@@ -84,7 +84,7 @@ def test_without_target(scene: Scene) -> None:
     bare = scene.folder / "bare.exr"
     write_exr(bare, {k: v for k, v in channels.items() if k not in "RGBA"}, {})
     views = load_views([bare], None, synthetic.FRAME, cameras=[view], folder=scene.folder, target=False)
-    assert views.target is None
+    assert views.tensors.target is None
     with pytest.raises(ContractError, match="channels A, B, G, R are missing"):
         load_views([bare], None, synthetic.FRAME, cameras=[view], folder=scene.folder)
 

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from dnrtrain.contract import ContractError, View
 from dnrtrain.selector.greedy import lazy_greedy
-from dnrtrain.selector.kmedoids import KMedoidsPolicy, camera_problem
-from dnrtrain.selector.medoids import Facilities, build, swap
+from dnrtrain.selector.medoids import Facilities, KMedoidsPolicy, build, camera_problem, swap
 from dnrtrain.selector.names import NAMES, TRAINED_NAMES, UNTRAINED_NAMES
 from dnrtrain.selector.policies import UNTRAINED, untrained
 from dnrtrain.selector.protocol import Candidates

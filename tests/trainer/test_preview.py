@@ -83,7 +83,7 @@ def test_it_shows_what_the_model_would_be(scene: Scene, tmp_path: Path, monkeypa
     views = unseen(scene, target=True)
     rendered = render_views(load_model(tmp_path / "step2", "cpu"), views)
     np.testing.assert_array_equal(last.image, rendered[0].permute(1, 2, 0).numpy())
-    assert views.target is not None and last.psnr == pytest.approx(float(psnr(rendered, views.target)))
+    assert views.tensors.target is not None and last.psnr == pytest.approx(float(psnr(rendered, views.tensors.target)))
     assert last.image.dtype == np.float32 and 0 <= last.image.min() < last.image.max() <= 1
     alone = list(train(scene, tmp_path / "alone", Preview(unseen(scene, target=False), 1e9)))
     assert [e.psnr for e in alone if isinstance(e, Previewed)] == [None, None]

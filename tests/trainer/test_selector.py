@@ -16,8 +16,7 @@ from dnrtrain.selector.agent import (
     reward_of,
     td_target,
 )
-from dnrtrain.selector.baselines import FarthestPolicy
-from dnrtrain.selector.policies import UNTRAINED
+from dnrtrain.selector.policies import UNTRAINED, FarthestPolicy
 from dnrtrain.selector.protocol import Candidates
 from dnrtrain.selector.qnetwork import QNetwork
 

@@ -251,7 +251,7 @@ def test_it_learns_views_it_has_not_seen(tmp_path: Path) -> None:
     chosen = scene.traced.subset([scene.traced.index(name) for name in record.selected])
     step2(chosen, tmp_path, model=model,
           settings=Step2Settings(epochs=25, photometric="l1", loss=LossWeights(perceptual=0)))  # fmt: skip
-    target, seen = scene.held_out.target, chosen.target
+    target, seen = scene.held_out.tensors.target, chosen.tensors.target
     assert target is not None and seen is not None
     baseline = float(psnr(seen.mean(0, keepdim=True).expand_as(target), target).mean())
     scores = {

@@ -99,7 +99,7 @@ def findings(workspace: Workspace) -> list[dict[str, Any]]:
 
 CONVERSION = (
     "blender",
-    *("stages/baking.py", "stages/opening.py", "stages/prepare.py"),
+    "stages/prepare.py",
     *("core/cameras.py", "core/scene_files.py", "core/scene_records.py", "core/settings.py"),
 )
 TRACING = tuple(f"raytrace/{name}.py" for name in ("tracer", "engine", "sensors", "visibility"))

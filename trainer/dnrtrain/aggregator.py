@@ -19,10 +19,10 @@ from torch import Tensor, nn
 from .contract import ContractError
 from .dataset import Batch
 from .precision import at_least_float32
+from .renderer import SLOPE
 from .settings import ModelSettings
 from .textures import TexturePyramid, apply_harmonics, depth_coordinate, octahedral
 
-SLOPE = 0.2
 GEOMETRY_TEXELS = 128
 """Most texels per side of the normal and depth textures: their domains are smooth, small and shared by
 the whole scene, so more texels than this would only be seen by single pixels."""

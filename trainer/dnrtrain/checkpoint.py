@@ -21,7 +21,7 @@ import torch
 from pydantic import ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import Tensor, nn
+from torch import Tensor
 
 from . import records
 from .atomic import atomic_path
@@ -123,13 +123,7 @@ def unprefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name.removeprefix(start): t for name, t in tensors.items() if name.startswith(start)}
 
 
-def load_module(module: nn.Module, tensors: Mapping[str, Tensor]) -> None:
-    """Copy weights into a module of the same layout."""
-    module.load_state_dict(dict(tensors))
-
-
 def save_state(folder: Path, tensors: Mapping[str, Tensor], progress: Progress) -> None:
-    """Write an epoch's state in place of the last one's."""
     save(folder / STATE, tensors, progress.data())
     records.write(folder / records.PROGRESS, progress)
 
@@ -199,7 +193,7 @@ def load_model(folder: Path, device: str | torch.device = "cpu") -> DNR:
         settings = ModelSettings.model_validate(record.model)
         _refuse_bomb(settings, saved)
         model = DNR(settings, seed=0)
-        load_module(model, saved.tensors)
+        model.load_state_dict(saved.tensors)
     except (ValidationError, RuntimeError, KeyError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ContractError(f"{folder}: model does not fit this version ({reason}); train it again") from None

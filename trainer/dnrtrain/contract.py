@@ -41,43 +41,23 @@ import zipfile
 import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import AfterValidator, BaseModel, Field, field_validator
 
 from .atomic import write_json
 
 RASTER_CHANNELS = ("R", "G", "B", "A")
 GBUFFER_CHANNELS = (
-    "depth.Z",
-    "normal.X",
-    "normal.Y",
-    "normal.Z",
-    "uv.U",
-    "uv.V",
-    "position.X",
-    "position.Y",
-    "position.Z",
-    "object.Id",
-    "mask",
-    "coverage",
+    *("depth.Z", "normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V"),
+    *("position.X", "position.Y", "position.Z", "object.Id", "mask", "coverage"),
 )
 BASE_CHANNELS = (
-    "base.R",
-    "base.G",
-    "base.B",
-    "base.A",
-    "diffuse.R",
-    "diffuse.G",
-    "diffuse.B",
-    "albedo.R",
-    "albedo.G",
-    "albedo.B",
-    "chain.U",
-    "chain.V",
-    "chain.mask",
-    "chain.weight",
+    *("base.R", "base.G", "base.B", "base.A"),
+    *("diffuse.R", "diffuse.G", "diffuse.B"),
+    *("albedo.R", "albedo.G", "albedo.B"),
+    *("chain.U", "chain.V", "chain.mask", "chain.weight"),
 )
 SPLITS = ("train", "val", "test")
 
@@ -109,29 +89,29 @@ class DamagedFile(ContractError):
         super().__init__(f"{path}: damaged ({self.reason}); delete it and run its stage again")
 
 
-class View(BaseModel):
+def _finite(value: float) -> float:
+    if not math.isfinite(value):
+        raise ValueError("must be finite")
+    return value
+
+
+Finite = Annotated[float, AfterValidator(_finite)]
+
+
+class View(BaseModel, extra="forbid", frozen=True):
     """One pinhole camera. Lengths in pixels (intrinsics) and scene units (c2w).
 
     ``name`` is unique within its split and is the stem of its files.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
     name: str = Field(pattern=r"^[A-Za-z0-9_.-]+$")
     width: int = Field(ge=1, le=16384)
     height: int = Field(ge=1, le=16384)
-    fl_x: float = Field(gt=0)
-    fl_y: float = Field(gt=0)
-    cx: float
-    cy: float
+    fl_x: Finite = Field(gt=0)
+    fl_y: Finite = Field(gt=0)
+    cx: Finite
+    cy: Finite
     c2w: tuple[tuple[float, ...], ...]
-
-    @field_validator("fl_x", "fl_y", "cx", "cy")
-    @classmethod
-    def _finite(cls, value: float) -> float:
-        if not math.isfinite(value):
-            raise ValueError("must be finite")
-        return value
 
     @field_validator("c2w")
     @classmethod
@@ -142,9 +122,8 @@ class View(BaseModel):
         if not np.isfinite(matrix).all():
             raise ValueError("transform contains NaN or infinity")
         rotation = matrix[:3, :3]
-        if np.abs(rotation).max() > 2:  # their products may overflow
-            raise ValueError("transform is not a rotation and a translation (scaled, sheared or mirrored)")
-        if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        large = np.abs(rotation).max() > 2  # their products may overflow
+        if large or not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
             raise ValueError("transform is not a rotation and a translation (scaled, sheared or mirrored)")
         return value
 
@@ -161,14 +140,7 @@ class View(BaseModel):
     @property
     def intrinsics(self) -> dict[str, float]:
         """Width, height, focal lengths and principal point in pixels, by the names of a ``transforms`` file."""
-        return {
-            "w": self.width,
-            "h": self.height,
-            "fl_x": self.fl_x,
-            "fl_y": self.fl_y,
-            "cx": self.cx,
-            "cy": self.cy,
-        }
+        return {"w": self.width, "h": self.height, **self.model_dump(include={"fl_x", "fl_y", "cx", "cy"})}
 
     def ray_directions(self) -> np.ndarray:
         """Unit world-space directions from the camera through pixel centres, float32 [H, W, 3]."""
@@ -183,11 +155,7 @@ class View(BaseModel):
 def write_cameras(path: Path, views: Sequence[View], split: str) -> None:
     """Write views as a NeRF ``transforms`` file with per-frame intrinsics, atomically."""
     frames = [
-        {
-            "file_path": f"{split}/{view.name}",
-            **view.intrinsics,
-            "transform_matrix": [list(row) for row in view.c2w],
-        }
+        {"file_path": f"{split}/{view.name}", **view.intrinsics, "transform_matrix": [list(row) for row in view.c2w]}
         for view in views
     ]
     write_json(path, {"camera_model": "OPENCV", "frames": frames})
@@ -310,7 +278,7 @@ def _focal(length: float, angle: float) -> float:
     return 0.5 * length / math.tan(0.5 * angle)
 
 
-class SceneFrame(BaseModel):
+class SceneFrame(BaseModel, extra="forbid"):
     """What the trainer must know of the scene beside pixels (``scene/frame.json``).
 
     near, far: planar depth range, scene units, that normalises depth to [0, 1].
@@ -320,23 +288,14 @@ class SceneFrame(BaseModel):
     display_lut: file beside this one with the baked display transform, or None for plain sRGB.
     """
 
-    model_config = ConfigDict(extra="forbid")
-
-    near: float = Field(gt=0)
-    far: float = Field(gt=0)
+    near: Finite = Field(gt=0)
+    far: Finite = Field(gt=0)
     center: tuple[float, float, float]
-    radius: float = Field(gt=0)
-    exposure: float = 0.0
-    gamma: float = 1.0
+    radius: Finite = Field(gt=0)
+    exposure: Finite = 0.0
+    gamma: Finite = 1.0
     view_transform: str = "Standard"
     display_lut: str | None = Field(default=None, pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")
-
-    @field_validator("near", "far", "radius", "exposure", "gamma")
-    @classmethod
-    def _finite(cls, value: float) -> float:
-        if not math.isfinite(value):
-            raise ValueError("must be finite")
-        return value
 
 
 def require_channels(

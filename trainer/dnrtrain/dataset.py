@@ -97,34 +97,6 @@ class ViewSet:
         return len(self.names)
 
     @property
-    def uv(self) -> Tensor:
-        return self.tensors.uv
-
-    @property
-    def depth(self) -> Tensor:
-        return self.tensors.depth
-
-    @property
-    def normal(self) -> Tensor:
-        return self.tensors.normal
-
-    @property
-    def mask(self) -> Tensor:
-        return self.tensors.mask
-
-    @property
-    def coverage(self) -> Tensor:
-        return self.tensors.coverage
-
-    @property
-    def view_dir(self) -> Tensor:
-        return self.tensors.view_dir
-
-    @property
-    def target(self) -> Tensor | None:
-        return self.tensors.target
-
-    @property
     def size(self) -> tuple[int, int]:
         """(height, width) in pixels."""
         height, width = self.tensors.mask.shape[-2:]

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from .aggregator import Aggregator
-from .correction import correct
+from .correction import correct, guide_channels, guide_maps
 from .dataset import Batch, ViewSet
-from .guides import guide_channels, guide_maps
 from .renderer import SLOPE, build_renderer
 from .settings import ModelSettings
 

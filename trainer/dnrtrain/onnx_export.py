@@ -23,6 +23,7 @@ Outputs: ``rgb`` [1, 3, H, W], display space over white, in [0, 1]; where the mo
 
 from __future__ import annotations
 
+import functools
 import io
 import json
 import math
@@ -38,20 +39,27 @@ from torch import Tensor, nn
 
 from .atomic import atomic_path
 from .contract import ContractError, SceneFrame
-from .correction import correct
+from .correction import correct, guide_maps
 from .dataset import Batch
 from .display import ALPHA_FLOOR, DisplayTransform
-from .guides import guide_maps
 from .model import DNR, compose
 from .settings import ModelSettings
 from .textures import SH_COUNT, SH_FIRST_CHANNEL, TexturePyramid, depth_coordinate, octahedral, spherical_harmonics
 
 OPSET = 18
 """onnxruntime has no kernel for the GridSample of opset 20."""
-CHANNELS: dict[str, int] = {
-    "uv": 2, "mask": 1, "coverage": 1, "view_dir": 3, "normal": 3, "depth": 1,
-    "base": 4, "diffuse": 3, "albedo": 3, "chain": 4,
-}  # fmt: skip
+CHANNELS: dict[str, list[str]] = {
+    "uv": ["uv.U", "uv.V"],
+    "mask": ["mask"],
+    "coverage": ["coverage"],
+    "normal": [f"normal.{c}" for c in "XYZ"],
+    "depth": ["depth.Z"],
+    "base": [f"base.{c}" for c in "RGBA"],
+    "diffuse": [f"diffuse.{c}" for c in "RGB"],
+    "albedo": [f"albedo.{c}" for c in "RGB"],
+    "chain": ["chain.U", "chain.V", "chain.mask", "chain.weight"],
+}
+"""Of the EXR files, by input; ``view_dir`` is in none."""
 EXAMPLE = (48, 40)
 """Height and width that the graph is traced with; the file has none."""
 MERGED_VALUES = 16 * 128**2
@@ -126,20 +134,9 @@ def graph_inputs(channels: Mapping[str, np.ndarray], view_dir: np.ndarray, names
 
     Raises KeyError for a channel that is not there.
     """
-    maps = {
-        "uv": ["uv.U", "uv.V"],
-        "mask": ["mask"],
-        "coverage": ["coverage"],
-        "normal": [f"normal.{c}" for c in "XYZ"],
-        "depth": ["depth.Z"],
-        "base": [f"base.{c}" for c in "RGBA"],
-        "diffuse": [f"diffuse.{c}" for c in "RGB"],
-        "albedo": [f"albedo.{c}" for c in "RGB"],
-        "chain": ["chain.U", "chain.V", "chain.mask", "chain.weight"],
-    }
     found = {}
     for name in names:
-        image = view_dir.transpose(2, 0, 1) if name == "view_dir" else np.stack([channels[c] for c in maps[name]])
+        image = view_dir.transpose(2, 0, 1) if name == "view_dir" else np.stack([channels[c] for c in CHANNELS[name]])
         found[name] = np.ascontiguousarray(image[None], dtype=np.float32)
     return found
 
@@ -237,12 +234,7 @@ class Graph(nn.Module):
         if id(pyramid) in self.tables:
             whole = self.tables[id(pyramid)]
             return F.grid_sample(whole, grid, mode="bilinear", padding_mode="border", align_corners=True)
-        total: Tensor | None = None
-        for texels in pyramid.levels:
-            sample = F.grid_sample(texels, grid, mode="bilinear", padding_mode="border", align_corners=False)
-            total = sample if total is None else total + sample
-        assert total is not None
-        return total
+        return pyramid.look_up(grid)
 
 
 class _GatheredDisplay(DisplayTransform):
@@ -257,7 +249,7 @@ class _GatheredDisplay(DisplayTransform):
         before = position.floor().clamp(0.0, side - 2)
         way = position - before
         first = before.long()
-        total: Tensor | None = None
+        parts: list[Tensor] = []
         for corner in range(8):
             step = [corner >> 2 & 1, corner >> 1 & 1, corner & 1]
             index, share = torch.zeros_like(first[:, 0]), torch.ones_like(way[:, 0])
@@ -266,10 +258,8 @@ class _GatheredDisplay(DisplayTransform):
                 share = share * (way[:, axis] if step[axis] else 1.0 - way[:, axis])
             _, height, width = index.shape
             colour = table.index_select(0, index.reshape(-1)).t().reshape(1, 3, height, width)
-            part = colour * share[:, None]
-            total = part if total is None else total + part
-        assert total is not None
-        return total.clamp(0.0, 1.0)
+            parts.append(colour * share[:, None])
+        return functools.reduce(torch.add, parts).clamp(0.0, 1.0)
 
 
 def _merged(pyramid: TexturePyramid) -> Tensor:
@@ -293,5 +283,6 @@ def _rows(image: Tensor, function: Any) -> Tensor:
 
 
 def _example(name: str, height: int, width: int) -> Tensor:
-    image = torch.rand(1, CHANNELS[name], height, width, generator=torch.Generator().manual_seed(len(name)))
+    channels = 3 if name == "view_dir" else len(CHANNELS[name])
+    image = torch.rand(1, channels, height, width, generator=torch.Generator().manual_seed(len(name)))
     return (image > 0.3).float() if name == "mask" else image

@@ -6,7 +6,7 @@ Krizhevsky 2014), defined here: torchvision is no dependency. Weights come from 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Literal
 
 import torch
@@ -182,14 +182,13 @@ class PerceptualLoss(nn.Module):
         with torch.no_grad():
             wanted = self.features(target, bfloat16=bfloat16)
         found = self.features(prediction, bfloat16=bfloat16)
-        return _weighted_l1(found, wanted)
-
-
-def _weighted_l1(found: Sequence[Tensor], wanted: Sequence[Tensor]) -> Tensor:
-    # The mean's gradient is laid out in the order of its input's dimensions. With channels last as they lie in
-    # memory, the whole backward pass stays in one layout.
-    distances = [at_least_float32((a - b).abs()).permute(0, 2, 3, 1).mean() for a, b in zip(found, wanted, strict=True)]
-    return torch.stack([weight * distance for weight, distance in zip(LOSS_WEIGHTS, distances, strict=True)]).sum()
+        # The mean's gradient is laid out in the order of its input's dimensions. With channels last as they lie in
+        # memory, the whole backward pass stays in one layout.
+        parts = [
+            weight * at_least_float32((a - b).abs()).permute(0, 2, 3, 1).mean()
+            for weight, a, b in zip(LOSS_WEIGHTS, found, wanted, strict=True)
+        ]
+        return torch.stack(parts).sum()
 
 
 def _unit(feature: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ All of this runs in float32 and only at the pixels inside the mask: P points ins
 
 from __future__ import annotations
 
+import functools
 import math
 
 import torch
@@ -65,13 +66,14 @@ class TexturePyramid(nn.Module):
         return super().train(mode)
 
     def _summed(self, points: Tensor) -> Tensor:
-        grid = points[None, None]
-        total: Tensor | None = None
-        for texels in self.levels:
-            sample = F.grid_sample(texels, grid, mode="bilinear", padding_mode="border", align_corners=False)
-            total = sample if total is None else total + sample
-        assert total is not None
-        return total[0, :, 0].t()
+        return self.look_up(points[None, None])[0, :, 0].t()
+
+    def look_up(self, grid: Tensor) -> Tensor:
+        """Coordinates [1, H, W, 2] in [-1, 1] -> the sum of all levels, [1, C, H, W]."""
+        return functools.reduce(
+            torch.add,
+            (F.grid_sample(t, grid, mode="bilinear", padding_mode="border", align_corners=False) for t in self.levels),
+        )
 
     def merged(self) -> tuple[Tensor, int, int]:
         """All levels as one texture: its texels row by row [height · width, C], width and height.

@@ -162,6 +162,6 @@ class TrainingRun:
 
     def _load(self, saved: checkpoint.State) -> None:
         self.dnr.use_bfloat16, self.history = saved.progress.bfloat16, saved.progress.history
-        checkpoint.load_module(self.dnr, checkpoint.unprefixed("dnr", saved.tensors))
+        self.dnr.load_state_dict(checkpoint.unprefixed("dnr", saved.tensors))
         checkpoint.restore_optimiser(self.optimiser, checkpoint.unprefixed("adam", saved.tensors))
         self.load_more(saved)

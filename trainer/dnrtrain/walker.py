@@ -15,7 +15,7 @@ from .dataset import ViewSet
 from .model import DNR
 from .schedule import STEP1, EpochBook, adam, guarded_step, step_random
 from .selector.agent import RewardScale, best_action, epsilon_at, epsilon_greedy, follow, reward_of, td_target
-from .selector.baselines import FarthestPolicy
+from .selector.policies import FarthestPolicy
 from .selector.protocol import Candidates, Choice
 from .selector.qnetwork import QNetwork
 from .settings import Step1Settings
@@ -150,6 +150,6 @@ class Walker:
     def load(self, saved: checkpoint.State) -> None:
         """Go on from step 1's checkpoint."""
         self.scale = RewardScale(saved.progress.reward_mean, raw=self.settings.reward_scale == "raw")
-        checkpoint.load_module(self.agent, checkpoint.unprefixed("agent", saved.tensors))
-        checkpoint.load_module(self.slow, checkpoint.unprefixed("slow", saved.tensors))
+        self.agent.load_state_dict(checkpoint.unprefixed("agent", saved.tensors))
+        self.slow.load_state_dict(checkpoint.unprefixed("slow", saved.tensors))
         checkpoint.restore_optimiser(self.adam, checkpoint.unprefixed("adam_agent", saved.tensors))

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import json
 import os
 import pickle
 import tarfile
@@ -100,8 +101,6 @@ def load_weights(cache_dir: Path | None = None) -> dict[str, Tensors]:
 
 def _verified_record(folder: Path) -> dict[str, Any] | None:
     """The cache's record when every file is present with the recorded SHA-256, else None."""
-    import json
-
     try:
         record = json.loads((folder / "weights.json").read_text(encoding="utf-8"))
         intact = all(_sha256((folder / record[n]["file"]).read_bytes()) == record[n]["sha256"] for n in CONVOLUTIONS)

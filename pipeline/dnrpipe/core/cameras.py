@@ -37,26 +37,14 @@ def make_cameras(summary: SceneSummary, settings: CameraSettings) -> dict[str, l
     """
     source = settings.source
     if source in ("auto", "dome", "sphere"):
-        return {
-            split: sphere_views(
-                summary,
-                settings,
-                count=getattr(settings, split),
-                stream=_STREAM[split],
-                hemisphere=source != "sphere",
-            )
-            for split in SPLITS
-        }
-    if source == "scene":
-        cameras = [c for c in summary.cameras if c.type == "PERSP"]
-        if not cameras:
+        return {split: sphere_views(summary, settings, split) for split in SPLITS}
+    if source in ("scene", "animation"):
+        own = [view for view, _ in _own_views(summary, settings)]
+        if source == "scene" and not own:
             raise UserError("--cameras scene: the scene has no perspective camera; use --cameras dome")
-        return split_views(unique_names([_scene_view(c, settings) for c in cameras]), settings)
-    if source == "animation":
-        frames = [f for f in summary.animation if f.type == "PERSP"]
-        if len(frames) < 2:
+        if source == "animation" and len(own) < 2:
             raise UserError("--cameras animation: the active camera does not move; use --cameras scene or dome")
-        return split_views([_scene_view(f, settings) for f in frames], settings)
+        return split_views(own, settings)
     path = Path(source)
     views = read_camera_file(path, settings)
     return own_splits(path, views) or split_views(views, settings)
@@ -82,15 +70,14 @@ def view_lenses(summary: SceneSummary, settings: CameraSettings) -> dict[str, Le
 
     Only the scene's own cameras have lenses; domes, spheres and camera files are pinholes.
     """
-    if settings.source == "scene":
-        cameras = [c for c in summary.cameras if c.type == "PERSP"]
-        named = unique_names([_scene_view(camera, settings) for camera in cameras])
-    elif settings.source == "animation":
-        cameras = [f for f in summary.animation if f.type == "PERSP"]
-        named = [_scene_view(frame, settings) for frame in cameras]
-    else:
-        return {}
-    return {view.name: camera.dof for view, camera in zip(named, cameras, strict=True) if camera.dof}
+    return {view.name: camera.dof for view, camera in _own_views(summary, settings) if camera.dof}
+
+
+def _own_views(summary: SceneSummary, settings: CameraSettings) -> list[tuple[View, SceneCamera]]:
+    """Views of the scene's own cameras, or of the active one's animation; [] for other sources."""
+    sources = {"scene": summary.cameras, "animation": summary.animation}
+    cameras = [camera for camera in sources.get(settings.source, ()) if camera.type == "PERSP"]
+    return list(zip(unique_names([_scene_view(camera, settings) for camera in cameras]), cameras, strict=True))
 
 
 def read_camera_file(path: Path, settings: CameraSettings) -> list[View]:
@@ -116,15 +103,14 @@ def read_camera_file(path: Path, settings: CameraSettings) -> list[View]:
     return views
 
 
-def sphere_views(
-    summary: SceneSummary, settings: CameraSettings, *, count: int, stream: int, hemisphere: bool
-) -> list[View]:
-    """``count`` views on a (hemi)sphere that looks at the scene's centre.
+def sphere_views(summary: SceneSummary, settings: CameraSettings, split: str) -> list[View]:
+    """Views of a split on a sphere, or by default a hemisphere, that look at the scene's centre.
 
     Directions are a Fibonacci lattice with a random turn and jitter: even like the lattice, and two
     splits never share a direction. The lens is the scene camera's where it has one.
     """
-    rng = np.random.default_rng([settings.seed, stream])
+    count, hemisphere = getattr(settings, split), settings.source != "sphere"
+    rng = np.random.default_rng([settings.seed, _STREAM[split]])
     center = np.asarray(summary.bounds.center, dtype=np.float64)
     focal, distance = framing(summary, settings)
     low, high = (math.sin(LOWEST), math.sin(HIGHEST)) if hemisphere else (-math.sin(HIGHEST), math.sin(HIGHEST))
@@ -152,13 +138,8 @@ def orbit_views(
     views = []
     for index in range(count):
         azimuth = 2 * math.pi * index / count
-        direction = np.array(
-            [
-                math.cos(elevation) * math.cos(azimuth),
-                math.cos(elevation) * math.sin(azimuth),
-                math.sin(elevation),
-            ]
-        )
+        around = math.cos(elevation) * np.array([math.cos(azimuth), math.sin(azimuth)])
+        direction = np.array([*around, math.sin(elevation)])
         views.append(look_at_view(f"{index:04d}", center + distance * direction, center, focal, settings))
     return views
 
@@ -244,13 +225,12 @@ def look_at_view(name: str, position: np.ndarray, target: np.ndarray, focal: flo
 def _scene_view(camera: SceneCamera, settings: CameraSettings) -> View:
     """Blender camera -> View. Sensor fit and shift as in Blender's manual, "Camera / Lens"."""
     width, height = settings.width, settings.height
-    fit = camera.sensor_fit
-    if fit == "AUTO":
-        fit = "HORIZONTAL" if width >= height else "VERTICAL"
-        sensor = camera.sensor_width
+    if camera.sensor_fit == "AUTO":
+        side, sensor = max(width, height), camera.sensor_width
+    elif camera.sensor_fit == "HORIZONTAL":
+        side, sensor = width, camera.sensor_width
     else:
-        sensor = camera.sensor_width if fit == "HORIZONTAL" else camera.sensor_height
-    side = width if fit == "HORIZONTAL" else height
+        side, sensor = height, camera.sensor_height
     focal = camera.lens / sensor * side
     name = f"frame{camera.frame:05d}" if camera.frame is not None else camera.name
     return View(

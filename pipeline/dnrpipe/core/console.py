@@ -33,7 +33,7 @@ class Bar:
     """One running progress bar. ``advance`` counts units; ``note`` is shown at its end."""
 
     def __init__(
-        self, label: str, total: int, done: int, progress: Progress | None, stream: Any, events: EventStream
+        self, label: str, total: int, done: int, progress: Progress | None, quiet: bool, events: EventStream
     ) -> None:
         self.label, self.total, self.done = label, total, done
         self._events = events
@@ -41,7 +41,7 @@ class Bar:
         self._first = done
         self._progress = progress
         self._task = progress.add_task(label, total=total, completed=done, note="") if progress else None
-        self._stream = stream
+        self._quiet = quiet
         self._started = self._last = time.monotonic()
         self._report("")
 
@@ -52,14 +52,10 @@ class Bar:
             self._progress.update(self._task, completed=self.done, note=note)
             return
         now = time.monotonic()
-        if now - self._last >= PLAIN_INTERVAL and self.done < self.total:
+        if now - self._last >= PLAIN_INTERVAL and self.done < self.total and not self._quiet:
             self._last = now
-            left = self._seconds_left(now) or 0.0
-            print(
-                f"{self.label}: {self.done}/{self.total}, {clock(left)} left {note}".rstrip(),
-                file=self._stream,
-            )
-            self._stream.flush()
+            left = clock(self._seconds_left(now) or 0.0)
+            print(f"{self.label}: {self.done}/{self.total}, {left} left {note}".rstrip(), file=sys.stderr, flush=True)
 
     def _seconds_left(self, now: float) -> float | None:
         made = self.done - self._first
@@ -110,7 +106,7 @@ class Console:
     def bar(self, label: str, total: int, done: int = 0) -> Iterator[Bar]:
         """A progress bar with time left; a line every ten seconds where there is no terminal."""
         if self.quiet or total <= 0 or not self._rich.is_terminal:
-            yield Bar(label, total, done, None, _Silent() if self.quiet else sys.stderr, self.events)
+            yield Bar(label, total, done, None, self.quiet, self.events)
             return
         with Progress(
             TextColumn("{task.description}"),
@@ -121,19 +117,10 @@ class Console:
             TextColumn("{task.fields[note]}"),
             console=self._rich,
         ) as progress:
-            yield Bar(label, total, done, progress, sys.stderr, self.events)
-
-
-class _Silent:
-    def write(self, text: str) -> None: ...
-
-    def flush(self) -> None: ...
+            yield Bar(label, total, done, progress, self.quiet, self.events)
 
 
 def clock(seconds: float) -> str:
-    whole = round(seconds)
-    return (
-        f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
-        if whole >= 3600
-        else f"{whole // 60}:{whole % 60:02d}"
-    )
+    """``3:05``, ``2:10:00``."""
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}" if minutes >= 60 else f"{minutes}:{rest:02d}"

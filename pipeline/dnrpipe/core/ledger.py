@@ -14,11 +14,13 @@ import errno
 import json
 import math
 import os
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator
+
+from dnrtrain.settings import Strict
 
 from .errors import UserError
 
@@ -31,7 +33,7 @@ STAGE_ORDER: tuple[str, ...] = get_args(StageName)
 PURPOSE_ORDER: tuple[str, ...] = get_args(Purpose)
 
 
-class CostRecord(BaseModel):
+class CostRecord(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """One unit of work that cost time.
 
     Args:
@@ -49,8 +51,6 @@ class CostRecord(BaseModel):
         cache_hit: the result was found, not computed; ``seconds`` is then what the look-up took.
         detail: anything JSON-able, without NaN.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     time: float = Field(ge=0)
     run: str
@@ -157,10 +157,8 @@ class Ledger:
         return records, truncated
 
 
-class CostSum(BaseModel):
+class CostSum(Strict):
     """Totals of some records. seconds: summed over units; wall_seconds: estimate on the wall clock."""
-
-    model_config = ConfigDict(extra="forbid")
 
     seconds: float = 0.0
     wall_seconds: float = 0.0
@@ -186,16 +184,16 @@ def total(records: Iterable[CostRecord]) -> CostSum:
 
 def by_stage(records: Sequence[CostRecord]) -> dict[str, CostSum]:
     """Totals per stage, in the order of the pipeline; stages without records are absent."""
-    return _group(records, STAGE_ORDER, lambda r: r.stage)
+    return _group(records, STAGE_ORDER, "stage")
 
 
 def by_purpose(records: Sequence[CostRecord]) -> dict[str, CostSum]:
     """Totals per purpose: training, evaluation, inference; absent where there are none."""
-    return _group(records, PURPOSE_ORDER, lambda r: r.purpose)
+    return _group(records, PURPOSE_ORDER, "purpose")
 
 
-def _group(records: Sequence[CostRecord], order: Sequence[str], key: Callable[[CostRecord], str]) -> dict[str, CostSum]:
-    sums = {name: total(r for r in records if key(r) == name) for name in order}
+def _group(records: Sequence[CostRecord], order: Sequence[str], field: str) -> dict[str, CostSum]:
+    sums = {name: total(r for r in records if getattr(r, field) == name) for name in order}
     return {name: value for name, value in sums.items() if value.records}
 
 
@@ -281,14 +279,12 @@ def upfront_seconds(records: Iterable[CostRecord], only: Collection[str] | None 
     return total(record for part in upfront_work(records, only).values() for record in part).wall_seconds
 
 
-class TracingComparison(BaseModel):
+class TracingComparison(Strict):
     """Ray-tracing the chosen views against ray-tracing every candidate, in wall seconds.
 
     ``saved_seconds`` is gross. ``net_saved_seconds`` takes off what choosing the views cost (stage ``select``); it is
     negative where choosing cost more than it saved.
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     views: int
     candidates: int
@@ -338,7 +334,7 @@ def break_even_frames(upfront_seconds: float, traced_frame: float, neural_frame:
     return math.ceil(upfront_seconds / gain) if gain > 0 else None
 
 
-class RaytracedSum(BaseModel):
+class RaytracedSum(Strict):
     """The ray-traced views of one purpose.
 
     Args:
@@ -350,8 +346,6 @@ class RaytracedSum(BaseModel):
         noise: mean estimated relative error; None where it is unknown.
     """
 
-    model_config = ConfigDict(extra="forbid")
-
     views: int
     spp: list[int]
     seconds_per_view: float
@@ -360,7 +354,7 @@ class RaytracedSum(BaseModel):
     noise: float | None
 
 
-class CostSummary(BaseModel):
+class CostSummary(Strict):
     """What ``dnrpipe costs`` and the report print. Every run is in the sums, repeated work too.
 
     Args:
@@ -371,8 +365,6 @@ class CostSummary(BaseModel):
         devices: all that they ran on.
         torn_lines: truncated records, whose seconds are not counted.
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     total: CostSum
     by_stage: dict[str, CostSum]

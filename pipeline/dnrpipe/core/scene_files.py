@@ -26,13 +26,9 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise _missing(path) from None
+        raise UserError(f"{path}: is missing; run `dnrpipe prepare --force`") from None
     except (ValueError, RecursionError) as error:
         raise DamagedFile(path, str(error)) from None
-
-
-def _missing(path: Path) -> UserError:
-    return UserError(f"{path}: is missing; run `dnrpipe prepare --force`")
 
 
 def read_record(path: Path, kind: type[Model]) -> Model:
@@ -40,7 +36,7 @@ def read_record(path: Path, kind: type[Model]) -> Model:
     try:
         return read(path, kind)
     except FileNotFoundError:
-        raise _missing(path) from None
+        raise UserError(f"{path}: is missing; run `dnrpipe prepare --force`") from None
 
 
 def read_summary(scene: Path) -> SceneSummary:
@@ -101,11 +97,6 @@ def _sha256_cached(path: Path, modified_ns: int, size: int) -> str:
 def split_views(workspace: Workspace) -> dict[str, list[View]]:
     """The views of each split, as `prepare` placed them."""
     return {split: read_cameras(workspace.cameras(split)) for split in SPLITS if workspace.cameras(split).exists()}
-
-
-def has_test_views(workspace: Workspace) -> bool:
-    """Whether there is anything to evaluate on."""
-    return bool(split_views(workspace).get("test"))
 
 
 def read_selection(workspace: Workspace) -> Selection:

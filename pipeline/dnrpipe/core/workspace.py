@@ -20,13 +20,13 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from filelock import FileLock, Timeout
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from dnrtrain.atomic import write_json
 
@@ -38,7 +38,7 @@ SUFFIX = ".dnr"
 LOCK_FILES = (".lock", ".lock-owner")
 
 
-class StageRecord(BaseModel):
+class StageRecord(BaseModel, extra="forbid"):
     """What a finished stage leaves in the manifest.
 
     Args:
@@ -48,8 +48,6 @@ class StageRecord(BaseModel):
         seconds: wall time of the run that finished it.
         detail: what ``--json`` tells of it. `Manifest` reads back what other stages need.
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     fingerprint: str
     output: str
@@ -63,8 +61,8 @@ class StageRecord(BaseModel):
         return self.detail.get("perceptual")
 
 
-class Prepared(BaseModel):
-    """What stage `prepare` did.
+class PrepareDetail(BaseModel, strict=True):
+    """What stage `prepare` tells of itself.
 
     Args:
         raster_engine, raster_reason: what draws rasterised colour, and why.
@@ -72,36 +70,28 @@ class Prepared(BaseModel):
         triangles: of the scene.
     """
 
-    model_config = ConfigDict(extra="ignore", strict=True)
-
     raster_engine: str = ""
     raster_reason: str = ""
     views: dict[str, int]
     triangles: int = 0
 
 
-class Raytraced(BaseModel):
-    """What stage `raytrace` did. views: their names. spp: samples per pixel, of each view where they have their own."""
-
-    model_config = ConfigDict(extra="ignore", strict=True)
+class RaytraceDetail(BaseModel, strict=True):
+    """What stage `raytrace` tells of itself. views: their names. spp: samples per pixel; a list where views differ."""
 
     views: list[str]
     spp: int | list[int | None] | None = None
 
 
-class Source(BaseModel):
+class Source(BaseModel, extra="forbid"):
     """The scene file a workspace was made from. ``path`` is absolute; the workspace lives without it."""
-
-    model_config = ConfigDict(extra="forbid")
 
     path: str
     sha256: str
 
 
-class Manifest(BaseModel):
+class Manifest(BaseModel, extra="forbid", populate_by_name=True):
     """``manifest.json``. overrides: the flags given so far. settings: the last resolved copy."""
-
-    model_config = ConfigDict(extra="forbid", populate_by_name=True)
 
     schema_version: int = Field(default=SCHEMA, alias="schema")
     source: Source
@@ -115,24 +105,24 @@ class Manifest(BaseModel):
     @classmethod
     def _readable(cls, stages: dict[str, StageRecord]) -> dict[str, StageRecord]:
         """What other commands read of a record is there."""
-        for name, kind in (("prepare", Prepared), ("raytrace", Raytraced)):
+        for name, kind in (("prepare", PrepareDetail), ("raytrace", RaytraceDetail)):
             try:
                 found = kind.model_validate(stages[name].detail) if name in stages else None
             except ValidationError as error:
                 raise ValueError(f"stage {name}: {error.errors()[0]['msg']}") from None
-            if isinstance(found, Prepared) and "train" not in found.views:
+            if isinstance(found, PrepareDetail) and "train" not in found.views:
                 raise ValueError("stage prepare does not say how many views it has")
         return stages
 
     @property
-    def prepared(self) -> Prepared | None:
+    def prepared(self) -> PrepareDetail | None:
         """What stage `prepare` did; None before it has."""
-        return Prepared.model_validate(self.stages["prepare"].detail) if "prepare" in self.stages else None
+        return PrepareDetail.model_validate(self.stages["prepare"].detail) if "prepare" in self.stages else None
 
     @property
-    def raytraced(self) -> Raytraced | None:
+    def raytraced(self) -> RaytraceDetail | None:
         """What stage `raytrace` did; None before it has."""
-        return Raytraced.model_validate(self.stages["raytrace"].detail) if "raytrace" in self.stages else None
+        return RaytraceDetail.model_validate(self.stages["raytrace"].detail) if "raytrace" in self.stages else None
 
 
 class DamagedManifest(UserError):
@@ -221,23 +211,9 @@ class Workspace:
         """Write the manifest atomically."""
         write_json(self.root / "manifest.json", self.manifest.model_dump(mode="json", by_alias=True))
 
-    def finish_stage(
-        self,
-        name: str,
-        *,
-        fingerprint: str,
-        output: str,
-        seconds: float,
-        detail: Mapping[str, Any] | None = None,
-    ) -> None:
-        """Record that a stage is done; the last thing a stage does."""
-        self.manifest.stages[name] = StageRecord(
-            fingerprint=fingerprint,
-            output=output,
-            finished=time.time(),
-            seconds=seconds,
-            detail=dict(detail or {}),
-        )
+    def finish_stage(self, name: str, **facts: Any) -> None:
+        """Record that a stage is done, the last thing a stage does. facts: fields of `StageRecord` but ``finished``."""
+        self.manifest.stages[name] = StageRecord(finished=time.time(), **facts)
         self.save()
 
 

@@ -11,7 +11,7 @@ What leaving out means
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from pathlib import Path
 
 from dnrtrain.atomic import write_text
@@ -81,7 +81,8 @@ def write_without(path: Path, left_out: Collection[str], target: Path) -> None:
     for emitter in root.findall("emitter"):
         if ("environment" if emitter.get("type") in ENVIRONMENTS else "point-lights") in left_out:
             root.remove(emitter)
-    for parent, shape in list(_children(root, "shape")):
+    shapes = [(above, below) for above in root.iter() for below in above.findall("shape")]
+    for parent, shape in shapes:
         emitter = shape.find("emitter")
         lamp = emitter is not None and _is_lamp(shape)
         strands = shape.get("id", "").startswith(STRANDS_PREFIX)
@@ -100,10 +101,6 @@ def _read(path: Path) -> ET.Element:
         raise UserError(f"{path}: is missing; run `dnrpipe prepare --force`") from None
     except ET.ParseError as error:
         raise UserError(f"{path}: damaged ({error}); run `dnrpipe prepare --force`") from None
-
-
-def _children(root: ET.Element, tag: str) -> Iterator[tuple[ET.Element, ET.Element]]:
-    return ((parent, child) for parent in root.iter() for child in parent.findall(tag))
 
 
 def _parameter(element: ET.Element, name: str) -> ET.Element | None:

@@ -46,11 +46,13 @@ NOTHING: dict[EffectName, str] = {
 def gather(census: Census, bundle: Mapping[str, Sequence[str]], lenses: Sequence[str]) -> dict[EffectName, Evidence]:
     """Evidence by effect name."""
     materials = census.materials
+    frozen = f"asked for, but the scene is frozen: {_list([repr(name) for name in census.motion])}"
+    motion = (frozen,) if census.motion else ()
     result: dict[EffectName, Evidence] = {
-        "indirect": _indirect(census, materials),
+        "indirect": _indirect(census),
         "refraction": _held(bundle, "refraction", _where(materials, lambda m: m.refractive, _with_ior)),
         "caustics": _caustics(materials, bundle),
-        "volumes": _held(bundle, "volumes", _volumes(census, materials)),
+        "volumes": _held(bundle, "volumes", _volumes(census)),
         "subsurface": _held(bundle, "subsurface", _where(materials, lambda m: m.subsurface)),
         "alpha": _held(bundle, "alpha", _where(materials, lambda m: m.transparent)),
         "environment": _held(bundle, "environment", _world(census.world)),
@@ -60,7 +62,7 @@ def gather(census: Census, bundle: Mapping[str, Sequence[str]], lenses: Sequence
         "hair": _held(bundle, "hair", tuple(f"'{name}'" for name in census.hair)),
         "depth-of-field": _lenses(census, lenses),
         "spectral": _spectral(materials),
-        "motion": _motion(census),
+        "motion": Evidence(False, False, motion),
     }
     shiny = [f"'{n}'" for n, m in materials.items() if m.glossy or m.transmissive or m.view_dependent]
     glossy = (f"{len(shiny)} materials are not matt: {_list(shiny)}",) if shiny else ()
@@ -91,13 +93,10 @@ def _where(
     for name, entry in materials.items():
         if not wanted(entry):
             continue
-        said = [part for part in (detail(entry), _on(entry)) if part]
+        shown = f"on {_list([repr(name) for name in entry.objects])}" if entry.objects else ""
+        said = [part for part in (detail(entry), shown) if part]
         words.append(f"material '{name}'" + (f" ({'; '.join(said)})" if said else ""))
     return tuple(words)
-
-
-def _on(entry: MaterialFacts) -> str:
-    return f"on {_list([repr(name) for name in entry.objects])}" if entry.objects else ""
 
 
 def _list(names: Sequence[str]) -> str:
@@ -113,9 +112,9 @@ def _with_roughness(entry: MaterialFacts) -> str:
     return "roughness by image" if entry.min_roughness is None else f"roughness {entry.min_roughness:.2g}"
 
 
-def _indirect(census: Census, materials: Mapping[str, MaterialFacts]) -> Evidence:
-    names = [name for name, entry in materials.items() if entry.reflects]
-    count = len(names) + bool(census.default_material)
+def _indirect(census: Census) -> Evidence:
+    materials = census.materials
+    count = sum(bool(entry.reflects) for entry in materials.values()) + bool(census.default_material)
     if not count:
         return Evidence(False, False)
     passing = [name for name, entry in materials.items() if entry.transparent or entry.transmissive]
@@ -141,9 +140,9 @@ def _caustics(materials: Mapping[str, MaterialFacts], bundle: Mapping[str, Seque
     return Evidence(True, not bundle.get("volumes"), words)
 
 
-def _volumes(census: Census, materials: Mapping[str, MaterialFacts]) -> tuple[str, ...]:
-    words = list(_where(materials, lambda m: m.volume))
-    words += [f"'{name}'" for name in census.volumes if name not in materials]
+def _volumes(census: Census) -> tuple[str, ...]:
+    words = list(_where(census.materials, lambda m: m.volume))
+    words += [f"'{name}'" for name in census.volumes if name not in census.materials]
     if census.world and census.world.volume:
         words.append(f"world '{census.world.name}'")
     return tuple(words)
@@ -177,9 +176,3 @@ def _lenses(census: Census, lenses: Sequence[str]) -> Evidence:
 def _spectral(materials: Mapping[str, MaterialFacts]) -> Evidence:
     films = _where(materials, lambda m: m.thin_film)
     return Evidence(False, False, ("not in the converted scene, see `dnrpipe inspect`", *films) if films else ())
-
-
-def _motion(census: Census) -> Evidence:
-    if not census.motion:
-        return Evidence(False, False)
-    return Evidence(False, False, (f"asked for, but the scene is frozen: {_list([repr(n) for n in census.motion])}",))

@@ -47,7 +47,7 @@ def check_page(out: Path, views: Sequence[View], data: ViewSet, model: DNR, cons
     from dnrtrain.metrics import psnr
     from dnrtrain.model import render_views
 
-    assert data.target is not None
+    assert data.tensors.target is not None
     expected = render_views(model, data)
     rows: list[dict[str, float]] = []
     address = (out.resolve() / "index.html").as_uri()
@@ -63,8 +63,8 @@ def check_page(out: Path, views: Sequence[View], data: ViewSet, model: DNR, cons
                 {
                     "psnr_torch": float(psnr(shown, same)),
                     "psnr_files": float(psnr(shown, expected[index : index + 1])),
-                    "psnr_truth": float(psnr(shown, data.target[index : index + 1])),
-                    "mask_agrees": float((batch.mask == data.mask[index : index + 1]).float().mean()),
+                    "psnr_truth": float(psnr(shown, data.tensors.target[index : index + 1])),
+                    "mask_agrees": float((batch.mask == data.tensors.mask[index : index + 1]).float().mean()),
                 }
             )
             bar.advance(note=f"{rows[-1]['psnr_torch']:.1f} dB")

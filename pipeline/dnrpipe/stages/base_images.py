@@ -55,7 +55,13 @@ class BaseRenderer:
     @property
     def light_is_baked(self) -> bool:
         """Whether the light is on disk, baked from the same inputs; True where none is needed."""
-        return self.light is None or _light_fingerprint(Path(self.light["output"])) == self.light["fingerprint"]
+        if self.light is None:
+            return True
+        try:
+            with np.load(self.light["output"], allow_pickle=False) as data:
+                return str(data["fingerprint"]) == self.light["fingerprint"]
+        except NPZ_ERRORS:
+            return False
 
 
 def base_path(workspace: Workspace, split: str, name: str) -> Path:
@@ -110,7 +116,11 @@ def base_views(
     renderer = base_renderer(run.workspace, run.settings, resolve_plan(run))
     bake_light(run, renderer)
     paths = paths or [base_path(run.workspace, split, view.name) for view in views]
-    tasks = [_task(view, path, renderer.fingerprint) for view, path in zip(views, paths, strict=True)]
+    tasks = []
+    for view, path in zip(views, paths, strict=True):
+        data = view.model_dump(mode="json")
+        fingerprint = digest([BASE_VERSION, renderer.fingerprint, data])
+        tasks.append({"view": data, "output": str(path), "fingerprint": fingerprint})
     run.view_tasks(
         "base images",
         "dnrpipe.raytrace.base_worker",
@@ -122,11 +132,6 @@ def base_views(
     )
     warn_of_repairs(tasks, run.console)
     return tasks
-
-
-def _task(view: View, path: Path, fingerprint: str) -> dict[str, Any]:
-    data = view.model_dump(mode="json")
-    return {"view": data, "output": str(path), "fingerprint": digest([BASE_VERSION, fingerprint, data])}
 
 
 def ready_renderer(workspace: Workspace, settings: Settings) -> BaseRenderer:
@@ -220,11 +225,3 @@ def bake_light(run: Run, renderer: BaseRenderer) -> dict[str, Any] | None:
         detail={"texels": result["texels"], "lost": result["lost"]},
     )
     return result
-
-
-def _light_fingerprint(path: Path) -> str | None:
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            return str(data["fingerprint"])
-    except NPZ_ERRORS:
-        return None

@@ -74,11 +74,7 @@ def _run_pilot(run: Run, plan: EffectPlan) -> DepthPilot:
 
 
 def run_pilots(
-    tasks: list[dict[str, Any]],
-    choice: VariantChoice,
-    console: Console,
-    label: str,
-    log: Path,
+    tasks: list[dict[str, Any]], choice: VariantChoice, console: Console, label: str, log: Path
 ) -> list[dict[str, Any]]:
     """Run pilot tasks, each in a process of its own (bundles add up in memory); answers in the tasks' order.
 
@@ -88,15 +84,8 @@ def run_pilots(
     with console.bar(label, len(tasks)) as bar:
         for task in tasks:
             common = {"configs": [task[key] for key in ("config", "with_effect", "without_effect") if key in task]}
-            result = only_answer(
-                label,
-                "dnrpipe.raytrace.pilot",
-                common,
-                task,
-                log=log,
-                console=console,
-                environment=choice.environment,
-            )
+            module, environment = "dnrpipe.raytrace.pilot", choice.environment
+            result = only_answer(label, module, common, task, log=log, console=console, environment=environment)
             if lost := result["masked"]:
                 console.warn(f"repaired: {lost} pixels of {label} pictures were not finite and are black")
             results.append(result)

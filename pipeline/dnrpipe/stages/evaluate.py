@@ -33,7 +33,7 @@ def evaluate(run: Run) -> Outcome:
     from dnrtrain.checkpoint import load_model
     from dnrtrain.metrics import image_metrics
     from dnrtrain.model import render_views
-    from dnrtrain.perceptual import Lpips
+    from dnrtrain.perceptual import build_lpips
 
     workspace, settings, console = run.workspace, run.settings, run.console
     views = split_views(workspace)["test"]
@@ -44,7 +44,7 @@ def evaluate(run: Run) -> Outcome:
     device = torch_device(settings)
     model = load_model(workspace.checkpoints("step2"), device)
     perceptual = perceptual_weights(console)
-    lpips = {name: Lpips(name, weights) for name, weights in perceptual.items()} if perceptual else None
+    lpips = build_lpips(perceptual) if perceptual else None
     rendered = settings.model.base in RENDERED
     rows: list[ViewMetrics] = []
     neural_seconds: list[float] = []
@@ -52,18 +52,19 @@ def evaluate(run: Run) -> Outcome:
         for view in views:
             data = load(workspace, [view], "test", raytraced=True, base=settings.model.base).to(device)
             seconds, prediction = _timed_render(lambda data=data: render_views(model, data), device)
-            assert data.target is not None  # loaded with raytraced=True
-            measured = image_metrics(prediction, data.target.cpu(), data.mask.cpu(), lpips)
-            truth = _image(data.target)
+            assert data.tensors.target is not None  # loaded with raytraced=True
+            measured = image_metrics(prediction, data.tensors.target.cpu(), data.tensors.mask.cpu(), lpips)
+            truth = _image(data.tensors.target)
             predicted = _image(prediction)
-            error, heat = flip_error(truth, predicted)
+            flip, heat = flip_error(truth, predicted)
             traced = read_metadata(workspace.raytraced("test", view.name)) or {}
             base = read_metadata(base_path(workspace, "test", view.name)) or {} if rendered else {}
+            noise_rmse = traced.get("noise_rmse")
             row = ViewMetrics(
                 name=view.name,
                 **measured,
-                flip=error,
-                ceiling_psnr=_ceiling(traced.get("noise_rmse")),
+                flip=flip,
+                ceiling_psnr=-20 * math.log10(noise_rmse) if noise_rmse else None,  # a denoiser's bias is not in it
                 reference_noise=traced.get("noise"),
                 reference_noise_error=traced.get("noise_error"),
                 seconds_traced=traced.get("seconds"),
@@ -78,15 +79,8 @@ def evaluate(run: Run) -> Outcome:
                 write_png(workspace.evaluation / f"{view.name}.{kind}.png", picture)
                 files[kind] = f"evaluation/{view.name}.{kind}.png"
             console.events.send("picture", split="test", view=view.name, files=files, psnr=row.psnr)
-            run.book(
-                "evaluation",
-                "view",
-                f"neural/{view.name}",
-                seconds,
-                device=device,
-                width=view.width,
-                height=view.height,
-            )
+            size = {"width": view.width, "height": view.height}
+            run.book("evaluation", "view", f"neural/{view.name}", seconds, device=device, **size)
             bar.advance(note=_figure(row.psnr, ".2f", " dB"))
     mean = _mean(rows)
     metrics = Metrics(
@@ -98,7 +92,10 @@ def evaluate(run: Run) -> Outcome:
         reference_noise_target=settings.raytrace.evaluation_noise,
         neural_ms=1000 * float(np.median(neural_seconds)),
     )
-    _remove_other_pictures(workspace, {view.name for view in views})
+    names = {view.name for view in views}
+    for path in workspace.evaluation.glob("[!.]*.png"):
+        if path.name.rsplit(".", 2)[0] not in names:  # of other cameras
+            path.unlink()
     write(workspace.evaluation / METRICS, metrics)
     ceiling = f" (ceiling {mean['ceiling_psnr']:.1f} dB)" if mean["ceiling_psnr"] is not None else ""
     console.say(
@@ -143,11 +140,6 @@ def _image(tensor: Any) -> np.ndarray:
     return tensor[0].float().clamp(0, 1).permute(1, 2, 0).cpu().numpy()
 
 
-def _ceiling(noise_rmse: float | None) -> float | None:
-    """The PSNR that a perfect renderer would measure against this noisy reference, dB; a denoiser's bias not in it."""
-    return None if not noise_rmse else -20 * math.log10(noise_rmse)
-
-
 def _mean(rows: list[ViewMetrics]) -> dict[str, float | None]:
     """The mean of each figure, over the views that have it."""
     result: dict[str, float | None] = {}
@@ -160,9 +152,3 @@ def _mean(rows: list[ViewMetrics]) -> dict[str, float | None]:
 
 def _figure(value: float | None, form: str, unit: str = "") -> str:
     return "not defined" if value is None else f"{value:{form}}{unit}"
-
-
-def _remove_other_pictures(workspace: Workspace, names: set[str]) -> None:
-    for path in workspace.evaluation.glob("[!.]*.png"):
-        if path.name.rsplit(".", 2)[0] not in names:
-            path.unlink()

@@ -136,7 +136,7 @@ class LivePicture:
 
         assert self.preview is not None
         started = time.monotonic()
-        target = self.preview.views.target
+        target = self.preview.views.tensors.target
         folder = self.workspace.preview
         files = {"prediction": "preview/prediction.png"}
         try:
@@ -159,16 +159,10 @@ class LivePicture:
             return
         facts = shown.model_dump(exclude={"truth", "time"})
         self.console.events.send("preview", stage="finetune", files=files, **facts)
+        seconds = event.seconds + time.monotonic() - started
         height, width = event.image.shape[:2]
-        self.run.book(
-            "evaluation",
-            "view",
-            f"preview/{event.view}",
-            event.seconds + time.monotonic() - started,
-            device=event.device,
-            width=width,
-            height=height,
-        )
+        size = {"width": width, "height": height}
+        self.run.book("evaluation", "view", f"preview/{event.view}", seconds, device=event.device, **size)
 
 
 def _small(image: np.ndarray) -> Any:
@@ -181,6 +175,5 @@ def _small(image: np.ndarray) -> Any:
     if scale >= 1:
         return image
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    channels = [Image.fromarray(np.ascontiguousarray(image[..., c], np.float32)).resize(size, Image.Resampling.BOX)
-                for c in range(3)]  # fmt: skip
-    return np.stack([np.asarray(channel) for channel in channels], axis=-1)
+    channels = [Image.fromarray(channel) for channel in np.moveaxis(image, -1, 0).astype(np.float32, order="C")]
+    return np.stack([channel.resize(size, Image.Resampling.BOX) for channel in channels], axis=-1)

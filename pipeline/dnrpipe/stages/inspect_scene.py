@@ -14,7 +14,7 @@ from ..core.scene_records import Census, Finding, FindingKind
 from ..core.settings import PassSettings
 from ..effects.bundle import bundle_facts
 from ..effects.plan import Effect, plan_effects
-from .opening import open_scene
+from .prepare import open_scene
 
 LISTED = 12  # names per line
 ORDER: tuple[FindingKind, ...] = ("approximated", "baked", "ignored", "missing")
@@ -61,16 +61,21 @@ class Inspection:
 
 def inspect_scene(scene: Path) -> Inspection:
     """Inspect a scene file in a worker process. Raises UserError for unusable input."""
-    if scene.is_dir():
-        raise UserError(f"{scene}: is a folder; name the scene file in it")
-    if not scene.exists():
-        raise UserError(f"{scene}: no such file")
+    require_file(scene)
     with tempfile.TemporaryDirectory(prefix="dnrpipe-inspect-") as folder:
         bundle = Path(folder) / "bundle"
         task = InspectTask(source=scene.resolve(), folder=bundle, bake_size=PassSettings().bake_size)
         found, _ = open_scene("dnrpipe.blender.inspection", task, InspectAnswer, Path(folder) / "log")
         facts = bundle_facts(bundle / "scene.xml") if bundle.exists() else {}  # nothing visible: nothing converted
     return Inspection(scene, found.warnings, found.census, plan_effects(found.census, facts).effects)
+
+
+def require_file(scene: Path) -> None:
+    """Raise UserError unless the scene is a file."""
+    if scene.is_dir():
+        raise UserError(f"{scene}: is a folder; name the scene file in it")
+    if not scene.exists():
+        raise UserError(f"{scene}: no such file")
 
 
 def exact(census: Census) -> dict[str, list[str]]:

@@ -105,11 +105,7 @@ STAGES: dict[str, Stage] = {
             needs=("prepare", "select"),
             reads=("scene", "selection.json"),
             writes=("raytraced/train", "base/train"),
-            settings=lambda s: [
-                _tracing(s, test=False),
-                _light(s),
-                _base(s),
-            ],
+            settings=lambda s: [_tracing(s, test=False), _light(s), _base(s)],
             make=raytrace.raytrace_selected,
             progress=raytrace.progress,
         ),
@@ -131,11 +127,7 @@ STAGES: dict[str, Stage] = {
             needs=("finetune",),
             reads=("passes/test", "checkpoints/step2"),
             writes=("raytraced/test", "base/test", "evaluation"),
-            settings=lambda s: [
-                _tracing(s, test=True),
-                _light(s),
-                _base(s),
-            ],
+            settings=lambda s: [_tracing(s, test=True), _light(s), _base(s)],
             make=evaluate.evaluate,
             progress=evaluate.progress,
         ),
@@ -237,10 +229,8 @@ def owner_of(path: Path, workspace: Workspace) -> Stage | None:
         inside = path.resolve().relative_to(workspace.root.resolve())
     except ValueError:
         return None
-    for stage in STAGES.values():
-        if any(inside.is_relative_to(written) for written in stage.writes):
-            return stage
-    return None
+    owners = (stage for stage in STAGES.values() if any(inside.is_relative_to(path) for path in stage.writes))
+    return next(owners, None)
 
 
 def discard(path: Path, owner: Stage, workspace: Workspace) -> None:

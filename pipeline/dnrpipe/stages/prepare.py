@@ -12,7 +12,18 @@ from dnrtrain.atomic import write_json
 from dnrtrain.contract import SPLITS, View, write_cameras
 
 from ..blender.finding_lines import finding_lines
-from ..blender.tasks import BakeOptions, PassesCommon, PassesTask, PrepareAnswer, PrepareTask
+from ..blender.tasks import (
+    BakeCommon,
+    BakeOptions,
+    BakeTask,
+    InspectAnswer,
+    InspectTask,
+    PassesCommon,
+    PassesTask,
+    PendingBakes,
+    PrepareAnswer,
+    PrepareTask,
+)
 from ..core.cameras import depth_range, make_cameras
 from ..core.console import Console
 from ..core.errors import UserError
@@ -28,13 +39,16 @@ from ..core.scene_records import Conversion, RasterChoice, SceneSummary
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest, file_sha256
 from ..effects.store import keep_plan
+from ..workers.answers import answers, warn_of_retries
+from ..workers.processes import Retry
 from ..workers.view_tasks import warn_of_repairs, worker_count
-from .baking import FOLDER, bake
-from .opening import open_scene
 from .stage import Outcome, Run
 
+Answer = TypeVar("Answer", PrepareAnswer, InspectAnswer)
 MAX_BAKE_ROUNDS = 4
 """Values whose need shows only after others are baked take further rounds; two are the rule."""
+BAKES = "bakes"
+"""Of a workspace: baked values by content hash. They outlive ``--force`` and changes elsewhere in the file."""
 PASSES_VERSION = 1
 # Evaluation needs G-buffers of test views only; their rasterised colour would never be read.
 RASTERISED = ("train", "val")
@@ -176,7 +190,7 @@ def _run_conversion(run: Run, source: Path, folder: Path) -> None:
     workspace, settings = run.workspace, run.settings
     size, refused = settings.passes.bake_size, list[str]()
     for _ in range(MAX_BAKE_ROUNDS):
-        bakes = BakeOptions(folder=workspace.root / FOLDER, size=size, refused=tuple(refused))
+        bakes = BakeOptions(folder=workspace.root / BAKES, size=size, refused=tuple(refused))
         task = PrepareTask(source=source, scene_dir=folder, strict=settings.strict, bakes=bakes)
         with run.console.bar("scene", 1) as bar:
             answer, first_failure = open_scene("dnrpipe.blender.prepare", task, PrepareAnswer, run.log)
@@ -187,6 +201,67 @@ def _run_conversion(run: Run, source: Path, folder: Path) -> None:
             return
         refused += bake(run, source, folder / "geometry.npz", answer.bakes)
     raise RuntimeError(f"{source}: the same textures are to be baked again and again")
+
+
+def open_scene(module: str, task: PrepareTask | InspectTask, answer: type[Answer], log: Path) -> tuple[Answer, str]:
+    """Run the task on a worker of ``module``: (its answer, why the first try failed or "").
+
+    Raises UserError: both tries failed; says whether Blender itself died of the file. Raises OSError: a full disk.
+    """
+    failed: list[Retry] = []
+    for outcome in answers(module, {}, [task.data()], workers=1, log=log, retried=failed.append):
+        if outcome.died:
+            raise UserError(f"{task.source}: Blender could not open it ({outcome.error}): damaged or truncated?")
+        if outcome.result is None:
+            raise UserError(str(outcome.error))
+        return answer.model_validate(outcome.result), failed[0].reason if failed else ""
+    raise AssertionError("run_tasks answers every task")
+
+
+def bake(run: Run, source: Path, geometry: Path, pending: PendingBakes) -> list[str]:
+    """Bake in worker processes; returns the keys of values that could not be baked.
+
+    Every value appears on disk whole: after Ctrl-C only what is missing is baked again.
+
+    Args:
+        geometry: ``geometry.npz`` of the conversion that asked for the bakes.
+        pending: what it asked for.
+    """
+    passes, console = run.settings.passes, run.console
+    count = min(worker_count(passes.workers), len(pending.layers))
+    folder = run.workspace.root / BAKES
+    folder.mkdir(parents=True, exist_ok=True)
+    common = BakeCommon(
+        source=source,
+        frame=pending.frame,
+        geometry=geometry,
+        folder=folder,
+        size=passes.bake_size,
+        threads=max(1, worker_count(0) // count),
+    )
+    refused: list[str] = []
+    tasks = [BakeTask(layer=layer, output=folder).data() for layer in pending.layers]
+    with console.bar("bakes", len(tasks)) as bar:
+        for outcome in answers(
+            "dnrpipe.blender.baking.bake",
+            common.data(),
+            tasks,
+            workers=count,
+            log=run.log,
+            retried=warn_of_retries("bake", console),
+        ):
+            if outcome.result is None:
+                layer = BakeTask.model_validate(outcome.task).layer
+                names = ", ".join(f"'{entry.material}'" for entry in layer[:5])
+                console.warn(f"could not bake textures of {names}: {outcome.error}; averages stand for them")
+                refused += [tap.key for entry in layer for tap in entry.taps]
+            else:
+                for name, lost in outcome.result["repaired"].items():
+                    console.warn(
+                        f"repaired: {lost} baked texels of '{name}' were not finite; neighbours stand for them"
+                    )
+            bar.advance()
+    return refused
 
 
 def _refuse_if_strict(source: Path, scene_dir: Path, settings: Settings) -> None:

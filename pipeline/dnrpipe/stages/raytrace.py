@@ -11,7 +11,7 @@ from dnrtrain.exr import read_metadata
 
 from ..core.scene_files import read_selection, scene_fingerprint, split_views
 from ..core.settings import Settings
-from ..core.workspace import Raytraced, Workspace, digest
+from ..core.workspace import RaytraceDetail, Workspace, digest
 from ..effects.plan import EffectPlan
 from ..effects.store import lenses, plan_of, trace_config, variant_for
 from ..raytrace.sample_schedule import Goal
@@ -37,7 +37,7 @@ def raytrace_selected(run: Run) -> Outcome:
     if goal_of(settings, "train") is not None:
         made.append(spp)  # with a time, how many samples were taken is not known before
     traced = settings.raytrace.spp if goal_of(settings, "train") is None else spp
-    return Outcome(digest(made), Raytraced(views=[view.name for view in selected], spp=traced).model_dump())
+    return Outcome(digest(made), RaytraceDetail(views=[view.name for view in selected], spp=traced).model_dump())
 
 
 def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
@@ -61,7 +61,7 @@ def trace_views(run: Run, views: list[View], split: str, *, spp: int | None = No
 
     spp: samples per pixel instead of the settings', where these name no noise or time for the split (`goal_of`).
     """
-    settings, console = run.settings, run.console
+    settings = run.settings
     plan = resolve_plan(run)
     goal = goal_of(settings, split)
     tasks = _tasks(run.workspace, settings, plan, views, split, spp)
@@ -69,33 +69,18 @@ def trace_views(run: Run, views: list[View], split: str, *, spp: int | None = No
         return tasks
     choice = variant_for(plan, settings)
     config = trace_config(run.workspace, plan, choice.variant)
-    console.say(f"ray tracing with Mitsuba {choice.variant}, {plan.integrator}, depth {plan.max_depth}")
+    run.console.say(f"ray tracing with Mitsuba {choice.variant}, {plan.integrator}, depth {plan.max_depth}")
     workers = 1 if choice.variant.startswith("cuda") else worker_count(settings.raytrace.workers)
     book = run.book_views(f"mitsuba {choice.variant}")
     label = "ray tracing" if split == "train" else "ray tracing test views"
     common = {"bundle": config["bundle"], "variant": choice.variant, "threads": 1}
     if goal is None:
-        run.view_tasks(
-            label,
-            "dnrpipe.raytrace.tracer",
-            common,
-            tasks,
-            workers=workers,
-            book=book,
-            environment=choice.environment,
-        )
+        module = "dnrpipe.raytrace.tracer"
+        run.view_tasks(label, module, common, tasks, workers=workers, book=book, environment=choice.environment)
     else:
-        sample_adaptively(
-            run,
-            label,
-            common,
-            tasks,
-            goal,
-            workers=workers,
-            book=book,
-            environment=choice.environment,
-        )
-    warn_of_repairs(tasks, console)
+        environment = choice.environment
+        sample_adaptively(run, label, common, tasks, goal, workers=workers, book=book, environment=environment)
+    warn_of_repairs(tasks, run.console)
     return tasks
 
 

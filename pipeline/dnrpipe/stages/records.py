@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from dnrtrain.records import Record
 
@@ -16,7 +16,7 @@ METRICS = "metrics.json"
 PREVIEW = "preview.json"
 
 
-class ViewMetrics(Record):
+class ViewMetrics(Record, allow_inf_nan=False):
     """One held-out view; None where a figure could not be computed.
 
     Args:
@@ -28,8 +28,6 @@ class ViewMetrics(Record):
         seconds_neural: of the network alone.
         spp: samples per pixel of the reference.
     """
-
-    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
     name: str = Field(pattern=r"^[A-Za-z0-9_.-]+$")
     psnr: float | None = None
@@ -48,7 +46,7 @@ class ViewMetrics(Record):
     spp: int | None = None
 
 
-class Metrics(Record):
+class Metrics(Record, allow_inf_nan=False):
     """The evaluation.
 
     Args:
@@ -61,8 +59,6 @@ class Metrics(Record):
         neural_ms: median of the network's milliseconds.
     """
 
-    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
-
     views: list[ViewMetrics] = Field(min_length=1)
     mean: dict[str, float | None] = Field(default_factory=dict)
     perceptual: bool = True
@@ -72,7 +68,7 @@ class Metrics(Record):
     neural_ms: float | None = None
 
 
-class PreviewState(Record):
+class PreviewState(Record, allow_inf_nan=False):
     """The picture of a fine-tuning under way.
 
     Args:
@@ -83,8 +79,6 @@ class PreviewState(Record):
         truth: whether there is a reference.
         time: unix seconds.
     """
-
-    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
     split: Literal["test", "train"]
     view: str

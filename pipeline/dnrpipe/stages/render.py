@@ -27,14 +27,7 @@ from .trainer import torch_device
 FPS = 24
 
 
-def render_novel(
-    run: Run,
-    views: Sequence[View],
-    *,
-    name: str,
-    frames: str,
-    movie: str,
-) -> dict[str, Any]:
+def render_novel(run: Run, views: Sequence[View], *, name: str, frames: str, movie: str) -> dict[str, Any]:
     """Render the views into ``renders/<name>/``.
 
     G-buffers and frames that are there are kept when the cameras and the model are the same; a changed model redoes
@@ -92,27 +85,18 @@ def render_novel(
             if frames in ("exr", "both"):
                 radiance = render_radiance(model, data)
                 write_frame_exr(folder / f"frame_{view.name}.exr", picture, radiance, data, view)
-            run.book(
-                "inference",
-                "view",
-                f"neural/{view.name}",
-                seconds[-1],
-                device=device,
-                width=view.width,
-                height=view.height,
-            )
+            size = {"width": view.width, "height": view.height}
+            run.book("inference", "view", f"neural/{view.name}", seconds[-1], device=device, **size)
             bar.advance()
-    result: dict[str, Any] = {
+    target = None if movie == "none" else folder / f"{name}.{movie}"
+    if target is not None:
+        (write_mp4 if movie == "mp4" else write_webp)(target, pictures)
+    return {
         "folder": str(folder),
         "frames": len(views),
         "neural_ms": 1000 * float(np.median(seconds)),
-        "movie": None,
+        "movie": target and str(target),
     }
-    if movie != "none":
-        target = folder / f"{name}.{movie}"
-        (write_mp4 if movie == "mp4" else write_webp)(target, pictures)
-        result["movie"] = str(target)
-    return result
 
 
 def write_frame_exr(path: Path, picture: np.ndarray, radiance: Any, data: Any, view: View) -> None:
@@ -123,7 +107,7 @@ def write_frame_exr(path: Path, picture: np.ndarray, radiance: Any, data: Any, v
     """
     from dnrtrain.exr import write_exr
 
-    alpha = data.coverage[0, 0].cpu().numpy()
+    alpha = data.tensors.coverage[0, 0].cpu().numpy()
     if radiance is not None:
         linear = radiance[0].float().permute(1, 2, 0).cpu().numpy()
     else:
@@ -169,7 +153,9 @@ def _inputs(run: Run, views: Sequence[View], frames: Path) -> list[Path]:
     """Files with what the network sees of each view. Base images that are rendered bring the G-buffer along."""
     rendered = run.settings.model.base in RENDERED
     paths = [frames / ("base" if rendered else "gbuffers") / f"{view.name}.exr" for view in views]
-    _drop_other_views(paths)
+    folder = paths[0].parent
+    if {path.name for path in folder.glob("[!.]*.exr")} - {path.name for path in paths}:  # of other views
+        shutil.rmtree(folder)
     if rendered:
         base_views(run, views, "novel", paths=paths)
     else:
@@ -179,11 +165,3 @@ def _inputs(run: Run, views: Sequence[View], frames: Path) -> list[Path]:
         engine = prepared.raster_engine if raster else "cycles-direct"
         draw_passes(run, "G-buffers", views, paths, engine, raster=[raster] * len(views))
     return paths
-
-
-def _drop_other_views(paths: Sequence[Path]) -> None:
-    folder = paths[0].parent
-    if folder.exists():
-        wanted = {path.name for path in paths}
-        if any(path.name not in wanted for path in folder.glob("[!.]*.exr")):
-            shutil.rmtree(folder)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import shutil
 import time
 from typing import TYPE_CHECKING
@@ -13,7 +12,7 @@ from dnrtrain.records import Selection, write
 from dnrtrain.selector.policies import untrained
 from dnrtrain.selector.protocol import Candidates
 
-from ..core.console import Bar, Console
+from ..core.console import Console
 from ..core.errors import UserError
 from ..core.scene_files import split_views
 from ..core.settings import Settings
@@ -85,19 +84,17 @@ def _choose_by(rule: Policy, run: Run, views: list[View]) -> Choice:
     clock, cpu = time.monotonic(), time.process_time()
     candidates = Candidates.of_views(views, look(run.workspace, run.console, views) if rule.needs_visibility else None)
     with run.console.bar(f"choosing by {select.policy}", len(views) * rule.effort) as bar:
-        tick = functools.partial(_advance, bar)
+
+        def tick(weighed: int) -> None:
+            bar.advance(min(weighed, bar.total - bar.done))  # a policy's effort is an estimate
+
         choice = rule.choose(candidates, select.budget, select.seed, tick)
         tick(bar.total)
     _book(run, time.monotonic() - clock, time.process_time() - cpu)
     return choice
 
 
-def _advance(bar: Bar, weighed: int) -> None:
-    bar.advance(min(weighed, bar.total - bar.done))  # a policy's effort is an estimate
-
-
 def _book(run: Run, seconds: float, cpu_seconds: float) -> None:
-    """Book what choosing took."""
     run.book("training", "scene", "selection", seconds, cpu_seconds=cpu_seconds, device="cpu")
 
 

@@ -7,16 +7,19 @@ import shutil
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from ..core.cameras import KEYWORDS, read_camera_file
+from ..core.console import Console
 from ..core.errors import UserError
 from ..core.ledger import StageName
+from ..core.scene_files import split_views
+from ..core.settings import Settings, merge, parse_assignment, resolve
+from ..core.workspace import DamagedManifest, Manifest, Source, Workspace, file_sha256, find_workspace, locked
+from .inspect_scene import require_file
+from .pipeline import STAGES, require_inputs, run_stage
+from .select import check_budget
 from .stage import Run
-
-if TYPE_CHECKING:
-    from ..core.console import Console
-    from ..core.settings import Settings
-    from ..core.workspace import Manifest, Source, Workspace
 
 
 class Session:
@@ -45,18 +48,16 @@ class Session:
             raise
 
     def _open(self) -> Session:
-        from ..core.console import Console
-        from ..core.settings import merge, parse_assignment
-        from ..core.workspace import Workspace, find_workspace, locked
-
-        self.console: Console = Console(json_mode=self.options["as_json"], quiet=self.options["quiet"])
+        self.console = Console(json_mode=self.options["as_json"], quiet=self.options["quiet"])
         overrides = self.overrides
         for text in self.options["assignments"]:
             overrides = merge(overrides, parse_assignment(text))
         preset = self.options["preset"]
         if self.scene is not None:
-            source = _source(self.scene)
-            root = _root_for(self.scene, self.options["workspace"])
+            require_file(self.scene)
+            source = Source(path=str(self.scene.resolve()), sha256=file_sha256(self.scene))
+            named = self.options["workspace"] or os.environ.get("DNRPIPE_WORKSPACE")
+            root = Path(named or f"{self.scene.stem}.dnr")
             # Bad settings are refused before a folder is made.
             stored = _stored(root, source, named=self.options["workspace"] is not None)
             planned = resolve_layers(root, preset or (stored.manifest.preset if stored else None), stored, overrides)
@@ -64,14 +65,14 @@ class Session:
             self.fresh = stored is None and not root.exists()
             self.stack.enter_context(locked(root, self.command))
             self.before = stored.manifest if stored else None
-            self.workspace: Workspace = Workspace.create(root, source)
+            self.workspace = Workspace.create(root, source)
         else:
             root = find_workspace(self.options["workspace"])
             Workspace.open(root)
             self.stack.enter_context(locked(root, self.command))
             self.workspace = Workspace.open(root)
             self.before = self.workspace.manifest.model_copy(deep=True)
-        self.settings: Settings = resolve_settings(self.workspace, overrides, preset)
+        self.settings = resolve_settings(self.workspace, overrides, preset)
         if self.late is not None:
             overrides = merge(overrides, self.late(self.settings))
             self.settings = resolve_settings(self.workspace, overrides, preset)
@@ -91,9 +92,6 @@ class Session:
 
     def stages(self, *names: StageName) -> None:
         """Run stages in order; flags are remembered once the first one's inputs are known to be there."""
-        from ..core.scene_files import has_test_views
-        from .pipeline import STAGES, require_inputs, run_stage
-
         require_inputs(STAGES[names[0]], self.workspace, self.settings)
         self.workspace.manifest.settings = self.settings.model_dump(mode="json")
         self.workspace.save()
@@ -101,7 +99,7 @@ class Session:
             size = f"{self.settings.cameras.width}x{self.settings.cameras.height}"
             self.console.say(f"workspace {self.workspace.root}, preset {self.settings.preset} ({size})")
         for name in names:
-            if name == "evaluate" and self.command == "run" and not has_test_views(self.workspace):
+            if name == "evaluate" and self.command == "run" and not split_views(self.workspace).get("test"):
                 self.console.warn("no test views: nothing is evaluated; prepare with cameras.test > 0")
                 continue
             try:
@@ -115,8 +113,6 @@ class Session:
 
     def adopt(self, overrides: dict[str, Any]) -> None:
         """Settings found by the command itself, remembered as flags are."""
-        from ..core.settings import merge
-
         manifest = self.workspace.manifest
         manifest.overrides = merge(manifest.overrides, overrides)
         self.settings = resolve_settings(self.workspace, {}, manifest.preset)
@@ -131,9 +127,6 @@ class Session:
 
     def _check(self, settings: Settings, workspace: Workspace | None) -> None:
         """Refuse bad camera files and a budget above the candidates before any work is done or folder made."""
-        from ..core.cameras import KEYWORDS, read_camera_file
-        from .select import check_budget
-
         prepared = workspace.manifest.prepared if workspace else None
         if settings.cameras.source not in KEYWORDS and (self.command == "prepare" or self.scene is not None):
             read_camera_file(Path(settings.cameras.source), settings.cameras)
@@ -148,8 +141,6 @@ def _stored(root: Path, source: Source, *, named: bool) -> Workspace | None:
 
     Raises UserError: it belongs to another scene of the same name and was not named with -w.
     """
-    from ..core.workspace import DamagedManifest, Workspace
-
     path = root / "manifest.json"
     if not path.exists():
         return None
@@ -170,23 +161,6 @@ def resolve_settings(workspace: Workspace, overrides: dict[str, Any], preset: st
 
 def resolve_layers(root: Path, preset: str | None, stored: Workspace | None, overrides: dict[str, Any]) -> Settings:
     """preset < ./dnrpipe.toml < workspace's dnrpipe.toml < environment < flags given before < flags."""
-    from ..core.settings import merge, resolve
-
     files = [path for path in (Path("dnrpipe.toml"), root / "dnrpipe.toml") if path.is_file()]
     flags = merge(stored.manifest.overrides if stored else {}, overrides)
     return resolve(preset, flags, toml_files=files)
-
-
-def _source(scene: Path) -> Source:
-    from ..core.workspace import Source, file_sha256
-
-    if scene.is_dir():
-        raise UserError(f"{scene}: is a folder; name the scene file in it")
-    if not scene.exists():
-        raise UserError(f"{scene}: no such file")
-    return Source(path=str(scene.resolve()), sha256=file_sha256(scene))
-
-
-def _root_for(scene: Path, explicit: str | None) -> Path:
-    named = explicit or os.environ.get("DNRPIPE_WORKSPACE")
-    return Path(named) if named else Path(f"{scene.stem}.dnr")

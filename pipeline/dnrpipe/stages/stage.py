@@ -16,7 +16,8 @@ from ..core.settings import Settings
 from ..core.workspace import Workspace
 from ..effects.plan import EffectPlan
 from ..effects.store import plan_of
-from ..workers.view_tasks import Book, run_view_tasks, task_name
+from ..workers.answers import answers
+from ..workers.view_tasks import Book, Failures, is_made, task_name
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class Run:
         )
 
     def book_views(self, device: str, *, folder: str | None = None, purpose: Purpose | None = None) -> Book:
-        """What `run_view_tasks` books each view by.
+        """What `view_tasks` books each view by.
 
         Args:
             device: as the ledger names it.
@@ -113,18 +114,29 @@ class Run:
         book: Book,
         environment: dict[str, str] | None = None,
     ) -> None:
-        """`run_view_tasks` with the run's console and log."""
-        run_view_tasks(
-            label,
-            module,
-            common,
-            tasks,
-            console=self.console,
-            log=self.log,
-            workers=workers,
-            book=book,
-            environment=environment,
+        """Run the tasks whose files are missing or out of date.
+
+        Args:
+            label: what the progress bar and warnings call them.
+            module, common, environment: of `processes.run_tasks`.
+            workers: processes at most.
+
+        Raises TasksFailed after all other tasks are done when some failed twice. Raises OSError: the disk is full.
+        """
+        due = [task for task in tasks if not is_made(task)]
+        if not due:
+            return
+        count = max(1, min(workers, len(due)))
+        failures = Failures(label, self.console, self.log)
+        outcomes = answers(
+            module, common, due, workers=count, log=self.log, retried=failures.retried, environment=environment
         )
+        with self.console.bar(label, len(tasks), len(tasks) - len(due)) as bar:
+            for outcome in failures.noted(outcomes):
+                if outcome.result is not None:
+                    book(outcome.task, outcome.result, count)
+                bar.advance(note=task_name(outcome.task) if outcome.result is not None else "")
+        failures.report(len(tasks))
 
 
 @dataclass(frozen=True)

@@ -39,11 +39,10 @@ def load(
     """
     from dnrtrain.dataset import load_views
 
-    frame = read_frame(workspace)
     return load_views(
         [workspace.passes(split, view.name) for view in views],
         [workspace.raytraced(split, view.name) for view in views] if raytraced else None,
-        frame,
+        read_frame(workspace),
         cameras=views,
         folder=workspace.scene,
         target=split != "test" or raytraced,
@@ -95,15 +94,8 @@ def follow(run: Run, events: Iterator[Event], epochs: int) -> Iterator[Event]:
             if isinstance(event, EpochEnd):
                 _book_epoch(run, event, f"epoch {event.epoch}")
                 _show_epoch(event, bar)
-                console.events.send(
-                    "epoch",
-                    stage=run.stage,
-                    epoch=event.epoch,
-                    epochs=event.epochs,
-                    losses=event.losses,
-                    val=event.val,
-                    seconds=event.seconds,
-                )
+                facts = {name: getattr(event, name) for name in ("epoch", "epochs", "losses", "val", "seconds")}
+                console.events.send("epoch", stage=run.stage, **facts)
                 if event.skipped:
                     console.warn(f"epoch {event.epoch}: skipped {event.skipped} non-finite steps")
             elif isinstance(event, Diverged):
@@ -115,23 +107,15 @@ def follow(run: Run, events: Iterator[Event], epochs: int) -> Iterator[Event]:
 
 
 def _book_epoch(run: Run, event: EpochEnd | Diverged, name: str) -> None:
-    run.book(
-        "training",
-        "epoch",
-        name,
-        event.seconds,
-        cpu_seconds=event.cpu_seconds,
-        device=event.device,
-        steps=event.steps,
-    )
+    facts = {field: getattr(event, field) for field in ("cpu_seconds", "device", "steps")}
+    run.book("training", "epoch", name, event.seconds, **facts)
 
 
 def _show_epoch(event: EpochEnd, bar: Bar) -> None:
     behind = event.epoch - bar.done - 1  # epochs that an earlier run did
     if behind > 0:
         bar.advance(behind)
-    total = event.losses.get("total", sum(event.losses.values()))
-    note = f"loss {total:.4f}"
+    note = f"loss {event.losses.get('total', sum(event.losses.values())):.4f}"
     if "psnr" in event.val:
         note += f", val {event.val['psnr']:.2f} dB"
     bar.advance(note=note)

@@ -9,15 +9,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from dnrtrain.contract import SPLITS, ContractError, DamagedFile
+import numpy as np
+
+from dnrtrain.contract import NPZ_ERRORS, SPLITS, ContractError, DamagedFile, read_cameras
+from dnrtrain.exr import read_exr
 
 from ..core.console import Console
 from ..core.errors import UserError
-from ..core.scene_records import Conversion
+from ..core.scene_files import read_conversion, read_frame, read_json, read_selection
 from ..core.workspace import Workspace, file_sha256
-from .pipeline import discard, owner_of
+from .pipeline import STAGES, discard, owner_of
 
 
 @dataclass(frozen=True)
@@ -45,14 +47,18 @@ def examine(workspace: Workspace, console: Console) -> tuple[int, list[Fault]]:
             except DamagedFile as damage:
                 if damage.path != path:  # a file that this one refers to; it has its own check
                     continue
-                owner = owner_of(path, workspace)
-                faults.append(Fault(path, f"damaged ({damage.reason})", owner.command if owner else None))
+                faults.append(_fault(workspace, path, f"damaged ({damage.reason})"))
             except (ContractError, UserError, OSError) as error:
-                text = str(error).removeprefix(f"{path}: ")
-                owner = owner_of(path, workspace)
-                faults.append(Fault(path, text, owner.command if owner else None))
-    faults += [Fault(path, "left behind by a run that was killed", None, True) for path in _leftovers(workspace.root)]
+                faults.append(_fault(workspace, path, str(error).removeprefix(f"{path}: ")))
+    # Temporary names of `dnrtrain.atomic.atomic_path` whose process has gone.
+    leftovers = sorted(path for path in workspace.root.rglob(".*.tmp*") if path.is_file())
+    faults += [Fault(path, "left behind by a run that was killed", None, True) for path in leftovers]
     return len(work), faults
+
+
+def _fault(workspace: Workspace, path: Path, reason: str) -> Fault:
+    owner = owner_of(path, workspace)
+    return Fault(path, reason, owner.command if owner else None)
 
 
 def repair(workspace: Workspace, faults: list[Fault]) -> list[str]:
@@ -60,8 +66,6 @@ def repair(workspace: Workspace, faults: list[Fault]) -> list[str]:
 
     Files of no stage stay, but for leftovers: what they are is for their owner to say.
     """
-    from .pipeline import STAGES
-
     due = set()
     for fault in faults:
         owner = owner_of(fault.path, workspace)
@@ -76,18 +80,18 @@ def repair(workspace: Workspace, faults: list[Fault]) -> list[str]:
 def _checks(workspace: Workspace) -> Iterator[tuple[Path, Callable[[Path], object]]]:
     """Each file that is there, with the function that raises when something is wrong with it."""
     root = workspace.root
-    yield from ((path, _cameras) for path in map(workspace.cameras, SPLITS) if path.exists())
+    yield from ((path, read_cameras) for path in map(workspace.cameras, SPLITS) if path.exists())
     yield from _scene(workspace)
     for folder in ("passes", "raytraced", "base", "renders"):
-        yield from ((path, _exr) for path in sorted((root / folder).rglob("[!.]*.exr")))
+        yield from ((path, read_exr) for path in sorted((root / folder).rglob("[!.]*.exr")))
     if workspace.selection.exists():
-        yield workspace.selection, lambda _: _selection(workspace)
+        yield workspace.selection, lambda _: read_selection(workspace)
     for step in ("step1", "step2"):
         folder = workspace.checkpoints(step)
         yield from ((path, _weights) for path in sorted(folder.glob("[!.]*.safetensors")))
-        yield from ((path, _json) for path in sorted(folder.glob("[!.]*.json")))
+        yield from ((path, read_json) for path in sorted(folder.glob("[!.]*.json")))
     for folder in ("evaluation", "renders"):
-        yield from ((path, _json) for path in sorted((root / folder).rglob("[!.]*.json")))
+        yield from ((path, read_json) for path in sorted((root / folder).rglob("[!.]*.json")))
         yield from ((path, _picture) for path in sorted((root / folder).rglob("[!.]*.png")))
     light = root / "base" / "light.npz"
     if light.exists():
@@ -97,14 +101,12 @@ def _checks(workspace: Workspace) -> Iterator[tuple[Path, Callable[[Path], objec
 
 
 def _scene(workspace: Workspace) -> Iterator[tuple[Path, Callable[[Path], object]]]:
-    marker = workspace.scene / "prepared.json"
     if not workspace.scene.exists():
         return
-    yield marker, lambda _: _conversion(workspace)
-    frame = workspace.scene / "frame.json"
-    yield frame, lambda _: _frame(workspace)
+    yield workspace.scene / "prepared.json", lambda _: read_conversion(workspace.scene)
+    yield workspace.scene / "frame.json", lambda _: read_frame(workspace)
     try:
-        files = _conversion(workspace).files
+        files = read_conversion(workspace.scene).files
     except (UserError, DamagedFile):
         return  # said by the check of the marker itself
     for name, wanted in files.items():
@@ -113,23 +115,11 @@ def _scene(workspace: Workspace) -> Iterator[tuple[Path, Callable[[Path], object
             yield path, lambda path, wanted=wanted: _same(path, wanted)
 
 
-def _same(path: Path, wanted: Any) -> None:
+def _same(path: Path, wanted: str) -> None:
     if not path.is_file():
         raise DamagedFile(path, "is gone")
     if file_sha256(path) != wanted:
         raise DamagedFile(path, "is not what was written")
-
-
-def _cameras(path: Path) -> None:
-    from dnrtrain.contract import read_cameras
-
-    read_cameras(path)
-
-
-def _exr(path: Path) -> None:
-    from dnrtrain.exr import read_exr
-
-    read_exr(path)
 
 
 def _weights(path: Path) -> None:
@@ -138,30 +128,6 @@ def _weights(path: Path) -> None:
     load(path)
     if path.name == "model.safetensors" and read_record(path.parent) is None:
         raise DamagedFile(path, "model.json is missing, damaged or of other weights")
-
-
-def _json(path: Path) -> None:
-    from ..core.scene_files import read_json
-
-    read_json(path)
-
-
-def _conversion(workspace: Workspace) -> Conversion:
-    from ..core.scene_files import read_conversion
-
-    return read_conversion(workspace.scene)
-
-
-def _frame(workspace: Workspace) -> None:
-    from ..core.scene_files import read_frame
-
-    read_frame(workspace)
-
-
-def _selection(workspace: Workspace) -> None:
-    from ..core.scene_files import read_selection
-
-    read_selection(workspace)
 
 
 def _picture(path: Path) -> None:
@@ -175,10 +141,6 @@ def _picture(path: Path) -> None:
 
 
 def _archive(path: Path) -> None:
-    import numpy as np
-
-    from dnrtrain.contract import NPZ_ERRORS
-
     try:
         with np.load(path, allow_pickle=False) as data:
             for name in data.files:
@@ -191,8 +153,3 @@ def _ledger(workspace: Workspace, path: Path) -> None:
     truncated = workspace.ledger.truncated_records()
     if truncated:
         raise DamagedFile(path, f"{truncated} lines do not read and are left out of all sums")
-
-
-def _leftovers(root: Path) -> list[Path]:
-    """Temporary names of `dnrtrain.atomic.atomic_path` whose process has gone."""
-    return sorted(path for path in root.rglob(".*.tmp*") if path.is_file())

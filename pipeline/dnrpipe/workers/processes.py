@@ -52,11 +52,6 @@ class TaskResult:
 
 
 @dataclass
-class _Slot:
-    process: subprocess.Popen[str] | None = None
-
-
-@dataclass
 class Retry:
     """A worker died or a task failed; the task is tried again."""
 
@@ -93,36 +88,37 @@ def run_tasks(
         pending.put((task, 1))
     outcomes: queue.SimpleQueue[TaskResult | Retry] = queue.SimpleQueue()
     stopping = threading.Event()
-    open_tasks = _Counter(len(tasks))
-    slots = [_Slot() for _ in range(max(1, min(workers, len(tasks))))]
+    open_tasks = len(tasks)  # not answered for yet: written by the consumer alone, read by the workers' threads
+    processes: list[subprocess.Popen[str] | None] = [None] * max(1, min(workers, len(tasks)))
     log.parent.mkdir(parents=True, exist_ok=True)
     # Workers end without Blender's own clean-up (see _worker_main); what it leaves in the temporary folder goes here.
     temp_dir = tempfile.TemporaryDirectory(prefix="dnrpipe-workers-", ignore_cleanup_errors=True)
     worker_environment = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), temp_dir.name) | (environment or {})
 
-    def serve(slot: _Slot) -> None:
+    def serve(slot: int) -> None:
         # The thread lives as long as its worker: PR_SET_PDEATHSIG follows the spawning thread.
         try:
-            while not stopping.is_set() and open_tasks.value > 0:
+            while not stopping.is_set() and open_tasks > 0:
                 try:
                     task, attempt = pending.get(timeout=0.05)
                 except queue.Empty:
                     continue
                 started = time.monotonic()
                 try:
-                    if slot.process is None or slot.process.poll() is not None:
-                        slot.process = _spawn(module, common, log, worker_environment)
-                    answer = _ask(slot.process, task, task_timeout.limit(attempt), task_timeout.reason())
+                    process = processes[slot]
+                    if process is None or process.poll() is not None:
+                        process = processes[slot] = _spawn(module, common, log, worker_environment)
+                    answer = _ask(process, task, task_timeout.limit(attempt), task_timeout.reason())
                 except (WorkerDied, OSError, ValueError) as death:  # also: cannot be started, truncated answer
-                    _kill(slot.process)
-                    slot.process = None
+                    _kill(processes[slot])
+                    processes[slot] = None
                     answer = {"error": " ".join(str(death).split()), "retry": True, "died": True}
                 if stopping.is_set():
                     return
                 seconds = time.monotonic() - started
                 if answer.get("retry"):  # on a fresh worker: this one may be short of memory, or half broken
-                    _close(slot.process, force=True)
-                    slot.process = None
+                    _close(processes[slot], force=True)
+                    processes[slot] = None
                 if "error" not in answer:
                     task_timeout.took(seconds)
                     outcomes.put(TaskResult(task, answer["result"], None, attempt, seconds))
@@ -133,25 +129,25 @@ def run_tasks(
                     died, number = answer.get("died", False), answer.get("errno")
                     outcomes.put(TaskResult(task, None, answer["error"], attempt, seconds, died, number))
         finally:
-            _close(slot.process, force=stopping.is_set())
+            _close(processes[slot], force=stopping.is_set())
 
-    threads = [threading.Thread(target=serve, args=(slot,), daemon=True) for slot in slots]
+    threads = [threading.Thread(target=serve, args=(slot,), daemon=True) for slot in range(len(processes))]
     for thread in threads:
         thread.start()
     try:
-        while open_tasks.value > 0:
+        while open_tasks > 0:
             outcome = outcomes.get()
             if isinstance(outcome, TaskResult):
                 more = next_tasks(outcome) if next_tasks is not None else ()
                 for task in more:
                     pending.put((task, 1))
-                open_tasks.value += len(more) - 1
+                open_tasks += len(more) - 1
             yield outcome
     finally:
-        stopping.set() if open_tasks.value > 0 else None
-        if stopping.is_set():
-            for slot in slots:
-                _kill(slot.process)
+        if open_tasks > 0:
+            stopping.set()
+            for process in processes:
+                _kill(process)
         for thread in threads:
             thread.join(timeout=10)
         temp_dir.cleanup()
@@ -175,15 +171,15 @@ class LocalWorker:
 
     def __init__(self, module: str, common: dict[str, Any], log: Path, environment: dict[str, str]) -> None:
         self.module, self.common, self.log, self.environment = module, common, log, environment
-        self._slot = _Slot()
+        self._process: subprocess.Popen[str] | None = None
 
     def ask(self, task: dict[str, Any], timeout: float) -> dict[str, Any]:
         """The worker's answer; it is started where there is none. Raises WorkerDied, TaskFailed."""
-        if self._slot.process is None or self._slot.process.poll() is not None:
+        if self._process is None or self._process.poll() is not None:
             self.log.parent.mkdir(parents=True, exist_ok=True)
-            self._slot.process = _spawn(self.module, self.common, self.log, self.environment)
+            self._process = _spawn(self.module, self.common, self.log, self.environment)
         try:
-            answer = _ask(self._slot.process, task, timeout)
+            answer = _ask(self._process, task, timeout)
         except WorkerDied:
             self.close()
             raise
@@ -193,15 +189,8 @@ class LocalWorker:
 
     def close(self) -> None:
         """End the process."""
-        _close(self._slot.process, force=True)
-        self._slot.process = None
-
-
-@dataclass
-class _Counter:
-    """Tasks not answered for yet. Written by the consumer of the answers alone, read by the workers' threads."""
-
-    value: int
+        _close(self._process, force=True)
+        self._process = None
 
 
 def _spawn(module: str, common: dict[str, Any], log: Path, environment: dict[str, str]) -> subprocess.Popen[str]:

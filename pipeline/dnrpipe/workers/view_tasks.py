@@ -1,4 +1,4 @@
-"""Tasks that write one file each: skip what is made, tell of progress, book what was done, report failures."""
+"""Tasks that write one file each: what they are called, whether they are made, what failed, what was repaired."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 from dnrtrain.exr import read_metadata
 
 from ..core.console import Console
-from .answers import answers
 from .processes import Retry, TaskResult
 
 Book = Callable[[dict[str, Any], dict[str, Any], int], None]
@@ -30,42 +29,6 @@ def is_made(task: dict[str, Any]) -> bool:
     """True when the task's file is there and was made from the same inputs."""
     metadata = read_metadata(Path(task["output"]))
     return metadata is not None and metadata.get("fingerprint") == task["fingerprint"]
-
-
-def run_view_tasks(
-    label: str,
-    module: str,
-    common: dict[str, Any],
-    tasks: Sequence[dict[str, Any]],
-    *,
-    console: Console,
-    log: Path,
-    workers: int,
-    book: Book,
-    environment: dict[str, str] | None = None,
-) -> None:
-    """Run the tasks whose files are missing or out of date.
-
-    Args:
-        label: what the progress bar and warnings call them.
-        module, common, environment: of `processes.run_tasks`.
-        workers: processes at most.
-
-    Raises TasksFailed after all other tasks are done when some failed twice. Raises OSError: the disk is full.
-    """
-    due = [task for task in tasks if not is_made(task)]
-    if not due:
-        return
-    count = max(1, min(workers, len(due)))
-    failures = Failures(label, console, log)
-    with console.bar(label, len(tasks), len(tasks) - len(due)) as bar:
-        for outcome in failures.noted(
-            answers(module, common, due, workers=count, log=log, retried=failures.retried, environment=environment)
-        ):
-            if outcome.result is not None:
-                book(outcome.task, outcome.result, count)
-            bar.advance(note=task_name(outcome.task) if outcome.result is not None else "")
-    failures.report(len(tasks))
 
 
 class Failures:

@@ -83,13 +83,15 @@ def measure(
     from dnrtrain.metrics import image_metrics
     from dnrtrain.perceptual import build_lpips
 
-    target = views.target
+    target = views.tensors.target
     assert target is not None  # loaded with ray-traced targets
     lpips = build_lpips(weights) if weights is not None else None
     rows = []
     for index, name in enumerate(views.names):
         one = slice(index, index + 1)
-        row: dict[str, Any] = dict(image_metrics(pictures[one], target[one].cpu(), views.mask[one].cpu(), lpips))
+        row: dict[str, Any] = dict(
+            image_metrics(pictures[one], target[one].cpu(), views.tensors.mask[one].cpu(), lpips)
+        )
         noise = (read_metadata(workspace.raytraced("test", name)) or {}).get("noise_rmse")
         row["flip"] = flip_error(_image(target[index]), _image(pictures[index]))[0]
         row["ceiling"] = -20 * math.log10(noise) if noise else None

@@ -16,7 +16,7 @@ from dnrtrain.dataset import ViewSet
 from dnrtrain.model import DNR
 from dnrtrain.selector.explain import explained
 from dnrtrain.selector.greedy import lazy_greedy
-from dnrtrain.selector.kmedoids import KMedoidsPolicy
+from dnrtrain.selector.medoids import KMedoidsPolicy
 from dnrtrain.selector.pool import canonical_order, complete_useful
 from dnrtrain.selector.protocol import Candidates, Choice
 from dnrtrain.selector.visibility import visibility_of
