@@ -10,7 +10,7 @@ from dnrpipe.core.errors import NothingVisible
 
 from .baking.pending import convert_materials, place_atlas
 from .bundle.export import export_bundle
-from .census import take_census, with_findings
+from .census import take_census
 from .findings import Findings
 from .reading.loading import load_scene
 from .reading.missing import note_missing
@@ -41,7 +41,8 @@ def inspect(task: InspectTask) -> InspectAnswer:
     # What would be baked is in the findings; placeholders stand for it in the bundle.
     bakes = BakeOptions(folder=task.folder / "bakes", size=task.bake_size)
     export_bundle(meshes, task.folder, findings, convert_materials(meshes, task.folder, findings, bakes))
-    return InspectAnswer(census=with_findings(census, findings), warnings=loaded.warnings)
+    census = census.model_copy(update={"findings": list(findings)})
+    return InspectAnswer(census=census, warnings=loaded.warnings)
 
 
 def _without_surface(reason: str) -> InspectAnswer:

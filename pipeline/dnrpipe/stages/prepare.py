@@ -11,7 +11,7 @@ from typing import Any
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import SPLITS, View, write_cameras
 
-from ..blender.finding_lines import finding_lines
+from ..blender.findings import finding_lines
 from ..blender.tasks import BakeOptions, PassesCommon, PassesTask, PrepareAnswer, PrepareTask
 from ..core.cameras import depth_range, make_cameras
 from ..core.console import Console

@@ -8,12 +8,10 @@ from dataclasses import dataclass, field
 import bpy
 import numpy as np
 
-from .frozen import UNIT_TEXTURE_SPACE
+from .frozen import UNIT_TEXTURE_SPACE, TextureSpace
 from .named_attributes import named_attributes
 
 UV_STEPS = 2**20  # artist's UVs are rounded to multiples of 1 / UV_STEPS
-
-TextureSpace = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 @dataclass
@@ -34,10 +32,9 @@ class LocalMesh:
     def digest(self) -> bytes:
         """Hash of all content: equal for meshes that evaluate to the same geometry with the same materials."""
         state = hashlib.blake2b(digest_size=16)
-        for array in (self.positions, self.normals, self.material_index, *self.uv_layers.values()):
+        layers = (*self.uv_layers.values(), *self.colors.values())
+        for array in (self.positions, self.normals, self.material_index, *layers):
             state.update(np.ascontiguousarray(array).data)
-        for array in self.colors.values():
-            state.update(array.data)
         names = (self.materials, list(self.uv_layers), self.active_uv, list(self.colors), self.active_color)
         state.update(repr((names, self.texture_space)).encode())
         return state.digest()
@@ -89,6 +86,19 @@ def read_local(obj: bpy.types.Object) -> LocalMesh | None:
         )
     finally:
         obj.to_mesh_clear()
+
+
+def new_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> bpy.types.Mesh:
+    """A Blender mesh of triangles. vertices: float32 [V, 3]; faces: int32 [T, 3]."""
+    data = bpy.data.meshes.new(name)
+    data.vertices.add(len(vertices))
+    data.loops.add(faces.size)
+    data.polygons.add(len(faces))
+    data.vertices.foreach_set("co", np.ascontiguousarray(vertices).ravel())
+    data.loops.foreach_set("vertex_index", np.ascontiguousarray(faces).ravel())
+    data.polygons.foreach_set("loop_start", np.arange(0, faces.size, 3, dtype=np.int32))
+    data.update(calc_edges=True)
+    return data
 
 
 def slot_names(obj: bpy.types.Object) -> list[str | None]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..bundle.ply import weld
 from ..geometry.frozen import ATLAS_LAYER, FrozenMesh
+from ..geometry.local_mesh import new_mesh
 from ..shading.textures import Value
 from .cutouts import (
     CUT_LAYER,
@@ -175,15 +176,7 @@ def _mesh(
         np.concatenate([mesh.normals for mesh in group])[corners],
         None,
     )
-    count = len(welded.faces)
-    data = bpy.data.meshes.new(name)
-    data.vertices.add(len(welded.vertices))
-    data.loops.add(3 * count)
-    data.polygons.add(count)
-    data.vertices.foreach_set("co", np.ascontiguousarray(welded.vertices[:, :3]).ravel())
-    data.loops.foreach_set("vertex_index", welded.faces.ravel())
-    data.polygons.foreach_set("loop_start", np.arange(0, 3 * count, 3, dtype=np.int32))
-    data.update(calc_edges=True)
+    data = new_mesh(name, welded.vertices[:, :3], welded.faces)
     atlas = np.concatenate([mesh.atlas for mesh in group])[corners]
     data.uv_layers.new(name=ATLAS_LAYER).uv.foreach_set("vector", np.ascontiguousarray(atlas).ravel())
     # "Free" custom normals (since 4.5): plain vectors, not the two angles in 16 bits of older files.
