@@ -58,7 +58,9 @@ def add_gbuffer_scene(
         if name:
             _add_copies(scene, obj, group[0].copies, object_id)
     configure_exact(scene)
-    scene[BOUNDS] = _bounding_sphere(meshes)
+    points = np.array([[points.min(0), points.max(0)] for points in (mesh.extent() for mesh in meshes)])
+    low, high = points[:, 0].min(0), points[:, 1].max(0)
+    scene[BOUNDS] = [*((low + high) / 2).tolist(), float(np.linalg.norm(high - low) / 2)]
     layer = scene.view_layers[0]
     if materials:
         scene.cycles.transparent_max_bounces = TRANSPARENT_BOUNCES
@@ -114,13 +116,6 @@ def configure_exact(scene: bpy.types.Scene) -> None:
     scene.view_layers[0].use_pass_combined = True
 
 
-def _bounding_sphere(meshes: Sequence[FrozenMesh]) -> list[float]:
-    extents = [mesh.extent() for mesh in meshes]
-    low = np.min([points.min(0) for points in extents], axis=0)
-    high = np.max([points.max(0) for points in extents], axis=0)
-    return [*((low + high) / 2).tolist(), float(np.linalg.norm(high - low) / 2)]
-
-
 def _add(scene: bpy.types.Scene, data: bpy.types.Mesh, object_id: int) -> bpy.types.Object:
     obj = bpy.data.objects.new(data.name, data)
     obj.pass_index = object_id
@@ -166,8 +161,7 @@ def _mesh(
 ) -> bpy.types.Mesh | None:
     """The meshes of a group as one, with atlas UVs and corner normals; None when nothing of it is there."""
     names = list(materials)
-    slots = [_slots(mesh, cut, names) for mesh in group]
-    slot = np.concatenate(slots)
+    slot = np.concatenate([_slots(mesh, cut, names) for mesh in group])
     corners = np.repeat(slot >= 0, 3)
     if not corners.any():
         return None
