@@ -6,7 +6,7 @@ all_glass       nothing but refraction: light reaches the eye through dielectric
 all_mirror      perfect mirrors facing one another, roughness 0
 emissive_only   no lamps, no world: surfaces that shine, one of them textured
 volume          absorbing and scattering media, bounded and free-standing
-tiny_scale      the still life of :func:`still_life` at 1e-4 units
+tiny_scale      the still life of `still_life` at 1e-4 units
 huge_scale      the same at 2e4 units; both must give the unit scene's picture
 
 ``python blender_scenes/build_hard.py --still-life SCALE OUT.blend`` builds the still life at any scale.

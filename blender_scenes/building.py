@@ -1,7 +1,7 @@
 """What every scene builder needs: an empty Cycles scene, packed images, materials, lights, a camera, saving.
 
 A builder is ``main("name", build)`` around a function that fills the scene. Its images come from
-:mod:`patterns` (numpy only), its meshes from :mod:`shapes`.
+`patterns` (numpy only), its meshes from `shapes`.
 """
 
 from __future__ import annotations

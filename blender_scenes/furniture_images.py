@@ -1,4 +1,4 @@
-"""Images of ``build_furniture.py``: colours, heights, normals. Arrays only (see :mod:`patterns`)."""
+"""Images of ``build_furniture.py``: colours, heights, normals. Arrays only (see `patterns`)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Solids as plain data, to be joined, moved and painted before they become one mesh.
 
-A :class:`Shape` is points, faces and UVs; :func:`place` hands it to Blender. :mod:`shapes` makes objects one
+A `Shape` is points, faces and UVs; `place` hands it to Blender. `shapes` makes objects one
 by one instead. Lengths are scene units, UVs texture repeats, faces wind counter-clockwise seen from outside.
 """
 

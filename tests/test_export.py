@@ -458,7 +458,7 @@ def emissive_ball() -> None:
     ball(material, (0, 0, 3.2), 0.3)
 
 
-# Energy within, relative RMSE within. Wider where the two lobes differ by nature (see FACTS.md).
+# Energy within, relative RMSE within. Wider where the two lobes differ by nature.
 CASES: list[tuple[Callable[[], None], float, float]] = [
     (textured_plane, 0.05, 0.06),
     (mapped_texture, 0.05, 0.06),

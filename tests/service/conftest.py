@@ -23,7 +23,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 def trained(server: Server) -> str:
     """Name of a workspace that the server made of an uploaded scene; it was killed with -9 while it trained.
 
-    The test of that is :func:`test_killed_while_it_trains`; the others look at what came out.
+    The test of that is `test_killed_while_it_trains`; the others look at what came out.
     """
     blend = Path(__file__).parents[2] / "blender_scenes" / "hard" / "emissive_only.blend"
     with server.client() as client:

@@ -2,7 +2,7 @@
 
 A half's noise is independent of the other's: rms((A - B) / 2) estimates the RMSE of the mean. Where that alone would
 cap what can be measured (caustics, light through openings), the halves are denoised with clean auxiliary images, each
-by itself; what is left of the noise is estimated in the same way. The denoiser's own bias stays; it favours the
+by itself; what is left of the noise is estimated in the same way. The denoiser's own bias stays, and favours the
 baselines.
 """
 

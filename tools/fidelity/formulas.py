@@ -1,6 +1,6 @@
 """What other exporters' formulas would give: the same bundle with one number changed.
 
-The formulas are those that shared/FACTS.md records of the existing Blender add-on for Mitsuba, and Mitsuba's own
+The formulas are those of the existing Blender add-on for Mitsuba, and Mitsuba's own
 defaults. Each function edits the parsed XML in place and returns whether it found anything to change.
 """
 

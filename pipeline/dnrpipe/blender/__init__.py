@@ -1,4 +1,4 @@
-"""Everything that imports bpy. Each module here that does runs in worker processes of its own.
+"""Everything that imports bpy. Modules that do run in worker processes of their own.
 
-``frozen`` and ``choice`` do not import bpy and may be used anywhere.
+`tasks`, `finding_lines`, `geometry.frozen` and `passes.choice` do not import bpy and may be used anywhere.
 """

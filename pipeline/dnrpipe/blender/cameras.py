@@ -23,8 +23,8 @@ def scene_cameras(scene: bpy.types.Scene) -> list[SceneCamera]:
 def camera_animation(scene: bpy.types.Scene, max_frames: int = MAX_FRAMES) -> list[SceneCamera]:
     """The active camera over the frame range, at most ``max_frames`` frames; [] when it does not move.
 
-    Camera markers are followed. Frames are evaluated in a scene that holds the cameras alone, with what they
-    depend on: a heavy scene would take minutes. Rigid-body cameras need their whole scene and stay where they are.
+    Follows camera markers. Evaluates frames in a scene that holds the cameras alone, with what they depend on: a
+    heavy scene would take minutes. Rigid-body cameras need their whole scene and stay where they are.
     """
     if not _may_move(scene):
         return []

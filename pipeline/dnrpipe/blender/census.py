@@ -94,13 +94,14 @@ def _lights(scene: bpy.types.Scene) -> list[LightFacts]:
     found = []
     for obj, _ in visible_lights(scene):
         light = obj.data
+        facts: dict[str, Any] = {"name": obj.name, "type": light.type, "color": tuple(light.color)}
+        facts["power"] = float(light.energy) * 2.0 ** float(light.exposure)
         if light.type == "AREA":
             both = light.shape in {"RECTANGLE", "ELLIPSE"}
-            size: dict[str, Any] = {"shape": light.shape, "size": (light.size, light.size_y if both else light.size)}
+            facts |= {"shape": light.shape, "size": (light.size, light.size_y if both else light.size)}
         else:
-            size = {"size": float(light.angle if light.type == "SUN" else light.shadow_soft_size)}
-        power = float(light.energy) * 2.0 ** float(light.exposure)
-        found.append(LightFacts(name=obj.name, type=light.type, power=power, color=tuple(light.color), **size))
+            facts["size"] = light.angle if light.type == "SUN" else light.shadow_soft_size
+        found.append(LightFacts.model_validate(facts))
     return found
 
 
@@ -139,7 +140,7 @@ def _world_emits(world: Any) -> bool:
 
 
 def _images(findings: Findings) -> list[ImageFacts]:
-    """Images with users; those whose file is gone are recorded."""
+    """Images with users; records those whose file is gone."""
     found = []
     for image in bpy.data.images:
         if image.users == 0 or image.source == "VIEWER":

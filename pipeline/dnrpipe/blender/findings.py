@@ -30,7 +30,7 @@ class Findings:
         object: str | None = None,
         material: str | None = None,
     ) -> None:
-        """Record a finding; a repetition is dropped."""
+        """Record a finding, unless it is known."""
         owner = None if object is None else printable(object)
         shader = None if material is None else printable(material)
         found = Finding(kind=kind, object=owner, material=shader, feature=printable(feature), note=printable(note))

@@ -169,6 +169,13 @@ class FrameCosts(TypedDict):
     peak_mb: float
 
 
+class FrameFailure(TypedDict):
+    """Why a frame could not be rendered. input: the scene is at fault."""
+
+    error: str
+    input: bool
+
+
 class PassesHeader(TypedDict):
     """Header of a view's file. repaired: pixels that were not finite or had no normal, and are 0."""
 

@@ -32,7 +32,7 @@ def freeze_visible(scene: bpy.types.Scene) -> Frozen:
 
 
 def _later(scene: bpy.types.Scene) -> Frozen | None:
-    """Try up to TRIES frames spread over the range; None when every one is empty or nothing is animated."""
+    """Try up to TRIES frames spread over the range. None when all are empty or nothing is animated."""
     if not any(obj.animation_data for obj in scene.objects) and not bpy.data.actions:
         return None
     before = scene.frame_current

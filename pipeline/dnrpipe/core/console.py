@@ -1,7 +1,7 @@
 """What the user sees while a stage runs: lines and progress bars, never from inside the trainer.
 
 Progress goes to standard error. With ``--json`` so do messages, and standard output carries one JSON value.
-Other programs read the same from the event stream (:mod:`.event_stream`).
+Other programs read the same from the event stream (`event_stream`).
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from dnrtrain.contract import SPLITS, DamagedFile, SceneFrame, View, read_camera
 from dnrtrain.records import Selection, read
 
 from .errors import UserError
-from .scene_records import Census, Prepared, RasterChoice, SceneSummary
+from .scene_records import Census, Conversion, RasterChoice, SceneSummary
 from .workspace import Workspace, digest, file_sha256
 
 SCENE_VERSION = 6  # raise when the conversion or the G-buffer scene changes what it writes
@@ -53,9 +53,9 @@ def read_census(scene: Path) -> Census:
     return read_record(scene / "census.json", Census)
 
 
-def read_prepared(scene: Path) -> Prepared:
+def read_conversion(scene: Path) -> Conversion:
     """``prepared.json`` of the folder ``scene/``. Raises UserError, DamagedFile as `read_json`."""
-    return read_record(scene / "prepared.json", Prepared)
+    return read_record(scene / "prepared.json", Conversion)
 
 
 def read_raster_choice(workspace: Workspace) -> RasterChoice | None:

@@ -2,7 +2,7 @@
 
 scene/summary.json    `SceneSummary`
 scene/census.json     `Census`, with a `Finding` for each feature
-scene/prepared.json   `Prepared`, written last
+scene/prepared.json   `Conversion`, written last
 passes/raster.json    `RasterChoice`
 """
 
@@ -260,7 +260,7 @@ class Census(SceneRecord):
     findings: list[Finding]
 
 
-class Prepared(SceneRecord):
+class Conversion(SceneRecord):
     """A conversion that is whole. fingerprint: of its inputs. files: SHA-256 of each file of ``scene/``, by path."""
 
     fingerprint: str

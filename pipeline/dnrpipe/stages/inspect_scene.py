@@ -68,9 +68,8 @@ def inspect_scene(scene: Path) -> Inspection:
     with tempfile.TemporaryDirectory(prefix="dnrpipe-inspect-") as folder:
         bundle = Path(folder) / "bundle"
         task = InspectTask(source=scene.resolve(), folder=bundle, bake_size=PassSettings().bake_size)
-        answer, _ = open_scene("dnrpipe.blender.inspection", task, Path(folder) / "log")
+        found, _ = open_scene("dnrpipe.blender.inspection", task, InspectAnswer, Path(folder) / "log")
         facts = bundle_facts(bundle / "scene.xml") if bundle.exists() else {}  # nothing visible: nothing converted
-    found = InspectAnswer.model_validate(answer)
     return Inspection(scene, found.warnings, found.census, plan_effects(found.census, facts).effects)
 
 

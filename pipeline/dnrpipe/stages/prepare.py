@@ -18,13 +18,13 @@ from ..core.console import Console
 from ..core.errors import UserError
 from ..core.scene_files import (
     read_census,
+    read_conversion,
     read_frame,
-    read_prepared,
     read_raster_choice,
     read_summary,
     scene_fingerprint,
 )
-from ..core.scene_records import Prepared, RasterChoice, SceneSummary
+from ..core.scene_records import Conversion, RasterChoice, SceneSummary
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest, file_sha256
 from ..effects.store import keep_plan
@@ -137,7 +137,7 @@ def convert_scene(run: Run) -> SceneSummary:
     """Open the scene in a worker and write ``scene/``, whole or not at all."""
     workspace, settings, console = run.workspace, run.settings, run.console
     marker = workspace.scene / "prepared.json"
-    if marker.exists() and read_prepared(workspace.scene).fingerprint == scene_fingerprint(workspace):
+    if marker.exists() and read_conversion(workspace.scene).fingerprint == scene_fingerprint(workspace):
         summary = read_summary(workspace.scene)
         if summary.bake_size in (None, settings.passes.bake_size):
             _refuse_if_strict(Path(workspace.manifest.source.path), workspace.scene, settings)
@@ -167,7 +167,7 @@ def convert_scene(run: Run) -> SceneSummary:
         for path in sorted(workspace.scene.rglob("[!.]*"))
         if path.is_file() and path.name != "frame.json"
     }
-    write_json(marker, Prepared(fingerprint=scene_fingerprint(workspace), files=files).data())
+    write_json(marker, Conversion(fingerprint=scene_fingerprint(workspace), files=files).data())
     return summary
 
 
@@ -179,14 +179,13 @@ def _run_conversion(run: Run, source: Path, folder: Path) -> None:
         bakes = BakeOptions(folder=workspace.root / FOLDER, size=size, refused=tuple(refused))
         task = PrepareTask(source=source, scene_dir=folder, strict=settings.strict, bakes=bakes)
         with run.console.bar("scene", 1) as bar:
-            answer, first_failure = open_scene("dnrpipe.blender.prepare", task, run.log)
+            answer, first_failure = open_scene("dnrpipe.blender.prepare", task, PrepareAnswer, run.log)
             bar.advance()
         if first_failure:
             run.console.warn(f"scene: {first_failure}; opening it once more went well")
-        pending = PrepareAnswer.model_validate(answer).bakes
-        if pending is None:
+        if answer.bakes is None:
             return
-        refused += bake(run, source, folder / "geometry.npz", pending)
+        refused += bake(run, source, folder / "geometry.npz", answer.bakes)
     raise RuntimeError(f"{source}: the same textures are to be baked again and again")
 
 

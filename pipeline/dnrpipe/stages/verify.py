@@ -15,7 +15,7 @@ from dnrtrain.contract import SPLITS, ContractError, DamagedFile
 
 from ..core.console import Console
 from ..core.errors import UserError
-from ..core.scene_records import Prepared
+from ..core.scene_records import Conversion
 from ..core.workspace import Workspace, file_sha256
 from .pipeline import discard, owner_of
 
@@ -100,11 +100,11 @@ def _scene(workspace: Workspace) -> Iterator[tuple[Path, Callable[[Path], object
     marker = workspace.scene / "prepared.json"
     if not workspace.scene.exists():
         return
-    yield marker, lambda _: _prepared(workspace)
+    yield marker, lambda _: _conversion(workspace)
     frame = workspace.scene / "frame.json"
     yield frame, lambda _: _frame(workspace)
     try:
-        files = _prepared(workspace).files
+        files = _conversion(workspace).files
     except (UserError, DamagedFile):
         return  # said by the check of the marker itself
     for name, wanted in files.items():
@@ -146,10 +146,10 @@ def _json(path: Path) -> None:
     read_json(path)
 
 
-def _prepared(workspace: Workspace) -> Prepared:
-    from ..core.scene_files import read_prepared
+def _conversion(workspace: Workspace) -> Conversion:
+    from ..core.scene_files import read_conversion
 
-    return read_prepared(workspace.scene)
+    return read_conversion(workspace.scene)
 
 
 def _frame(workspace: Workspace) -> None:

@@ -2,7 +2,7 @@
 
 A renderer runs in a process of its own: bpy is process-global state, and a bad LLVM or GL driver kills
 the process it lives in. The parent survives, reports, retries a task once on a fresh worker, and goes on.
-A worker that does not answer is killed after a while: see :class:`TaskTimeout`.
+A worker that does not answer is killed after a while: see `TaskTimeout`.
 
 Protocol: ``python -m dnrpipe.workers.processes MODULE PARENT``. The worker calls ``MODULE.Worker(common)`` once, then
 ``worker(task) -> result`` for every JSON line on standard input. Answers are JSON lines on a private copy
@@ -81,11 +81,11 @@ def run_tasks(
         module: importable module with a class ``Worker(common)`` that is callable with a task.
         common: JSON-able, sent once to each worker.
         log: file to which the workers' output is appended.
-        timeout: seconds after which a silent task counts as hung; its worker is killed. None: see :mod:`.patience`.
+        timeout: seconds after which a silent task counts as hung; its worker is killed. None: see `patience`.
         environment: variables added to the workers' environment.
         next_tasks: called with each TaskResult before it is yielded; returns tasks to do after it.
 
-    Closing the iterator (Ctrl-C in the consumer) kills the workers. Raises UserError: see :class:`TaskTimeout`.
+    Closing the iterator (Ctrl-C in the consumer) kills the workers. Raises UserError: see `TaskTimeout`.
     """
     task_timeout = TaskTimeout(timeout)
     pending: queue.SimpleQueue[tuple[dict[str, Any], int]] = queue.SimpleQueue()
@@ -166,11 +166,11 @@ class TaskFailed(RuntimeError):
 
 
 class LocalWorker:
-    """One worker process that is asked task by task, outside of :func:`run_tasks`. Not for several threads at once.
+    """One worker process that is asked task by task, outside of `run_tasks`. Not for several threads at once.
 
     Linux kills it when the thread that asked first ends.
 
-    Args: as of :func:`run_tasks`.
+    Args: as of `run_tasks`.
     """
 
     def __init__(self, module: str, common: dict[str, Any], log: Path, environment: dict[str, str]) -> None:

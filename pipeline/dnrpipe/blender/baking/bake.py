@@ -1,6 +1,6 @@
 """Worker that bakes socket values of many materials into the scene atlas, one Cycles EMIT bake per task.
 
-A DIFFUSE bake would be black on metals; emission is what it is.
+An EMIT bake yields the value itself; a DIFFUSE bake would be black on metals.
 """
 
 from __future__ import annotations
@@ -125,8 +125,10 @@ def _material(name: str) -> bpy.types.Material:
 
 
 def _complete(pixels: np.ndarray, texels: np.ndarray, size: int) -> tuple[np.ndarray, int]:
-    """(the region's values [N, 3], how many were not finite). These, and texels that Cycles did not reach (rims,
-    slivers), take a neighbour's."""
+    """(values of the region [N, 3], how many were not finite).
+
+    Those, and texels that Cycles did not reach (rims, slivers), take a neighbour's value.
+    """
     values = pixels[texels].copy()
     # Shader graphs can yield NaN; Cycles hands it through.
     bad = ~np.isfinite(values)

@@ -1,4 +1,4 @@
-"""The nodes that decide a socket's value: walking them, naming them, and hashing what they would compute."""
+"""The nodes that decide a socket's value: walks them, names them, and hashes what they compute."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ class GraphHasher:
 
 
 def _contents(image: Any) -> Iterator[bytes]:
-    """The bytes that an image is made of; of one that is nowhere, nothing."""
+    """The bytes of an image; none where it has no file and no pixels."""
     if image.is_dirty or image.source == "GENERATED":
         values = np.empty(len(image.pixels), np.float32)
         image.pixels.foreach_get(values)

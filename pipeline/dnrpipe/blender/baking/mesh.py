@@ -1,4 +1,4 @@
-"""Frozen meshes as Blender objects to bake: atlas, artist's UVs, colours, and what nodes ask the object for."""
+"""Frozen meshes as Blender objects to bake: atlas, the artist's UVs, colours, and what nodes read from the object."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def needs_own_space(mesh: FrozenMesh, materials: Iterable[str]) -> bool:
 
 
 def is_object_space(node: Any) -> bool:
-    """Whether the node needs the object's own axes, which world-space triangles have not."""
+    """Whether the node needs the object's own axes, which world-space triangles do not have."""
     if node.type == "VECT_TRANSFORM":
         return "OBJECT" in {node.convert_from, node.convert_to}
     if node.type == "NORMAL_MAP":

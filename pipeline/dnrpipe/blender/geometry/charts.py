@@ -1,9 +1,9 @@
 """A UV atlas for scenes too big for Blender's unwrapper: planar charts by direction, shelf-packed. Numpy only.
 
-Every triangle is projected along the axis its normal points to most (box projection); connected triangles of one
-mesh with one direction form a chart, too small ones are gathered by place. Charts keep one scale, lie on their
-bounding boxes and are packed on shelves. A million polygons take seconds where ``smart_project`` takes minutes.
-A chart that folds back over itself overlaps: measured and reported with the atlas.
+Every triangle is projected along the axis its normal points to most (box projection). Connected triangles of one
+mesh with one direction form a chart; charts that are too small are joined with their neighbours in space. Charts keep
+one scale and are packed on shelves by their bounding boxes. A million polygons take seconds where ``smart_project``
+takes minutes. A chart that folds back over itself overlaps; the atlas' facts say how much.
 """
 
 from __future__ import annotations
@@ -85,8 +85,8 @@ def _charts(mesh: FrozenMesh) -> tuple[np.ndarray, np.ndarray]:
 def _components(keys: np.ndarray) -> np.ndarray:
     """Component of every triangle, int [T]; triangles with a key in common [T, 3] are connected.
 
-    Labels spread as minima over keys, with pointer jumping, until nothing changes (about the logarithm of the
-    longest way); stopped after a fixed number of rounds, which leaves components in parts: harmless here.
+    Labels spread as minima over keys, with pointer jumping, until nothing changes: about as many rounds as the
+    logarithm of the longest way. The number of rounds is limited; a component that is then still in parts does no harm.
     """
     _, key = np.unique(keys.ravel(), return_inverse=True)
     key = key.reshape(-1, 3)

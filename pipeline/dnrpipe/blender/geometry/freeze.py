@@ -121,8 +121,8 @@ def freeze(depsgraph: bpy.types.Depsgraph) -> Frozen:
     """Collect every visible surface of an evaluated depsgraph, instances included, in world space.
 
     Normals go through the inverse transpose; mirrored transforms keep counter-clockwise winding.
-    Triangles without area or with non-finite corners are dropped and counted. Every evaluated mesh is read once;
-    beyond a budget instances share it (see `instances`).
+    Drops and counts triangles without area or with non-finite corners. Reads every evaluated mesh once; beyond a
+    budget instances share it (see `instances`).
     """
     cache: dict[tuple[object, ...], tuple[LocalMesh, bytes] | None] = {}
     unique: dict[bytes, LocalMesh] = {}

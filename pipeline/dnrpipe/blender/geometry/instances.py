@@ -1,7 +1,7 @@
 """Which instances get a mesh of their own, and which share one.
 
-A mesh of its own means an atlas place of its own: light that falls on it is remembered by itself. That is worth
-having for a few hundred instances; tens of thousands would multiply memory and shrink everybody's texels to nothing.
+A mesh of its own has an atlas place of its own, and so a light map of its own. That pays for a few hundred
+instances; tens of thousands would multiply memory and leave each surface hardly a texel.
 """
 
 from __future__ import annotations

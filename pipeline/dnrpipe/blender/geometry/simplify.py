@@ -1,7 +1,7 @@
 """Heavy geometry with thousands of instances: simplified until all of it fits the ray tracer.
 
 Mitsuba's llvm and cuda variants cannot hold thousands of instances (see `shapes`), so copies are written out
-as triangles, and that has to end somewhere. The simpler mesh is used everywhere: G-buffers and ray tracing agree.
+as triangles, up to a budget. The simpler mesh is used everywhere: G-buffers and ray tracing agree.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Blender lamps -> Mitsuba emitters. Radiometry: shared/FACTS.md, checked by tests/test_export.py.
+"""Blender lamps -> Mitsuba emitters. tests/test_export.py compares their radiometry with Cycles.
 
 Blender's power P of a lamp in watts is the radiant flux of an isotropic source of radiance P / (4 pi^2 r^2);
 colours are scene-linear; a lamp shines along its local -Z.

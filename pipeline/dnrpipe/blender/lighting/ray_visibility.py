@@ -1,4 +1,4 @@
-"""Objects that only some rays see: what Mitsuba, which knows no ray kinds, does not do, is said."""
+"""Objects that only some kinds of rays see. Mitsuba knows no ray kinds, so each becomes a finding."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ KINDS = {
 def report_ray_visibility(names: Iterable[str], findings: Findings) -> None:
     """A finding for each object that is hidden from some rays, a shadow catcher, a holdout, or has linked light.
 
-    names: objects of the frozen scene. Camera rays are not among them: those are obeyed.
+    names: objects of the frozen scene. Visibility to camera rays is converted, and is no finding.
     """
     objects = {obj.name_full: obj for obj in bpy.data.objects}
     for name in sorted(set(names) & set(objects)):

@@ -1,4 +1,4 @@
-"""The sun disc of a Sky Texture: taken out of the environment image, where it would cover a pixel, as a lamp.
+"""The sun disc of a Sky Texture becomes a lamp: in the environment image it would cover about a pixel.
 
 A sun of half a degree holds most of the light of a clear sky; rendered into an image of 1024 x 512 it is off by some
 percent of its energy. So the sky is rendered without it, and its irradiance is measured in a close-up.

@@ -22,7 +22,7 @@ SAMPLES = 16
 def render_equirect(world: Any) -> np.ndarray:
     """Radiance of ``world`` from the origin as float32 [H, W, 3], bottom row first, Blender's equirect layout.
 
-    As Cycles hands it over: perhaps not finite.
+    As Cycles renders it; values may not be finite.
     """
 
     def panorama(camera: Any, body: Any) -> None:

@@ -1,4 +1,4 @@
-"""Alpha in the G-buffers: materials that are an emission where a surface's opacity says so, and nothing elsewhere.
+"""Alpha in the G-buffers: materials that emit where the surface is opaque, and are transparent elsewhere.
 
 G-buffers ask "is the surface there" at the pixel centre (opacity above one half), coverage asks "how much of it":
 the same materials serve both, with the threshold on or off.

@@ -20,7 +20,7 @@ def configure_raster(scene: bpy.types.Scene, engine: str, samples: int) -> None:
 
     Lights, world and materials stay as in the file. Compositor, sequencer, stamp, border, simplify,
     motion blur, freestyle, depth of field, multi-view, camera markers, dithering and film exposure are
-    taken out: they would not match the G-buffers or the ray tracer.
+    switched off: they would not match the G-buffers or the ray tracer.
     """
     render = scene.render
     render.film_transparent = True

@@ -23,7 +23,7 @@ from dnrpipe.core.errors import UserError
 from dnrpipe.workers.processes import die_with_parent
 from dnrtrain.contract import View
 
-from ..tasks import FrameCosts, PassesCommon
+from ..tasks import FrameCosts, FrameFailure, PassesCommon
 
 Kind = Literal["gbuffer", "coverage", "raster"]
 
@@ -94,7 +94,7 @@ def _serve(connection: Connection, kind: Kind, common: PassesCommon, parent: int
                 draw = make_renderer(kind, common)
             draw(view, path)
             peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-            answer: FrameCosts | dict[str, Any] = {
+            answer: FrameCosts | FrameFailure = {
                 "seconds": time.perf_counter() - started,
                 "cpu_seconds": time.process_time() - cpu,
                 "peak_mb": peak / (1 << 20 if sys.platform == "darwin" else 1 << 10),

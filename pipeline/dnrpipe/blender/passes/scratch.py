@@ -21,7 +21,7 @@ def scratch_folder(pixels: int) -> Iterator[Path]:
     """A temporary folder for render outputs: on the RAM disk when four such files fit there, else on disk."""
     need = 4 * pixels * BYTES_PER_PIXEL
     fits = RAM_DISK.is_dir() and os.access(RAM_DISK, os.W_OK) and shutil.disk_usage(RAM_DISK).free > need
-    # Scratch folders whose process was killed: nobody else frees the memory that they hold.
+    # Temporary folders whose process was killed: nothing else frees the memory that they hold.
     for folder in RAM_DISK.glob(f"{PREFIX}*-*") if fits else ():
         owner = folder.name.removeprefix(PREFIX).partition("-")[0]
         if owner.isdigit() and not Path("/proc", owner).exists():

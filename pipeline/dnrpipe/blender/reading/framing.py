@@ -20,8 +20,8 @@ def ensure_camera(scene: bpy.types.Scene, center: np.ndarray, points: Iterable[n
     """Give ``scene`` an active camera where it has no usable one; say so in one line.
 
     center [3], points (arrays [N, 3]): what to look at and what to frame, world space. A camera of the file is
-    preferred to a new one. Anything that is no camera (Blender lets lamps and empties be "the camera"), or whose
-    matrix is singular or not finite, does not count.
+    preferred to a new one. An active object that is no camera (Blender allows
+    lamps and empties), or whose matrix is singular or not finite, does not count.
     """
     if usable(scene.camera):
         return []

@@ -1,4 +1,4 @@
-"""Open a scene file and freeze what its pictures show: the common beginning of `prepare` and `inspect`."""
+"""Open a scene file and freeze what renders show: the common beginning of `prepare` and `inspect`."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ def strict_refusal(missing: list[Reference]) -> str:
 def note_missing(findings: Findings) -> None:
     """Record missing files, and linked data-blocks that are not in their library.
 
-    Whole images are left to the census and the texture reader; single tiles of a UDIM image are recorded here.
+    The census and the texture reader record whole images; single tiles of a UDIM image are recorded here.
     """
     tiled = {image.name_full for image in bpy.data.images if image.source == "TILED"}
     for reference in missing_files():

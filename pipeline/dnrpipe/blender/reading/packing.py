@@ -16,7 +16,7 @@ from .missing import SHAPELESS_IMAGES, image_files, is_file
 def pack_everything() -> list[str]:
     """Pack all external data of the open file; return a warning for each that could not be packed.
 
-    Missing files are passed over: opening has named them.
+    Skips missing files: `opening` has named them.
     """
     warnings = []
     for image in bpy.data.images:

@@ -1,4 +1,4 @@
-"""Python inside scene files: never executed, always said."""
+"""Python inside scene files: never executed, always reported."""
 
 from __future__ import annotations
 

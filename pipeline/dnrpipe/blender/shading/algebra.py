@@ -25,7 +25,7 @@ def below(value: Value, limit: float) -> bool:
 
 
 def squared(value: Value) -> Value:
-    """Microfacet alpha of a roughness: its square, kept away from 0."""
+    """Microfacet alpha of a roughness: its square, kept above 0."""
     if isinstance(value, Constant):
         return constant(max(value.scalar, SMOOTH) ** 2)
     return value.map(lambda x: np.maximum(x, SMOOTH) ** 2)

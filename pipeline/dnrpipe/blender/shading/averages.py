@@ -1,4 +1,4 @@
-"""What stands for a node that is neither an image nor baked: the average of its output, as well as it is known."""
+"""The average of a node's output, as well as it is known: it stands for nodes that are neither images nor baked."""
 
 from __future__ import annotations
 

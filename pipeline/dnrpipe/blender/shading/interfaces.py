@@ -40,7 +40,7 @@ class InterfaceShaders(NormalShaders):
         return self._bent(element, node, scope, both_sides=True)
 
     def _index(self, node: Any, scope: Scope) -> float:
-        """Index of refraction; 1 is kept away from, since nothing would refract."""
+        """Index of refraction, kept away from 1, where nothing would refract."""
         ior = self._number(node, scope, 1.45, "IOR")
         return MIN_ETA if abs(ior - 1) < 1e-4 else max(ior, 1e-3)
 

@@ -29,8 +29,8 @@ class NormalShaders(ShaderBase):
     def _by(self, socket: Any, scope: Scope, surface: Surface) -> Surface:
         """``surface`` under the normal that ``socket`` receives.
 
-        Images are read as they are, anything else is baked. The bent BSDF is made two-sided first: seen from
-        behind, normal and all are turned over, as in Cycles.
+        Images are used as they are, anything else is baked. The BSDF is made two-sided first: seen from behind, its
+        normal turns over with it, as in Cycles.
         """
         source = resolve(socket, scope)
         if not source.linked:

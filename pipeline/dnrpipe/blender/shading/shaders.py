@@ -1,10 +1,8 @@
 """Blender's shader nodes -> Mitsuba BSDFs: the walk over a material's shader tree.
 
-One method per node, by family: `lobes` (what reflects), `interfaces` (what transmits),
-`principled`, `mixing`, `volumes` (what fills a mesh);
-`normals` bends their normals. Calibration:
-shared/FACTS.md, re-measured in `calibration`. Whatever is not converted exactly is recorded as a finding with
-the material's name.
+One method per node, by family: `lobes` (what reflects), `interfaces` (what transmits), `principled`, `mixing` and
+`volumes` (what fills a mesh); `normals` bends their normals. The numbers of `calibration` make them agree with Cycles.
+Whatever is not converted exactly becomes a finding with the material's name.
 """
 
 from __future__ import annotations

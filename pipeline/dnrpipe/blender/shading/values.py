@@ -1,8 +1,8 @@
 """Values of shader sockets: constants, image textures, and colour arithmetic on them.
 
-Nodes that only depend on images of one placement are evaluated texel by texel, exactly; a plain colour attribute is
-kept at the corners. Everything else is baked by Cycles over the scene atlas (`baking.cache`). What cannot be
-baked becomes its average. Both with a finding: never silently.
+Nodes that only depend on images of one placement are evaluated texel by texel, exactly. A plain colour attribute is
+kept at the corners. Cycles bakes everything else over the scene atlas (`baking.cache`). What cannot be baked becomes
+its average. Baking and averaging are findings.
 """
 
 from __future__ import annotations
