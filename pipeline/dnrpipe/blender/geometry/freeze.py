@@ -125,7 +125,7 @@ def freeze(depsgraph: bpy.types.Depsgraph) -> Frozen:
     budget instances share it (see `instances`).
     """
     cache: dict[tuple[object, ...], tuple[LocalMesh, bytes] | None] = {}
-    unique: dict[bytes, LocalMesh] = {}
+    unique: dict[bytes, LocalMesh] = {}  # one mesh for all that evaluate to the same content
     placed: list[Placed] = []
     findings = Findings()
     for instance in depsgraph.object_instances:
@@ -137,7 +137,10 @@ def freeze(depsgraph: bpy.types.Depsgraph) -> Frozen:
         for key, read in _surfaces(obj, instance.show_self, instance.show_particles, findings):
             if key not in cache:
                 local = read()
-                cache[key] = None if local is None or not len(local.material_index) else _intern(local, unique)
+                cache[key] = None
+                if local is not None and len(local.material_index):
+                    digest = local.digest()
+                    cache[key] = unique.setdefault(digest, local), digest
             if (found := cache[key]) is not None:
                 placed.append(Placed(obj.name_full, persistent, matrix, *found, obj.visible_camera))
     repairs = dict.fromkeys(REPAIRS, 0)
@@ -181,12 +184,6 @@ def _surfaces(
     if show_particles and isinstance(data, bpy.types.Mesh):
         for name, read in hair_systems(obj, findings):
             yield (obj.name, data.as_pointer(), "hair", name), read
-
-
-def _intern(local: LocalMesh, unique: dict[bytes, LocalMesh]) -> tuple[LocalMesh, bytes]:
-    """One LocalMesh for all that evaluate to the same content."""
-    digest = local.digest()
-    return unique.setdefault(digest, local), digest
 
 
 def _note_sharing(shared: Shared, findings: Findings) -> None:

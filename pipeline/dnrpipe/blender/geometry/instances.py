@@ -20,7 +20,7 @@ SINGULAR = 1e-9  # |det| of a matrix with columns scaled to length 1: flat ones 
 
 @dataclass
 class Placed:
-    """One visible instance of a local mesh: ``identity`` (object name, persistent id) makes the order stable."""
+    """One visible instance of a local mesh; object name and persistent id make the order stable."""
 
     name: str
     persistent: tuple[int, ...]

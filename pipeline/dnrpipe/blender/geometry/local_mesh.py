@@ -8,9 +8,19 @@ from dataclasses import dataclass, field
 import bpy
 import numpy as np
 
+from ..baking.trees import attribute_names
 from .frozen import UNIT_TEXTURE_SPACE, TextureSpace
-from .named_attributes import named_attributes
 
+FIELDS = {
+    "FLOAT": ("value", 1),
+    "INT": ("value", 1),
+    "BOOLEAN": ("value", 1),
+    "FLOAT_VECTOR": ("vector", 3),
+    "FLOAT2": ("vector", 2),
+    "FLOAT_COLOR": ("color", 4),
+    "BYTE_COLOR": ("color", 4),
+}
+"""Type of attribute -> (its property, numbers per element)."""
 UV_STEPS = 2**20  # artist's UVs are rounded to multiples of 1 / UV_STEPS
 
 
@@ -80,7 +90,7 @@ def read_local(obj: bpy.types.Object) -> LocalMesh | None:
             materials=materials,
             uv_layers=uv_layers,
             active_uv=active,
-            colors=colors | named_attributes(obj, mesh, known, corner_vertex, loops, polygons),
+            colors=colors | _named_attributes(obj, mesh, known, corner_vertex, loops, polygons),
             active_color=mesh.attributes.default_color_name or None,
             texture_space=(_triple(mesh.texspace_location), _triple(mesh.texspace_size)),
         )
@@ -115,6 +125,47 @@ def _colors(mesh: bpy.types.Mesh, corner_vertex: np.ndarray, loops: np.ndarray) 
         values = np.empty((len(attribute.data), 4), np.float32)
         attribute.data.foreach_get("color", values.ravel())
         result[attribute.name] = values[corner_vertex[loops] if attribute.domain == "POINT" else loops]
+    return result
+
+
+def _named_attributes(
+    obj: bpy.types.Object,
+    mesh: bpy.types.Mesh,
+    known: set[str],
+    corner_vertex: np.ndarray,
+    loops: np.ndarray,
+    polygons: np.ndarray,
+) -> dict[str, np.ndarray]:
+    """Attributes other than UV layers and colours that the object's materials name, float32 [3T, 4].
+
+    A number fills all three channels, as Cycles shows it as a colour; alpha is 1 unless the attribute has one.
+
+    Args:
+        known: names that are read elsewhere.
+        corner_vertex: vertex of every corner of the mesh. loops, polygons: corner [3T] and polygon [T] of the
+            triangles.
+    """
+    wanted = set[str]()
+    for slot in obj.material_slots:
+        if slot.material is not None:
+            wanted |= attribute_names(slot.material)
+    places = {"POINT": corner_vertex[loops], "CORNER": loops, "FACE": np.repeat(polygons, 3)}
+    result = {}
+    for name in sorted(wanted - known):
+        attribute = mesh.attributes.get(name)
+        if attribute is None or attribute.domain not in places or attribute.data_type not in FIELDS:
+            continue
+        if attribute.is_required or attribute.is_internal:
+            continue  # Blender's own, such as the positions themselves
+        field, width = FIELDS[attribute.data_type]
+        kind = {"INT": np.int32, "BOOLEAN": bool}.get(attribute.data_type, np.float32)
+        values = np.empty(len(attribute.data) * width, kind)
+        attribute.data.foreach_get(field, values)
+        rows = values.reshape(-1, width).astype(np.float32)
+        full = np.zeros((len(rows), 4), np.float32)
+        full[:, 3] = 1
+        full[:, : 3 if width == 1 else width] = rows  # a single number is broadcast
+        result[name] = full[places[attribute.domain]]
     return result
 
 

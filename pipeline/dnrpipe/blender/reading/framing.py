@@ -45,13 +45,8 @@ def ensure_camera(scene: bpy.types.Scene, center: np.ndarray, points: Iterable[n
 
 def framing_pose(center: np.ndarray, distance: float) -> np.ndarray:
     """Camera-to-world (looks along -Z, Y up), float64 [4, 4], ``distance`` from ``center``, 25 degrees above."""
-    back = np.array(
-        [
-            math.cos(ELEVATION) * math.cos(AZIMUTH),
-            math.cos(ELEVATION) * math.sin(AZIMUTH),
-            math.sin(ELEVATION),
-        ]
-    )
+    flat = math.cos(ELEVATION)
+    back = np.array([flat * math.cos(AZIMUTH), flat * math.sin(AZIMUTH), math.sin(ELEVATION)])
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
     pose = np.eye(4)

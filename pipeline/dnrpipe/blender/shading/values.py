@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from ..baking.cache import BakeCache
+from ..baking.trees import ACTIVE_COLOUR
 from ..findings import Findings
-from ..geometry.corner_colours import ACTIVE_COLOUR, colour_corners, is_uv_layer
+from ..geometry.corner_colours import colour_corners, is_uv_layer
 from ..tasks import ValueKind
 from .averages import procedural_mean
 from .blackbody import blackbody_colour
