@@ -67,8 +67,7 @@ def add_object(
     matrix = meshes[0].object_to_world if local else np.eye(4)
     into = np.linalg.inv(matrix)
     positions = np.concatenate([mesh.positions.astype(np.float64) for mesh in meshes]) @ into[:3, :3].T + into[:3, 3]
-    normals = np.concatenate([mesh.normals.astype(np.float64) for mesh in meshes]) @ matrix[:3, :3]
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    normals = _object_normals(np.concatenate([mesh.normals for mesh in meshes]), matrix)
     order = np.arange(len(positions))
     if np.linalg.det(matrix[:3, :3]) < 0:  # Blender turns the winding of mirrored objects again
         order = order.reshape(-1, 3)[:, [0, 2, 1]].ravel()
@@ -131,8 +130,7 @@ def _object_attributes(data: bpy.types.Mesh, meshes: Sequence[FrozenMesh], order
     """Object and generated coordinates, object normal, and Object Info, per corner."""
     inside = [object_positions(mesh) for mesh in meshes]
     generated = [generated_positions(mesh) for mesh in meshes]
-    normals = [mesh.normals.astype(np.float64) @ mesh.object_to_world[:3, :3] for mesh in meshes]
-    normals = [n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-30) for n in normals]
+    normals = [_object_normals(mesh.normals, mesh.object_to_world) for mesh in meshes]
     for name, parts in ((OBJECT, inside), (GENERATED, generated), (OBJECT_NORMAL, normals)):
         _attribute(data, name, "FLOAT_VECTOR", np.concatenate(parts)[order])
     rows = [object_info(mesh) for mesh in meshes]
@@ -140,6 +138,12 @@ def _object_attributes(data: bpy.types.Mesh, meshes: Sequence[FrozenMesh], order
     kinds = {LOCATION: "FLOAT_VECTOR", OBJECT_COLOUR: "FLOAT_COLOR", OBJECT_NUMBERS: "FLOAT_VECTOR"}
     for column, (name, kind) in enumerate(kinds.items()):
         _attribute(data, name, kind, np.repeat(np.array([row[column] for row in rows]), counts, axis=0)[order])
+
+
+def _object_normals(normals: np.ndarray, object_to_world: np.ndarray) -> np.ndarray:
+    """World-space normals [N, 3] as unit ones in the object's space, float64."""
+    turned = normals.astype(np.float64) @ object_to_world[:3, :3]
+    return turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-30)
 
 
 def object_positions(mesh: FrozenMesh) -> np.ndarray:
@@ -152,22 +156,20 @@ def object_positions(mesh: FrozenMesh) -> np.ndarray:
     extent = float(np.abs(points).max(initial=0.0))
     if not 0 < extent < np.inf:
         return points
-    return _rounded(points, 2.0 ** (np.ceil(np.log2(extent)) - 20))
+    step = 2.0 ** (np.ceil(np.log2(extent)) - 20)
+    return np.round(points / step) * step
 
 
 def generated_positions(mesh: FrozenMesh) -> np.ndarray:
     """Generated coordinates [3T, 3]: 0 to 1 over the texture space; rounded to 2^-18, so that its ends are exact."""
     location, size = (np.asarray(part, np.float64) for part in mesh.texture_space)
-    return _rounded((_unrounded(mesh) - location) / np.where(size == 0, 1, 2 * size) + 0.5, 2.0**-18)
+    generated = (_unrounded(mesh) - location) / np.where(size == 0, 1, 2 * size) + 0.5
+    return np.round(generated * 2**18) / 2**18
 
 
 def _unrounded(mesh: FrozenMesh) -> np.ndarray:
     inverse = np.linalg.pinv(mesh.object_to_world)
     return mesh.positions.astype(np.float64) @ inverse[:3, :3].T + inverse[:3, 3]
-
-
-def _rounded(values: np.ndarray, step: float) -> np.ndarray:
-    return np.round(values / step) * step
 
 
 def object_info(mesh: FrozenMesh) -> tuple[list[float], list[float], list[float]]:

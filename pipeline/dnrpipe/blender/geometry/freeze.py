@@ -65,20 +65,13 @@ def freeze_scene(scene: bpy.types.Scene) -> Frozen:
         UserError: nothing in the scene is visible in renders.
     """
     render = scene.render
-    kept = {
-        name: getattr(render, name)
-        for name in (
-            "engine",
-            "resolution_x",
-            "resolution_y",
-            "resolution_percentage",
-            "use_border",
-            "use_multiview",
-            "use_compositing",
-            "use_sequencer",
-            "use_simplify",
-        )
+    wanted = {
+        "engine": _FreezeEngine.bl_idname,
+        **dict.fromkeys(("resolution_x", "resolution_y"), 8),
+        "resolution_percentage": 100,
+        **dict.fromkeys(("use_border", "use_multiview", "use_compositing", "use_sequencer", "use_simplify"), False),
     }
+    kept = {name: getattr(render, name) for name in wanted}
     layer = render_layer(scene)
     used = layer.use
     camera = None
@@ -89,11 +82,8 @@ def freeze_scene(scene: bpy.types.Scene) -> Frozen:
     _FreezeEngine.outcome = None
     try:
         layer.use = True
-        render.engine = _FreezeEngine.bl_idname
-        render.resolution_x = render.resolution_y = 8
-        render.resolution_percentage = 100
-        render.use_border = render.use_multiview = False
-        render.use_compositing = render.use_sequencer = render.use_simplify = False
+        for name, value in wanted.items():
+            setattr(render, name, value)
         bpy.ops.render.render(scene=scene.name, layer=layer.name)
         outcome = _FreezeEngine.outcome
     finally:
