@@ -86,9 +86,9 @@ for number, view in enumerate(views):
     plain, _ = engine.frame(folder / "scene.xml", integrator, engine.sensor(view), view, 256, number)
     worst = max(worst, float(np.abs(kept - plain).mean()))
     note(alpha=np.abs(kept[..., 3].mean() - plain[..., 3].mean()))
-before = frames._path[64].n_recordings
+before = frames._kernels["_path_kernel", 64].n_recordings
 again = frames.path(views[0], 64, 0)
-note(worst=worst, level=kept[..., :3].mean(), recorded=frames._path[64].n_recordings - before,
+note(worst=worst, level=kept[..., :3].mean(), recorded=frames._kernels["_path_kernel", 64].n_recordings - before,
      same=np.abs(again - frames.path(views[0], 64, 0)).max(), other=np.abs(again - frames.path(views[0], 64, 1)).max())
 """,
     )

@@ -12,7 +12,7 @@ import pytest
 from dnrpipe.core.console import Console
 from dnrpipe.core.settings import Settings
 from dnrpipe.core.workspace import Source, Workspace
-from dnrpipe.raytrace.finite import masked, masked_channels
+from dnrpipe.raytrace.engine import masked, masked_channels
 from dnrpipe.raytrace.noise import half_noise
 from dnrpipe.raytrace.pictures import repair
 from dnrpipe.stages.base_images import BaseRenderer, bake_light

@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("bpy")
 
 from dnrpipe.blender.bundle.units import rescale, unit_scale
-from dnrpipe.raytrace import units
+from dnrpipe.raytrace import sensors as units
 from dnrpipe.raytrace.variants import choose_variant
 from dnrtrain.contract import View
 

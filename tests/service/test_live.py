@@ -20,7 +20,7 @@ from tests.service.test_planned import prediction
 from websockets.sync.client import connect
 
 from dnrpipe.export.browser import find_chromium, open_page
-from dnrpipe.service.live_pace import BUDGET, LEVELS, MIN_FRAMES, START, Pace
+from dnrpipe.service.live_pool import BUDGET, LEVELS, MIN_FRAMES, START, Pace
 from dnrpipe.service.models import JobRequest
 from dnrpipe.service.routes_live import unpack
 

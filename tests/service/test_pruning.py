@@ -13,8 +13,7 @@ from tests.service.harness import Server, empty_workspace
 from dnrpipe.core.errors import UserError
 from dnrpipe.service.config import ServerConfig
 from dnrpipe.service.models import FINAL, JobRequest
-from dnrpipe.service.pruning import DAY, prune
-from dnrpipe.service.queue import BATCH, Queue
+from dnrpipe.service.queue import BATCH, DAY, Queue
 from dnrpipe.service.root import ServiceRoot
 
 NOW = 1_000 * DAY
@@ -49,7 +48,7 @@ class Place:
         return job
 
     def prune(self, **limits: Any) -> list[int]:
-        return prune(self.queue, self.root, ServerConfig(root=self.root.folder, **limits), NOW)
+        return self.queue.prune(self.root, ServerConfig(root=self.root.folder, **limits), NOW)
 
     def told(self, job: int) -> tuple[bool, bool, bool]:
         """(events other than states, a log, an event file)"""

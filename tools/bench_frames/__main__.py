@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from dnrpipe.cli.thread_waiting import set_thread_waiting
+from dnrpipe.cli import set_thread_waiting
 from dnrpipe.core.errors import UserError
 from dnrpipe.raytrace.variants import choose_variant
 

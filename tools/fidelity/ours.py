@@ -102,7 +102,7 @@ CONVERSION = (
     *("stages/baking.py", "stages/opening.py", "stages/prepare.py"),
     *("core/cameras.py", "core/scene_files.py", "core/scene_records.py", "core/settings.py"),
 )
-TRACING = tuple(f"raytrace/{name}.py" for name in ("tracer", "engine", "sensors", "visibility", "coverage"))
+TRACING = tuple(f"raytrace/{name}.py" for name in ("tracer", "engine", "sensors", "visibility"))
 PLUGINS = ("raytrace/plugins",)
 
 

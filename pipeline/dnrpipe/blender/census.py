@@ -16,7 +16,7 @@ from .census_materials import describe_material
 from .findings import Findings
 from .geometry.freeze import render_layer
 from .geometry.frozen import FrozenMesh
-from .lighting.visible_lights import visible_lights
+from .lighting.lights import visible_lights
 from .reading.missing import SHAPELESS_IMAGES
 from .reading.names import find_material
 from .shading.sockets import find_input, resolve, surface_source, walk

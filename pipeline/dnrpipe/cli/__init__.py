@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from collections.abc import MutableMapping
 
 import click
 
@@ -20,7 +21,6 @@ from .frontier import frontier
 from .jobs import cancel, jobs, logs, retry, submit
 from .plan import plan
 from .serve import bench_live, serve
-from .verify import verify
 
 
 class _Group(click.Group):
@@ -70,7 +70,7 @@ for _command in (
     bench_select,
     *(serve, submit, jobs, logs, cancel, retry, bench_live),
     information.status,
-    verify,
+    information.verify,
     information.costs,
     information.doctor,
     information.weights,
@@ -80,8 +80,6 @@ for _command in (
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point: runs the command and turns every expected failure into one line and an exit code."""
-    from .thread_waiting import set_thread_waiting
-
     set_thread_waiting(os.environ)
     code = _main(arguments)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is written; a late Ctrl-C must not spoil the exit code
@@ -89,11 +87,12 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _main(arguments: list[str] | None) -> int:
-    from .interrupts import interrupt_as_keyboard
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
 
+    previous = signal.signal(signal.SIGTERM, stop)  # SIGTERM ends a command as Ctrl-C does
     try:
-        with interrupt_as_keyboard():
-            cli.main(args=arguments, standalone_mode=False, prog_name="dnrpipe")
+        cli.main(args=arguments, standalone_mode=False, prog_name="dnrpipe")
     except click.exceptions.Exit as error:
         return error.exit_code
     except (KeyboardInterrupt, click.Abort):
@@ -107,9 +106,31 @@ def _main(arguments: list[str] | None) -> int:
         if explained is None:
             raise
         return _fail(*explained)
+    finally:
+        signal.signal(signal.SIGTERM, previous)
     return 0
 
 
 def _fail(message: str, code: int) -> int:
     print(f"dnrpipe: error: {message}" if code != 130 else f"dnrpipe: {message}", file=sys.stderr, flush=True)
     return code
+
+
+def set_thread_waiting(environment: MutableMapping[str, str]) -> None:
+    """Make torch's threads spin a little, then sleep; read when torch is loaded. What the user has set stays.
+
+    Torch for Linux comes with GNU's OpenMP, which takes a number of spins; other runtimes only sleep at once or never.
+    Measured on two cores, a training step at 128², ms (`python -m tools.bench_waiting WORKSPACE`):
+
+        spins before sleeping       0    1,000   300,000 (libgomp's default)
+        idle machine               86       49        42
+        four other processes      288      361       878
+
+    One run each. Beside other processes it varies by half; spinning a little costs some there, spinning on threefold.
+    """
+    if "OMP_WAIT_POLICY" in environment or "GOMP_SPINCOUNT" in environment:
+        return
+    if sys.platform.startswith("linux"):
+        environment["GOMP_SPINCOUNT"] = "1000"
+    else:
+        environment["OMP_WAIT_POLICY"] = "PASSIVE"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.metadata
+import importlib.util
 import os
 import platform
 import shutil
@@ -17,6 +19,11 @@ APT_LINE = (
     " libatomic1 libllvm19 libegl1 libgl1-mesa-dri"
 )
 MIN_FREE_GB = 2
+TORCH_CODE = (
+    "import torch; g = torch.cuda.is_available();"
+    "where = torch.cuda.get_device_name() if g else f'{torch.get_num_threads()} CPU threads';"
+    "print(torch.__version__, 'on', where)"
+)
 
 
 def examine() -> list[dict[str, Any]]:
@@ -33,7 +40,7 @@ def examine() -> list[dict[str, Any]]:
             "import mitsuba_oidn as o; print('Open Image Denoise', o.oidn_version(), 'on the CPU')",
             "render",
         ),
-        _torch(),
+        _import_check("torch", TORCH_CODE, "train"),
         _weights(),
         _module("OpenEXR", "OpenEXR"),
         _module("flip-evaluator", "flip_evaluator"),
@@ -88,15 +95,6 @@ def _mitsuba() -> dict[str, Any]:
     return _row("mitsuba", "warn" if slow else "ok", choice.reason + (f"; faster with: {APT_LINE}" if slow else ""))
 
 
-def _torch() -> dict[str, Any]:
-    code = (
-        "import torch; g = torch.cuda.is_available();"
-        "where = torch.cuda.get_device_name() if g else f'{torch.get_num_threads()} CPU threads';"
-        "print(torch.__version__, 'on', where)"
-    )
-    return _import_check("torch", code, "train")
-
-
 def _weights() -> dict[str, Any]:
     try:
         from dnrtrain.weights import WeightsMissing, load_weights
@@ -110,10 +108,6 @@ def _weights() -> dict[str, Any]:
 
 
 def _module(name: str, module: str) -> dict[str, Any]:
-    import importlib.metadata
-    import importlib.util
-
     if importlib.util.find_spec(module) is None:
         return _row(name, "fail", "not installed; try: pip install 'dnrpipe[render]'")
-    version = importlib.metadata.version(module.replace("_", "-"))
-    return _row(name, "ok", version)
+    return _row(name, "ok", importlib.metadata.version(module.replace("_", "-")))

@@ -2,31 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from ..core.errors import UserError
+from .options import OUTPUT_OPTIONS
+from .options import options as with_options
 
 if TYPE_CHECKING:
     from ..core.console import Console
     from ..core.workspace import Workspace
 
 
-def _common(function: Callable[..., Any]) -> Callable[..., Any]:
-    """What all exports take."""
-    for option in reversed(
-        [
-            click.argument("workspace", required=False, metavar="[WORKSPACE]"),
-            click.option("-w", "--workspace", "named", metavar="DIR", help="The same, as other commands take it."),
-            click.option("--json", "as_json", is_flag=True, help="Print one JSON value; messages to stderr."),
-            click.option("-q", "--quiet", is_flag=True, help="Warnings and errors only."),
-        ]
-    ):
-        function = option(function)
-    return function
+_common = with_options(
+    [
+        click.argument("workspace", required=False, metavar="[WORKSPACE]"),
+        click.option("-w", "--workspace", "named", metavar="DIR", help="The same, as other commands take it."),
+        *OUTPUT_OPTIONS,
+    ]
+)
 
 
 def _opened(workspace: str | None, named: str | None, as_json: bool, quiet: bool) -> tuple[Workspace, Console]:

@@ -10,22 +10,10 @@ import click
 from ..core.errors import UserError
 
 _EXTRAS = {
-    "torch": "train",
-    "bpy": "render",
-    "mitsuba": "render",
-    "drjit": "render",
-    "flip_evaluator": "render",
-    "imageio_ffmpeg": "render",
-    "PIL": "render",
-    "jinja2": "render",
-    "matplotlib": "render",
-    "onnx": "export",
-    "onnxruntime": "export",
-    "playwright": "export",
-    "fastapi": "serve",
-    "uvicorn": "serve",
-    "websockets": "serve",
-    "httpx": "serve",
+    "train": ("torch",),
+    "render": ("bpy", "mitsuba", "drjit", "flip_evaluator", "imageio_ffmpeg", "PIL", "jinja2", "matplotlib"),
+    "export": ("onnx", "onnxruntime", "playwright"),
+    "serve": ("fastapi", "uvicorn", "websockets", "httpx"),
 }
 
 
@@ -46,8 +34,9 @@ def explain(error: Exception) -> tuple[str, int] | None:
         return error.format_message(), 2
     if isinstance(error, ModuleNotFoundError):
         module = (error.name or "").split(".")[0]
-        if module in _EXTRAS:
-            return f"{module} is not installed; run `pip install 'dnrpipe[{_EXTRAS[module]}]'`", 2
+        for extra, modules in _EXTRAS.items():
+            if module in modules:
+                return f"{module} is not installed; run `pip install 'dnrpipe[{extra}]'`", 2
     if isinstance(error, OSError):
         return _explain_os(error)
     return None

@@ -35,7 +35,7 @@ def _client(server: str | None, token_file: Path | None) -> Client:
     import os
 
     from ..service.client import DEFAULT_SERVER, Client
-    from ..service.tokens import read_token
+    from ..service.config import read_token
 
     named = token_file or os.environ.get("DNRPIPE_TOKEN_FILE")
     token = read_token(Path(named)) if named else None
@@ -67,9 +67,8 @@ def submit(
     memory_mb: int | None,
     disk_mb: int | None,
     detach: bool,
-    server: str | None,
-    token_file: Path | None,
     as_json: bool,
+    **server: Any,
 ) -> None:
     """Send a job to a server, and show its progress.
 
@@ -85,7 +84,7 @@ def submit(
     import pydantic
 
     from ..core.console import Console
-    from ..service.models import JobRequest, Limits
+    from ..service.models import JobRequest, Limits, first_fault
 
     console = Console(json_mode=as_json)
     path = Path(scene)
@@ -105,9 +104,8 @@ def submit(
         limits = Limits(seconds=3600 * hours if hours is not None else None, memory_mb=memory_mb, disk_mb=disk_mb)
         request = JobRequest(**fields, force=force, priority=priority, limits=limits)  # type: ignore[arg-type]
     except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        raise UserError(f"submit: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
-    with _client(server, token_file) as client:
+        raise UserError(f"submit: {first_fault(error)}") from None
+    with _client(**server) as client:
         if upload is not None:
             with console.bar(f"uploading {path.name}", path.stat().st_size) as bar:
                 client.upload(path, upload, sent=bar.advance)
@@ -116,14 +114,17 @@ def submit(
         if not detach:
             job = _follow(client, job, console)
     console.result(job.model_dump(mode="json"))
-    _exit(job)
+    if job.state == "failed":
+        raise UserError(f"job {job.id}: {job.error}")
+    if job.state == "cancelled":
+        raise UserError(f"job {job.id} was cancelled; `dnrpipe retry {job.id}` goes on")
 
 
 @click.command()
 @click.option("--state", "states", type=click.Choice(STATES), multiple=True, help="Only these. Repeatable.")
 @click.option("-n", "--limit", type=click.IntRange(1), default=20, show_default=True, metavar="N")
 @with_options(SERVER)
-def jobs(states: tuple[str, ...], limit: int, server: str | None, token_file: Path | None, as_json: bool) -> None:
+def jobs(states: tuple[str, ...], limit: int, as_json: bool, **server: Any) -> None:
     """List the jobs of a server, newest first.
 
     \b
@@ -131,7 +132,7 @@ def jobs(states: tuple[str, ...], limit: int, server: str | None, token_file: Pa
       dnrpipe jobs
       dnrpipe jobs --state queued --state running --json
     """
-    with _client(server, token_file) as client:
+    with _client(**server) as client:
         found = list(client.jobs(list(states), limit))  # type: ignore[arg-type]
     if as_json:
         click.echo(json.dumps([job.model_dump(mode="json") for job in found], indent=2))
@@ -146,7 +147,7 @@ def jobs(states: tuple[str, ...], limit: int, server: str | None, token_file: Pa
 @click.argument("job", type=click.IntRange(1))
 @click.option("-f", "--follow", is_flag=True, help="Go on until the job has ended.")
 @with_options(SERVER)
-def logs(job: int, follow: bool, server: str | None, token_file: Path | None, as_json: bool) -> None:
+def logs(job: int, follow: bool, as_json: bool, **server: Any) -> None:
     """Print what a job's process printed.
 
     \b
@@ -156,7 +157,7 @@ def logs(job: int, follow: bool, server: str | None, token_file: Path | None, as
     """
     from ..service.models import FINAL
 
-    with _client(server, token_file) as client:
+    with _client(**server) as client:
         offset, text = 0, ""
         while True:
             ended = client.job(job).state in FINAL
@@ -165,12 +166,12 @@ def logs(job: int, follow: bool, server: str | None, token_file: Path | None, as
                 text += page.text
             else:
                 click.echo(page.text, nl=False)
-            more = page.next < page.size
             offset = page.next
-            if not more and (ended or not follow):
+            if offset < page.size:
+                continue
+            if ended or not follow:
                 break
-            if not more:
-                time.sleep(LOG_PAUSE)
+            time.sleep(LOG_PAUSE)
     if as_json:
         click.echo(json.dumps({"job": job, "text": text}))
 
@@ -178,31 +179,31 @@ def logs(job: int, follow: bool, server: str | None, token_file: Path | None, as
 @click.command()
 @click.argument("job", type=click.IntRange(1))
 @with_options(SERVER)
-def cancel(job: int, server: str | None, token_file: Path | None, as_json: bool) -> None:
+def cancel(job: int, **options: Any) -> None:
     """Cancel a queued or running job; what it made is kept.
 
     \b
     Examples:
       dnrpipe cancel 12
     """
-    _act(lambda client: client.cancel(job), server, token_file, as_json)
+    _act(lambda client: client.cancel(job), **options)
 
 
 @click.command()
 @click.argument("job", type=click.IntRange(1))
 @with_options(SERVER)
-def retry(job: int, server: str | None, token_file: Path | None, as_json: bool) -> None:
+def retry(job: int, **options: Any) -> None:
     """Queue a failed or cancelled job again; it goes on where it stopped.
 
     \b
     Examples:
       dnrpipe retry 12
     """
-    _act(lambda client: client.retry(job), server, token_file, as_json)
+    _act(lambda client: client.retry(job), **options)
 
 
-def _act(wish: Callable[[Client], Job], server: str | None, token_file: Path | None, as_json: bool) -> None:
-    with _client(server, token_file) as client:
+def _act(wish: Callable[[Client], Job], as_json: bool, **server: Any) -> None:
+    with _client(**server) as client:
         job = wish(client)
     if as_json:
         click.echo(json.dumps(job.model_dump(mode="json"), indent=2))
@@ -253,13 +254,6 @@ class _Shown:
     def close(self) -> None:
         self.stack.close()
         self.bar = None
-
-
-def _exit(job: Job) -> None:
-    if job.state == "failed":
-        raise UserError(f"job {job.id}: {job.error}")
-    if job.state == "cancelled":
-        raise UserError(f"job {job.id} was cancelled; `dnrpipe retry {job.id}` goes on")
 
 
 def _how(job: Job) -> str:

@@ -20,28 +20,35 @@ SAMPLES_AT_ONCE = 8
 """The least that is traced towards a target: schedule.STEP, which is not imported for --help."""
 
 
-def common(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Options every stage has."""
-    for option in reversed(
-        [
-            click.option("-w", "--workspace", metavar="DIR", help="The workspace folder (scene.dnr)."),
-            click.option("--preset", metavar="NAME", help="draft (default), standard or paper."),
-            click.option(
-                "--set",
-                "assignments",
-                multiple=True,
-                metavar="KEY=VALUE",
-                help="Any setting, e.g. --set finetune.step2.epochs=20. Repeatable; remembered.",
-            ),
-            click.option("--force", is_flag=True, help="Do it again, reusing nothing."),
-            click.option("--json", "as_json", is_flag=True, help="Print one JSON value; messages to stderr."),
-            click.option("-q", "--quiet", is_flag=True, help="Warnings and errors only."),
-        ]
-    ):
-        function = option(function)
-    return function
+def options(options: list[Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        for option in reversed(options):
+            function = option(function)
+        return function
+
+    return decorate
 
 
+OUTPUT_OPTIONS = [
+    click.option("--json", "as_json", is_flag=True, help="Print one JSON value; messages to stderr."),
+    click.option("-q", "--quiet", is_flag=True, help="Warnings and errors only."),
+]
+common = options(
+    [
+        click.option("-w", "--workspace", metavar="DIR", help="The workspace folder (scene.dnr)."),
+        click.option("--preset", metavar="NAME", help="draft (default), standard or paper."),
+        click.option(
+            "--set",
+            "assignments",
+            multiple=True,
+            metavar="KEY=VALUE",
+            help="Any setting, e.g. --set finetune.step2.epochs=20. Repeatable; remembered.",
+        ),
+        click.option("--force", is_flag=True, help="Do it again, reusing nothing."),
+        *OUTPUT_OPTIONS,
+    ]
+)
+"""Options every stage has."""
 CAMERA_OPTIONS = [
     click.option(
         "--cameras",
@@ -72,15 +79,6 @@ def strict_override(strict: bool) -> dict[str, Any]:
     return {"strict": True} if strict else {}
 
 
-def options(options: list[Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        for option in reversed(options):
-            function = option(function)
-        return function
-
-    return decorate
-
-
 def open_session(
     command: str,
     options: dict[str, Any],
@@ -100,15 +98,14 @@ def camera_overrides(options: dict[str, Any]) -> dict[str, Any]:
     source = options.pop("cameras")
     if source is not None:
         from ..core.cameras import KEYWORDS
+        from ..core.workspace import file_sha256
 
-        if source not in KEYWORDS and not Path(source).is_file():
-            raise UserError(f"--cameras {source}: neither {', '.join(KEYWORDS)} nor a camera file")
         if source in KEYWORDS:
             cameras |= {"source": source, "source_sha256": ""}
-        else:
-            from ..core.workspace import file_sha256
-
+        elif Path(source).is_file():
             cameras |= {"source": str(Path(source).resolve()), "source_sha256": file_sha256(Path(source))}
+        else:
+            raise UserError(f"--cameras {source}: neither {', '.join(KEYWORDS)} nor a camera file")
     views, resolution, raster = options.pop("views"), options.pop("resolution"), options.pop("raster")
     if views is not None:
         cameras["train"] = views
@@ -122,9 +119,9 @@ def camera_overrides(options: dict[str, Any]) -> dict[str, Any]:
 
 def select_overrides(options: dict[str, Any]) -> dict[str, Any]:
     chosen = {key: options.pop(key) for key in ("budget", "policy")}
-    if chosen["budget"] is not None and chosen["budget"] < 1:
-        raise UserError(f"--budget {chosen['budget']}: must be at least 1 view")
     given = {key: value for key, value in chosen.items() if value is not None}
+    if given.get("budget", 1) < 1:
+        raise UserError(f"--budget {given['budget']}: must be at least 1 view")
     return {"select": given} if given else {}
 
 
@@ -134,10 +131,7 @@ def tracing_overrides(noise: str | None, time: str | None, spp: int | None, deno
 
     raytrace: dict[str, Any] = {}
     if noise is not None or time is not None:
-        raytrace = {
-            "noise": amount("--noise", noise, parse_share),
-            "time": amount("--time", time, parse_seconds),
-        }
+        raytrace = {"noise": amount("--noise", noise, parse_share), "time": amount("--time", time, parse_seconds)}
         if spp is not None:
             if spp < SAMPLES_AT_ONCE:
                 raise UserError(f"--spp {spp}: with --noise or --time at least {SAMPLES_AT_ONCE}, one in each group")

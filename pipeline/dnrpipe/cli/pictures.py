@@ -43,8 +43,28 @@ def render(
     """
     if orbit is not None and camera_file is not None:
         raise UserError("render: give --orbit or --cameras, not both")
+    from dnrtrain.contract import parse_transforms
+
+    from ..core.cameras import orbit_views
+    from ..core.scene_files import read_summary
+    from ..stages.pipeline import STAGES, require_inputs
+    from ..stages.render import render_novel
+
     with open_session("render", options) as session:
-        _render(session, orbit or 60, elevation, camera_file, frames, movie, resolution)
+        require_inputs(STAGES["evaluate"], session.workspace, session.settings)
+        cameras = session.settings.cameras
+        if camera_file is not None:
+            views = parse_transforms(camera_file, (cameras.width, cameras.height))
+            name = camera_file.stem
+        else:
+            if resolution is not None:
+                cameras = cameras.model_copy(update={"width": resolution, "height": resolution})
+            views = orbit_views(read_summary(session.workspace.scene), cameras, orbit or 60, elevation)
+            name = f"orbit-{orbit or 60}"
+        answer = render_novel(session.run.for_stage("render"), views, name=name, frames=frames, movie=movie)
+        session.console.say(f"{answer['frames']} frames, {answer['neural_ms']:.1f} ms each for the network")
+        session.console.say(answer["movie"] or answer["folder"])
+        session.console.result(answer)
 
 
 @click.command()
@@ -59,40 +79,6 @@ def report(**options: Any) -> None:
     """
     with open_session("report", options) as session:
         write_report(session)
-
-
-def _render(
-    session: Session,
-    orbit: int,
-    elevation: float,
-    camera_file: Path | None,
-    frames: str,
-    movie: str,
-    resolution: int | None,
-) -> None:
-    from dnrtrain.contract import parse_transforms
-
-    from ..core.cameras import orbit_views
-    from ..core.scene_files import read_summary
-    from ..stages.pipeline import STAGES, require_inputs
-    from ..stages.render import render_novel
-
-    require_inputs(STAGES["evaluate"], session.workspace, session.settings)
-    cameras = session.settings.cameras
-    if camera_file is not None:
-        views = parse_transforms(camera_file, (cameras.width, cameras.height))
-        name = camera_file.stem
-    else:
-        if resolution is not None:
-            cameras = cameras.model_copy(update={"width": resolution, "height": resolution})
-        views = orbit_views(read_summary(session.workspace.scene), cameras, orbit, elevation)
-        name = f"orbit-{orbit}"
-    console = session.console
-    run = session.run.for_stage("render")
-    answer = render_novel(run, views, name=name, frames=frames, movie=movie)
-    console.say(f"{answer['frames']} frames, {answer['neural_ms']:.1f} ms each for the network")
-    console.say(answer["movie"] or answer["folder"])
-    console.result(answer)
 
 
 def write_report(session: Session) -> None:

@@ -10,8 +10,6 @@ import click
 
 from .options import common, open_session
 
-_EFFECT = "NAME"
-
 
 @click.command()
 @click.argument("scene", type=click.Path(path_type=Path))
@@ -35,9 +33,9 @@ def inspect(scene: Path, as_json: bool) -> None:
 
 @click.command()
 @click.option("--measure", is_flag=True, help="Fill the cost and error columns from short paired renders.")
-@click.option("--enable", multiple=True, metavar=_EFFECT, help="Simulate an effect. Repeatable; remembered.")
-@click.option("--disable", multiple=True, metavar=_EFFECT, help="Leave an effect out. Repeatable; remembered.")
-@click.option("--auto", multiple=True, metavar=_EFFECT, help="Let the scene decide again. Repeatable.")
+@click.option("--enable", multiple=True, metavar="NAME", help="Simulate an effect. Repeatable; remembered.")
+@click.option("--disable", multiple=True, metavar="NAME", help="Leave an effect out. Repeatable; remembered.")
+@click.option("--auto", multiple=True, metavar="NAME", help="Let the scene decide again. Repeatable.")
 @common
 def effects(
     measure: bool, enable: tuple[str, ...], disable: tuple[str, ...], auto: tuple[str, ...], **options: Any

@@ -50,10 +50,9 @@ def serve(
       dnrpipe submit scene.blend             # in another terminal
     """
     from ..core.console import Console
-    from ..service.config import ServerConfig, default_devices, default_memory_mb
+    from ..service.config import ServerConfig, default_devices, default_memory_mb, read_token
     from ..service.models import Limits
     from ..service.server import serve as run_server
-    from ..service.tokens import read_token
 
     token = read_token(token_file) if token_file is not None else None
     chosen = tuple(part.strip() for part in devices.split(",")) if devices else default_devices()

@@ -129,41 +129,25 @@ class _Parts:
 
     def vectors(self, values: np.ndarray, *, bounds: bool = False) -> int:
         values = np.ascontiguousarray(values, "<f4")
-        entry: dict[str, Any] = {
-            "bufferView": self.view(values.tobytes(), ARRAY),
-            "componentType": FLOAT,
-            "count": len(values),
-            "type": f"VEC{values.shape[1]}",
-        }
-        if bounds:
-            entry |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
-        self.accessors.append(entry)
-        return len(self.accessors) - 1
+        limits = {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()} if bounds else {}
+        return self._accessor(values, ARRAY, FLOAT, len(values), f"VEC{values.shape[1]}", limits)
 
     def indices(self, faces: np.ndarray) -> int:
-        content = np.ascontiguousarray(faces, "<u4").tobytes()
-        self.accessors.append(
-            {
-                "bufferView": self.view(content, INDICES),
-                "componentType": UNSIGNED,
-                "count": faces.size,
-                "type": "SCALAR",
-            }
-        )
+        return self._accessor(np.ascontiguousarray(faces, "<u4"), INDICES, UNSIGNED, faces.size, "SCALAR", {})
+
+    def _accessor(
+        self, values: np.ndarray, target: int, component: int, count: int, kind: str, limits: dict[str, Any]
+    ) -> int:
+        view = self.view(values.tobytes(), target)
+        self.accessors.append({"bufferView": view, "componentType": component, "count": count, "type": kind, **limits})
         return len(self.accessors) - 1
 
 
 def _material(name: str, lit: bool) -> dict[str, Any]:
-    surface: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
-    if not lit:
-        return {
-            "name": name,
-            "doubleSided": True,
-            "pbrMetallicRoughness": surface | {"baseColorFactor": [0.8, 0.8, 0.8, 1]},
-        }
-    surface["baseColorTexture"] = {"index": 0, "texCoord": 0}
-    unlit: dict[str, Any] = {"KHR_materials_unlit": {}}
-    return {"name": name, "doubleSided": True, "pbrMetallicRoughness": surface, "extensions": unlit}
+    colour = {"baseColorTexture": {"index": 0, "texCoord": 0}} if lit else {"baseColorFactor": [0.8, 0.8, 0.8, 1]}
+    surface = {"metallicFactor": 0.0, "roughnessFactor": 1.0, **colour}
+    extensions = {"extensions": {"KHR_materials_unlit": {}}} if lit else {}
+    return {"name": name, "doubleSided": True, "pbrMetallicRoughness": surface, **extensions}
 
 
 def _rotated(vectors: np.ndarray) -> np.ndarray:

@@ -55,7 +55,11 @@ def read_meshes(scene: Path) -> list[BundleMesh]:
         numbers = np.array([float(part) for part in matrix.attrib["value"].split()]).reshape(4, 4)
         numbers[:3, 3] /= unit
         placed.setdefault(reference.attrib["id"], []).append(numbers)
-    found = [_mesh(shape, scene, unit, [np.eye(4)]) for shape in root.findall("shape[@type='ply']") if _seen(shape)]
+    found = [
+        _mesh(shape, scene, unit, [np.eye(4)])
+        for shape in root.findall("shape[@type='ply']")
+        if not shape.get("id", "").startswith(SKIPPED)
+    ]
     for group in root.findall("shape[@type='shapegroup']"):
         places = placed.get(group.attrib["id"], [])
         found += [_mesh(shape, scene, unit, places) for shape in group.findall("shape[@type='ply']") if places]
@@ -81,10 +85,6 @@ def read_ply(path: Path) -> tuple[dict[str, np.ndarray], np.ndarray]:
     if len(faces) and (faces.min() < 0 or faces.max() >= vertices):
         raise UserError(f"{path}: faces name vertices that are not there; run `dnrpipe prepare --force`")
     return {name: table[:, i] for i, name in enumerate(names)}, faces
-
-
-def _seen(shape: ET.Element) -> bool:
-    return not shape.get("id", "").startswith(SKIPPED)
 
 
 def _mesh(shape: ET.Element, scene: Path, unit: float, placements: list[np.ndarray]) -> BundleMesh:

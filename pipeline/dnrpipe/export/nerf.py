@@ -58,18 +58,20 @@ def export_nerf(workspace: Workspace, out: Path, console: Console, *, normalise:
     cloud = out / "points3d.ply"
     write_points(cloud, (points + shift) * scale, colours)
     moved = {split: [_moved(view, scale, shift) for view in members] for split, members in views.items()}
-    shared = _shared_intrinsics([*moved["train"], *moved["test"]])
+    intrinsics = [_intrinsics(view) for split in SPLITS for view in moved[split]]
+    shared = intrinsics[0] if all(other == intrinsics[0] for other in intrinsics) else None
+    first = views["train"][0]
     if shared is None:
         console.warn("the views have different lenses: readers of NeRF-Synthetic take the first one's for all of them")
-    elif not _centred(views["train"][0]):
+    elif abs(first.cx - first.width / 2) >= 1e-3 or abs(first.cy - first.height / 2) >= 1e-3:
         console.warn("the principal point is not the image's centre: readers of NeRF-Synthetic ignore that")
     extra = {"scale": scale, "shift": [float(x) for x in shift]}
     for name, split in (("train", "train"), ("val", "test"), ("test", "test")):
         path = out / f"transforms_{name}.json"
-        write_json(path, _transforms(moved[split], split, shared, extra, suffix=""))
+        write_json(path, _transforms(moved[split], f"./images/{split}/{{}}", shared, extra))
         files.append(path)
-    files += [cloud, _write_nerfstudio(out, moved, shared, extra)]
-    finish(out, "nerf", files)
+    write_json(out / "transforms.json", _nerfstudio(moved, shared, extra))
+    finish(out, "nerf", [*files, cloud, out / "transforms.json"])
     return {
         "folder": str(out),
         "train": len(views["train"]),
@@ -98,14 +100,15 @@ def write_rgba(path: Path, image: Path, frame: SceneFrame, folder: Path) -> None
 
 def write_points(path: Path, points: np.ndarray, colours: np.ndarray) -> None:
     """Points [P, 3] and colours uint8 [P, 3] as binary PLY with the properties that 3-D Gaussian splatting reads."""
-    names = [("x", "float"), ("y", "float"), ("z", "float"), ("nx", "float"), ("ny", "float"), ("nz", "float")]
-    names += [("red", "uchar"), ("green", "uchar"), ("blue", "uchar")]
-    table = np.zeros(len(points), [(name, "<f4" if kind == "float" else "u1") for name, kind in names])
+    channels = ("red", "green", "blue")
+    columns = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [(name, "u1") for name in channels]
+    table = np.zeros(len(points), columns)
     for i in range(3):
         table["xyz"[i]] = points[:, i]
-        table[("red", "green", "blue")[i]] = colours[:, i]
+        table[channels[i]] = colours[:, i]
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
-    lines += [f"property {kind} {name}" for name, kind in names] + ["end_header", ""]
+    lines += [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in columns]
+    lines += ["end_header", ""]
     with atomic_path(path) as temporary:
         temporary.write_bytes("\n".join(lines).encode("ascii") + table.tobytes())
 
@@ -144,24 +147,13 @@ def _intrinsics(view: View) -> dict[str, float]:
     }
 
 
-def _shared_intrinsics(views: Sequence[View]) -> dict[str, float] | None:
-    first = _intrinsics(views[0])
-    return first if all(_intrinsics(view) == first for view in views) else None
-
-
-def _centred(view: View) -> bool:
-    return abs(view.cx - view.width / 2) < 1e-3 and abs(view.cy - view.height / 2) < 1e-3
-
-
 def _transforms(
-    views: Sequence[View], split: str, shared: dict[str, float] | None, extra: dict[str, Any], *, suffix: str
+    views: Sequence[View], file_path: str, shared: dict[str, float] | None, extra: dict[str, Any]
 ) -> dict[str, Any]:
     """Intrinsics stand once where all views share them; else in each frame, the first one's angle also once."""
     frames = [
         {
-            "file_path": f"./images/{split}/{view.name}{suffix}"
-            if not suffix
-            else f"images/{split}/{view.name}{suffix}",
+            "file_path": file_path.format(view.name),
             **({} if shared is not None else _intrinsics(view)),
             "transform_matrix": [list(row) for row in view.c2w],
         }
@@ -171,12 +163,10 @@ def _transforms(
     return {**(shared or angle), "dnrpipe": extra, "frames": frames}
 
 
-def _write_nerfstudio(
-    out: Path, views: dict[str, list[View]], shared: dict[str, float] | None, extra: dict[str, Any]
-) -> Path:
-    parts = {split: _transforms(views[split], split, shared, extra, suffix=".png") for split in SPLITS}
+def _nerfstudio(views: dict[str, list[View]], shared: dict[str, float] | None, extra: dict[str, Any]) -> dict[str, Any]:
+    parts = {split: _transforms(views[split], f"images/{split}/{{}}.png", shared, extra) for split in SPLITS}
     names = {split: [frame["file_path"] for frame in parts[split]["frames"]] for split in SPLITS}
-    whole = {
+    return {
         **parts["train"],
         "camera_model": "OPENCV",
         "ply_file_path": "points3d.ply",
@@ -185,8 +175,6 @@ def _write_nerfstudio(
         "test_filenames": names["test"],
         "frames": [*parts["train"]["frames"], *parts["test"]["frames"]],
     }
-    write_json(out / "transforms.json", whole)
-    return out / "transforms.json"
 
 
 def _points(workspace: Workspace, views: Sequence[View], frame: SceneFrame) -> tuple[np.ndarray, np.ndarray]:

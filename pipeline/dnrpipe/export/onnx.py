@@ -102,13 +102,25 @@ def _compare(
     import onnxruntime
     import torch
 
+    from dnrtrain.correction import to_log
+    from dnrtrain.dataset import load_views
     from dnrtrain.onnx_export import input_names
 
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    batch = _batch(workspace, model, frame, view, split)
-    inputs = view_inputs(workspace, view, split, model.settings.base, input_names(model.settings))
+    base = model.settings.base
+    batch = load_views(
+        [workspace.passes(split, view.name)],
+        None,
+        frame,
+        cameras=[view],
+        folder=workspace.scene,
+        target=False,
+        base=base,
+        base_files=[base_path(workspace, split, view.name)] if base in RENDERED else None,
+    ).batch([0])
+    inputs = view_inputs(workspace, view, split, base, input_names(model.settings))
     height, width = (min(side, odd) for side, odd in zip((view.height, view.width), ODD, strict=True))
     differences, seconds = {}, []
     for name, rows, columns in (("whole", view.height, view.width), ("cut", height, width)):
@@ -119,8 +131,9 @@ def _compare(
         started = time.perf_counter()
         answers = session.run(None, given)
         seconds.append(time.perf_counter() - started)
-        expected = [output.rgb.clamp(0.0, 1.0)] + ([] if output.radiance is None else [_compressed(output.radiance)])
-        answers = [torch.from_numpy(answers[0]), *(_compressed(torch.from_numpy(a)) for a in answers[1:])]
+        # Highlights of 1,000 differ by rounding alone by more than 1e-3: radiance is compared where the network works.
+        expected = [output.rgb.clamp(0.0, 1.0)] + ([] if output.radiance is None else [to_log(output.radiance)])
+        answers = [torch.from_numpy(answers[0]), *(to_log(torch.from_numpy(a)) for a in answers[1:])]
         differences[name] = max(float((a - b).abs().max()) for a, b in zip(answers, expected, strict=True))
     bar.advance(note=f"{max(differences.values()):.1e}")
     return {
@@ -130,28 +143,3 @@ def _compare(
         **differences,
         "milliseconds": 1000 * seconds[0],
     }
-
-
-def _compressed(radiance: Any) -> Any:
-    """Highlights of 1,000 differ by rounding alone by more than 1e-3: compared where the network works."""
-    from dnrtrain.correction import to_log
-
-    return to_log(radiance)
-
-
-def _batch(workspace: Workspace, model: DNR, frame: SceneFrame, view: View, split: str) -> Any:
-    """The same view by the trainer's own loader, without the target."""
-    from dnrtrain.dataset import load_views
-
-    base = model.settings.base
-    views = load_views(
-        [workspace.passes(split, view.name)],
-        None,
-        frame,
-        cameras=[view],
-        folder=workspace.scene,
-        target=False,
-        base=base,
-        base_files=[base_path(workspace, split, view.name)] if base in RENDERED else None,
-    )
-    return views.batch([0])

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import tarfile
 import tempfile
+from importlib.resources import files
 from pathlib import Path
 
 from dnrtrain.atomic import atomic_path, write_text
@@ -22,25 +23,6 @@ FILES = (
     "ort.webgpu.bundle.min.mjs",
     "ort-wasm-simd-threaded.asyncify.wasm",
 )
-LICENCE = """onnxruntime-web {version}, https://www.npmjs.com/package/onnxruntime-web
-
-MIT License
-
-Copyright (c) Microsoft Corporation
-
-Permission is hereby granted, free of charge, to any person obtaining a copy of this software and associated
-documentation files (the "Software"), to deal in the Software without restriction, including without limitation the
-rights to use, copy, modify, merge, publish, distribute, sublicense, and/or sell copies of the Software, and to permit
-persons to whom the Software is furnished to do so, subject to the following conditions:
-
-The above copyright notice and this permission notice shall be included in all copies or substantial portions of the
-Software.
-
-THE SOFTWARE IS PROVIDED "AS IS", WITHOUT WARRANTY OF ANY KIND, EXPRESS OR IMPLIED, INCLUDING BUT NOT LIMITED TO THE
-WARRANTIES OF MERCHANTABILITY, FITNESS FOR A PARTICULAR PURPOSE AND NONINFRINGEMENT. IN NO EVENT SHALL THE AUTHORS OR
-COPYRIGHT HOLDERS BE LIABLE FOR ANY CLAIM, DAMAGES OR OTHER LIABILITY, WHETHER IN AN ACTION OF CONTRACT, TORT OR
-OTHERWISE, ARISING FROM, OUT OF OR IN CONNECTION WITH THE SOFTWARE OR THE USE OR OTHER DEALINGS IN THE SOFTWARE.
-"""
 
 
 def runtime() -> Path:
@@ -48,7 +30,8 @@ def runtime() -> Path:
 
     Raises UserError: no npm, no network, or other bytes than expected.
     """
-    folder = _cache() / f"onnxruntime-web-{VERSION}"
+    cache = Path(os.environ.get("DNRPIPE_CACHE") or Path.home() / ".cache" / "dnrpipe")
+    folder = cache / f"onnxruntime-web-{VERSION}"
     if all((folder / name).is_file() for name in (*FILES, "LICENSE")):
         return folder
     npm = shutil.which("npm")
@@ -70,9 +53,6 @@ def runtime() -> Path:
                 assert member is not None
                 with atomic_path(folder / name) as temporary:
                     temporary.write_bytes(member.read())
-    write_text(folder / "LICENSE", LICENCE.format(version=VERSION))
+    licence = files("dnrpipe.export") / "page" / "onnxruntime-LICENSE"
+    write_text(folder / "LICENSE", licence.read_text(encoding="utf-8").format(version=VERSION))
     return folder
-
-
-def _cache() -> Path:
-    return Path(os.environ.get("DNRPIPE_CACHE") or Path.home() / ".cache" / "dnrpipe")

@@ -94,7 +94,12 @@ def export_web(
     for name in (*FILES, "LICENSE"):
         with atomic_path(out / "ort" / name) as temporary:
             temporary.write_bytes((vendored / name).read_bytes())
-    _embed(out)
+    embedded = (*EMBEDDED, *(f"ort/{name}" for name in FILES[:2]))
+    offline = {
+        "scene": json.loads((out / "scene.json").read_text(encoding="utf-8")),
+        "files": {name: base64.b64encode((out / name).read_bytes()).decode("ascii") for name in embedded},
+    }
+    write_text(out / "offline.js", f"window.DNR_OFFLINE = {json.dumps(offline)};\n")
     written = [
         *(out / name for name in (*EMBEDDED, "scene.json", "index.html", "viewer.js", "offline.js")),
         *(out / "ort" / name for name in (*FILES, "LICENSE")),
@@ -145,15 +150,3 @@ def _scene(workspace: Workspace, views: dict[str, list[View]], maps: SurfaceMaps
         "distance": float(np.median([np.linalg.norm(view.position - frame.center) for view in views["train"]])),
         "trained_on": len(read_selection(workspace).views),
     }
-
-
-def _embed(out: Path) -> None:
-    """``offline.js``: base64 of what the page would otherwise fetch."""
-
-    def text(path: Path) -> str:
-        return base64.b64encode(path.read_bytes()).decode("ascii")
-
-    content = {name: text(out / name) for name in EMBEDDED}
-    content |= {f"ort/{name}": text(out / "ort" / name) for name in FILES[:2]}
-    scene = json.loads((out / "scene.json").read_text(encoding="utf-8"))
-    write_text(out / "offline.js", f"window.DNR_OFFLINE = {json.dumps({'scene': scene, 'files': content})};\n")

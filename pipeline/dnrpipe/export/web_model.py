@@ -44,13 +44,11 @@ def web_settings(settings: Settings, views: int, epochs: int | None) -> tuple[Mo
     return model, step2.model_copy(update={"epochs": wanted})
 
 
-def web_views(
-    workspace: Workspace, views: Sequence[View], split: str, maps: SurfaceMaps, *, raytraced: bool = True
-) -> ViewSet:
+def web_views(workspace: Workspace, views: Sequence[View], split: str, maps: SurfaceMaps) -> ViewSet:
     """The views with the base image that the page would draw, and ray-traced targets."""
     from dnrtrain.display import DisplayTransform
 
-    loaded = load(workspace, list(views), split, raytraced=raytraced)
+    loaded = load(workspace, list(views), split, raytraced=True)
     base = base_images(loaded.tensors, maps)
     display = DisplayTransform(read_frame(workspace), workspace.scene)
     return replace(loaded, tensors=replace(loaded.tensors, base=base, display=display))

@@ -13,8 +13,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .frames_rays import lets_through
-from .lobes import bsdfs_of
+from .lobes import bsdfs_of, lets_through
 from .visibility import first_visible_of
 
 MAX_BOUNCES = 6

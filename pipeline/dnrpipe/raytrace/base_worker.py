@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import time
 from typing import Any
 
@@ -14,12 +13,11 @@ from dnrtrain.exr import write_exr
 
 from .base_renderer import BaseRenderer
 from .denoise import denoise
-from .engine import Engine
-from .finite import masked
+from .engine import Engine, masked
 from .frames import Frames
 from .light_worker import read_light
-from .tasks import BakedCommon, BaseAnswer, BaseTask, SampledCommon
-from .units import scaled_view
+from .sensors import scaled_view
+from .tasks import BakedCommon, BaseAnswer, BaseTask, SampledCommon, costs_since
 
 COLOUR = ("base.R", "base.G", "base.B", "base.A")
 MIRROR = 0.02
@@ -56,9 +54,7 @@ class Worker:
         started, cpu = time.monotonic(), time.process_time()
         channels = self.channels(view)
         answer: BaseAnswer = {
-            "seconds": time.monotonic() - started,
-            "cpu_seconds": time.process_time() - cpu,
-            "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            **costs_since(started, cpu),
             "kind": self.common.kind,
             "samples": self.common.samples,
             "repaired": self.repaired,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,8 @@ from dnrtrain.contract import View
 
 from . import paths, plugins
 from .auxiliary import auxiliary_integrator
-from .finite import masked
 from .recorded import without_collection
-from .sensors import sensor_dict
-from .units import scaled_lens, scaled_view, unit_scale
+from .sensors import scaled_lens, scaled_view, sensor_dict, unit_scale
 from .visibility import camera_integrator
 
 # Samples per kernel launch x pixels: bounds the wavefront's memory (about 1 GiB on the CPU).
@@ -155,3 +153,23 @@ def _refuse_instances(bundles: Sequence[Path]) -> None:
                 f"{bundle}: has instances, which Mitsuba's scalar variant cannot render;"
                 " install LLVM (see `dnrpipe doctor`)"
             )
+
+
+def masked(image: np.ndarray) -> tuple[np.ndarray, int]:
+    """``image`` [H, W, C] with 0 in the pixels that hold a NaN or an infinity, and how many those are."""
+    fine = np.isfinite(image).all(axis=-1, keepdims=True)
+    lost = int(fine.size - np.count_nonzero(fine))
+    return (np.where(fine, image, 0).astype(image.dtype) if lost else image), lost
+
+
+def masked_channels(channels: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int]:
+    """The same of channels [H, W]: a pixel that is not finite in one of them becomes 0 in all.
+
+    Nearly always there is nothing to do, and then it costs one addition a value: a sum is finite where its terms are.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        sums = [float(values.sum()) for values in channels.values()]
+    if np.isfinite(sums).all():
+        return dict(channels), 0
+    bad = ~np.logical_and.reduce([np.isfinite(values) for values in channels.values()])
+    return {name: np.where(bad, values.dtype.type(0), values) for name, values in channels.items()}, int(bad.sum())

@@ -11,6 +11,7 @@ Notation
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,10 +23,11 @@ from dnrtrain.contract import View
 
 from .auxiliary import shown_first
 from .engine import Engine
-from .frames_rays import lets_through, pinhole, seen_first
+from .lobes import lets_through
 from .recorded import Recorded, prepare_emitters
+from .sensors import scaled_view
 from .texels import ATTRIBUTE
-from .units import scaled_view
+from .visibility import first_visible_of
 
 MAX_EDGE_RAYS = 1 << 24
 """Of a launch that looks at silhouettes: bounds its memory."""
@@ -65,22 +67,16 @@ class Frames:
         prepare_emitters(self.mi, self.scene)
         self.integrator, self.name = engine.integrator(bundle, integrator, max_depth)
         self.passing = lets_through(self.mi, self.scene)
-        self._path: dict[int, Any] = {}
-        self._auxiliary: dict[int, Any] = {}
-        self._centre: Any = None
+        self._kernels: dict[tuple[str, int], Any] = {}
         self._cover: dict[int, Any] = {}
 
     def path(self, view: View, spp: int, seed: int) -> np.ndarray:
         """Path-traced RGBA, linear Rec.709, premultiplied, box filter, float32 [H, W, 4]; NaN where Mitsuba gave it."""
-        if spp not in self._path:
-            self._path[spp] = self._warmed(self._path_kernel(spp), view, spp)
-        return self._image(self._path[spp](*self._inputs(view, seed, spp)))
+        return self._image(self._kernel(self._path_kernel, view, spp)(*self._inputs(view, seed, spp)))
 
     def auxiliary(self, view: View, rays: int, seed: int) -> Auxiliary:
         """Means over ``rays`` primary rays a pixel; a square number of them is stratified, one per cell."""
-        if rays not in self._auxiliary:
-            self._auxiliary[rays] = self._warmed(self._auxiliary_kernel(rays), view, rays)
-        image = self._image(self._auxiliary[rays](*self._inputs(view, seed, rays)))
+        image = self._image(self._kernel(self._auxiliary_kernel, view, rays)(*self._inputs(view, seed, rays)))
         return Auxiliary(image[..., :3], image[..., 3:6], image[..., 6])
 
     def gbuffer(self, view: View, rays: int = 16) -> dict[str, np.ndarray]:
@@ -88,9 +84,7 @@ class Frames:
 
         coverage: as of `coverage`. The rest is of the ray through the pixel's centre.
         """
-        if self._centre is None:
-            self._centre = self._warmed(self._centre_kernel(), view, 1)
-        image = self._image(self._centre(*self._inputs(view, 0, 1)))
+        image = self._image(self._kernel(self._centre_kernel, view, 1)(*self._inputs(view, 0, 1)))
         axis = view.matrix[:3, 2]
         position, mask = image[..., 5:8] / self.engine.unit_scale, image[..., 8] > 0
         names = ("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "position.X", "position.Y", "position.Z", "mask")
@@ -164,7 +158,7 @@ class Frames:
 
         return kernel
 
-    def _centre_kernel(self) -> Any:
+    def _centre_kernel(self, count: int) -> Any:
         import drjit as dr
 
         mi, scene, seen = self.mi, self.scene, seen_first(self.mi, self.scene)
@@ -173,7 +167,7 @@ class Frames:
         @Recorded
         def kernel(camera: list[Any], seed: Any, samples: Any) -> list[Any]:
             sampler = prototype.fork()
-            ray = rays(sampler, camera, seed, samples, 1, 0)
+            ray = rays(sampler, camera, seed, samples, count, 0)
             hit = seen(scene, ray, sampler)
             found = hit.is_valid()
             place = hit.shape.eval_attribute_3(ATTRIBUTE, hit, found & hit.shape.has_attribute(ATTRIBUTE, found))
@@ -275,6 +269,13 @@ class Frames:
         camera = [dr.opaque(mi.Float, float(number)) for number in numbers]
         return camera, dr.opaque(mi.UInt32, seed), dr.opaque(mi.UInt32, samples)
 
+    def _kernel(self, make: Callable[[int], Any], view: View, rays: int) -> Any:
+        """The kernel that ``make`` makes for so many rays a pixel: made once, and warm."""
+        key = make.__name__, rays
+        if key not in self._kernels:
+            self._kernels[key] = self._warmed(make(rays), view, rays)
+        return self._kernels[key]
+
     def _warmed(self, kernel: Any, view: View, samples: int) -> Any:
         """``kernel`` after frames of several cameras and seeds: each input that changes is then known to."""
         for turn in range(WARM_FRAMES):
@@ -293,3 +294,49 @@ def _differs(mask: np.ndarray) -> np.ndarray:
     height, width = mask.shape
     shifted = [padded[i : i + height, j : j + width] for i in range(3) for j in range(3)]
     return np.any(shifted, axis=0) & ~np.all(shifted, axis=0)
+
+
+def pinhole(mi: Any, camera: list[Any], pixel: Any, offset: Any, width: int) -> Any:
+    """Rays through places (0..1, 0..1) of pixels, numbered row by row.
+
+    camera: c2w's first three rows, focal length, principal point (x, y), lengths of the latter in pixels.
+    """
+    import drjit as dr
+
+    x = (mi.Float(pixel % width) + offset.x - camera[13]) / camera[12]
+    y = (mi.Float(pixel // width) + offset.y - camera[14]) / camera[12]
+    # Camera axes are OpenGL's: y up, looking along -z.
+    world = [camera[4 * row] * x - camera[4 * row + 1] * y - camera[4 * row + 2] for row in range(3)]
+    return mi.Ray3f(mi.Point3f(camera[3], camera[7], camera[11]), dr.normalize(mi.Vector3f(*world)))
+
+
+def seen_first(mi: Any, scene: Any) -> Any:
+    """Function (scene, ray, sampler) -> what the pixel shows there first.
+
+    Lamps are passed, and what surfaces let straight through is passed with its probability; where there are no such
+    surfaces, the sampler may be None.
+    """
+    import drjit as dr
+
+    visible, transparent = first_visible_of(mi, scene), lets_through(mi, scene)
+
+    def seen(scene: Any, ray: Any, sampler: Any) -> Any:
+        ray, hit = visible(scene, ray, mi.Bool(True))
+        if not transparent:
+            return hit
+
+        def passes(hit: Any, sampler: Any, active: Any) -> Any:
+            bsdf = hit.bsdf()
+            null = active & hit.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
+            share = dr.mean(bsdf.eval_null_transmission(hit, null))
+            return null & (sampler.next_1d(active) < share)
+
+        def onwards(hit: Any, direction: Any, sampler: Any, active: Any) -> tuple[Any, ...]:
+            _, next_hit = visible(scene, hit.spawn_ray(direction), active)
+            hit = dr.select(active, next_hit, hit)
+            return hit, direction, sampler, passes(hit, sampler, active)
+
+        state = (hit, mi.Vector3f(ray.d), sampler, passes(hit, sampler, mi.Bool(True)))
+        return dr.while_loop(state, lambda hit, direction, sampler, active: active, onwards)[0]
+
+    return seen

@@ -15,8 +15,7 @@ from dnrtrain.contract import View
 
 from .engine import MAX_WAVEFRONT, Engine
 from .noise import GROUPS
-from .sensors import sensor_dict
-from .units import scaled_lens, scaled_view
+from .sensors import scaled_lens, scaled_view, sensor_dict
 
 LAUNCH_BITS = 14
 """Seeds of a view: its own 18 bits, then the number of the launch."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import time
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from dnrtrain.contract import NPZ_ERRORS
 
 from .engine import Engine
 from .lightmap import LightBaker
-from .tasks import BundleCommon, LightAnswer, LightTask
+from .tasks import BundleCommon, LightAnswer, LightTask, costs_since
 from .texels import grouped_meshes
 from .visibility import ROULETTE_DEPTH
 
@@ -45,9 +44,7 @@ class Worker:
         with atomic_path(task.output) as temporary, temporary.open("wb") as file:
             np.savez(file, light=light, fingerprint=np.array(task.fingerprint))
         return {
-            "seconds": time.monotonic() - started,
-            "cpu_seconds": time.process_time() - cpu,
-            "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            **costs_since(started, cpu),
             "texels": int((light[0, 0].sum(axis=-1) > 0).sum()),
             "spp": task.spp,
             "lost": baker.lost,

@@ -24,8 +24,16 @@ from typing import Any
 import numpy as np
 
 from .denoise import denoise, filled
-from .frames_rays import lets_through
-from .lobes import bsdfs_of, diffuse_context, ignores_context, is_among, is_rough, reflectance, specular_context
+from .lobes import (
+    bsdfs_of,
+    diffuse_context,
+    ignores_context,
+    is_among,
+    is_rough,
+    lets_through,
+    reflectance,
+    specular_context,
+)
 from .texels import AtlasSurface
 
 MAX_SAMPLES = 4_000_000

@@ -18,6 +18,11 @@ def bsdfs_of(scene: Any) -> list[Any]:
     return list({id(b): b for b in [shape.bsdf() for shape in scene.shapes()] if b is not None}.values())
 
 
+def lets_through(mi: Any, scene: Any) -> bool:
+    """Whether a surface of the scene passes light straight on."""
+    return any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs_of(scene))
+
+
 def ignores_context(bsdf: Any) -> bool:
     """Whether the BSDF, or one nested in it, evaluates all its lobes whatever it is asked for."""
     return IGNORE_CONTEXT in str(bsdf)

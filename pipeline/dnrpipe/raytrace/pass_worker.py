@@ -6,7 +6,6 @@ after a crash or with another target. The decisions are `sample_schedule`'s.
 
 from __future__ import annotations
 
-import resource
 import time
 from typing import Any
 
@@ -19,7 +18,7 @@ from .grouped import GroupedSensor
 from .noise import GROUPS, group_noise
 from .pictures import finished, repair
 from .samples import Samples, read_samples
-from .tasks import NoiseFigures, PassAnswer, PassTask, TracedView, TracerCommon, WriteAnswer, WriteTask
+from .tasks import NoiseFigures, PassAnswer, PassTask, TracedView, TracerCommon, WriteAnswer, WriteTask, costs_since
 
 
 class Worker:
@@ -81,8 +80,9 @@ class Worker:
         started, cpu = time.monotonic(), time.process_time()
         channels, noise = self._pictures(task, samples)
         _, name = self._integrator(task)
-        facts.seconds += time.monotonic() - started
-        facts.cpu_seconds += time.process_time() - cpu
+        costs = costs_since(started, cpu)
+        facts.seconds += costs["seconds"]
+        facts.cpu_seconds += costs["cpu_seconds"]
         answer: WriteAnswer = {
             "spp": facts.spp,
             "max_depth": task.max_depth,
@@ -90,7 +90,6 @@ class Worker:
             "integrator": name + ("+lens" if task.lens else ""),
             "variant": self.engine.variant,
             "load_seconds": self.engine.load_seconds,
-            "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
             **noise,
             "repaired": facts.repaired,
             "masked": facts.masked,
@@ -100,6 +99,7 @@ class Worker:
             "time_target": task.goal.time_target,
             "max_spp": task.goal.max_spp,
             "ended_by": task.goal.ended_by,
+            **costs,
             "seconds": facts.seconds,
             "cpu_seconds": facts.cpu_seconds,
         }

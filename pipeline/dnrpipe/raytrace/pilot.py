@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .engine import Engine
-from .finite import masked
+from .engine import Engine, masked
 from .statistics import REFERENCE_DEPTH, DepthStep, cost, difference, display, enough, remaining, significance
 from .tasks import CompareAnswer, CompareTask, DepthAnswer, DepthTask, PilotCommon, PilotConfig, PilotView
 

@@ -1,8 +1,13 @@
-"""Views as Mitsuba sensors: pinhole, and thin lens where the scene's camera has depth of field."""
+"""Views as Mitsuba sensors: pinhole, and thin lens where the scene's camera has depth of field.
+
+A bundle may have units of its own: see `dnrpipe.blender.bundle.units`.
+"""
 
 from __future__ import annotations
 
 import math
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -83,3 +88,23 @@ def _centred(size: int, centre: float) -> tuple[int, int]:
     twice = round(2 * centre)
     offset = max(0, size - twice)
     return twice + 2 * offset, offset
+
+
+def unit_scale(bundle: Path) -> float:
+    """What the bundle's lengths are multiples of the scene's by; 1 for scenes of usual size."""
+    with bundle.open(encoding="utf-8") as file:
+        found = re.search(r'<default name="unit_scale" value="([^"]+)"', file.read(512))
+    return float(found[1]) if found else 1.0
+
+
+def scaled_view(view: View, factor: float) -> View:
+    """The view from the same place of a scene ``factor`` times as large."""
+    if factor == 1.0:
+        return view
+    rows = [(*row[:3], row[3] * factor) for row in view.c2w[:3]]
+    return view.model_copy(update={"c2w": (*rows, view.c2w[3])})
+
+
+def scaled_lens(lens: dict[str, float] | None, factor: float) -> dict[str, float] | None:
+    """Aperture and focus distance, both lengths."""
+    return lens and {name: length * factor for name, length in lens.items()}

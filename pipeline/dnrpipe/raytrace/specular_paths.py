@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .frames_rays import lets_through
+from .base_renderer import TILE, fraction, steps
 from .lobes import (
     bsdfs_of,
     context_of,
@@ -19,12 +19,12 @@ from .lobes import (
     ignores_context,
     is_among,
     is_rough,
+    lets_through,
     mirrors_and_refracts,
     reflectance,
     specular_context,
 )
 from .paths import power_heuristic
-from .sequence import TILE, fraction, steps
 from .texels import ATTRIBUTE
 from .visibility import LAMP_PREFIX, UNSEEN_PREFIX, is_one_of
 

@@ -15,9 +15,8 @@ from dnrtrain.atomic import atomic_path
 
 from .denoise import filled
 from .engine import Engine
-from .frames_rays import lets_through
 from .lightmap import LightBaker
-from .lobes import diffuse_context, reflectance
+from .lobes import diffuse_context, lets_through, reflectance
 from .tasks import BundleCommon, SurfaceAnswer, SurfaceTask
 from .texels import grouped_meshes
 

@@ -9,6 +9,8 @@ Seconds are wall-clock, ``cpu_seconds`` of the process. A ``fingerprint`` is a h
 
 from __future__ import annotations
 
+import resource
+import time
 from pathlib import Path
 from typing import Any, Literal, NotRequired, TypedDict
 
@@ -38,6 +40,15 @@ class Costs(TypedDict):
     seconds: float
     cpu_seconds: float
     peak_mb: float
+
+
+def costs_since(wall: float, cpu: float) -> Costs:
+    """wall, cpu: `time.monotonic` and `time.process_time` at the start."""
+    return {
+        "seconds": time.monotonic() - wall,
+        "cpu_seconds": time.process_time() - cpu,
+        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+    }
 
 
 # -- tracer, pass_worker: path-traced views ----------------------------------------------------------------

@@ -11,7 +11,6 @@ This traces a number of samples per pixel; `pass_worker` traces to a noise level
 
 from __future__ import annotations
 
-import resource
 import time
 from typing import Any
 
@@ -22,7 +21,7 @@ from dnrtrain.exr import write_exr
 from .engine import Engine
 from .noise import half_noise
 from .pictures import finished, repair
-from .tasks import TraceAnswer, TracerCommon, TraceTask
+from .tasks import TraceAnswer, TracerCommon, TraceTask, costs_since
 
 
 class Worker:
@@ -63,10 +62,8 @@ class Worker:
             "seed": seed,
             "integrator": name + ("+lens" if task.lens else ""),
             "variant": self.engine.variant,
-            "seconds": time.monotonic() - started,
-            "cpu_seconds": time.process_time() - cpu,
+            **costs_since(started, cpu),
             "load_seconds": self.engine.load_seconds,
-            "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
             **noise,
             "repaired": repaired,
             "masked": masked,

@@ -1,4 +1,4 @@
-"""The report's missing parts, and its notes on how far to trust the figures."""
+"""The report's headline, its missing parts, and its notes on how far to trust the figures."""
 
 from __future__ import annotations
 
@@ -10,9 +10,34 @@ from typing import Any
 from dnrtrain.contract import View
 
 from ..core.ledger import CostSummary
-from ..core.units import duration, several
+from ..core.units import duration, ratio, several
 from .data import Missing, Quality, Selection, Training
 from .quality import perceptual_note
+
+
+def verdict(quality: Quality | None, selection: Selection | None) -> str:
+    """The result in one sentence; says what is not known yet."""
+    if selection is None:
+        return "The scene is prepared; no views have been chosen yet."
+    chosen = f"{len(selection.views)} of {selection.candidates} candidate views"
+    if quality is None:
+        return f"{chosen} were chosen for ray tracing ({selection.policy}); the renderer has not been measured yet."
+    psnr = next((row for row in quality.rows if row.key == "psnr"), None)
+    if psnr is None:
+        return f"Trained on {chosen}."
+    views = "the one view" if len(quality.views) == 1 else f"{len(quality.views)} views"
+    text = f"Trained on {chosen}, the renderer reaches {psnr.mean:.1f} dB on {views} that it never saw"
+    if quality.neural_seconds is None or quality.frame_seconds is None:
+        return text + "."
+    text += f", at {duration(quality.neural_seconds)} per frame"
+    if quality.gbuffer_seconds is not None:
+        text += f" plus {duration(quality.gbuffer_seconds)} for its {'base image' if quality.based else 'G-buffer'}"
+    if quality.traced_seconds is None:
+        return text + "."
+    if quality.traced_seconds <= quality.frame_seconds:
+        return f"{text}; a ray-traced frame takes {duration(quality.traced_seconds)}."
+    faster = ratio(quality.traced_seconds, quality.frame_seconds)
+    return f"{text}: {faster} times faster than the {duration(quality.traced_seconds)} of a ray-traced one."
 
 
 def missing(
@@ -56,17 +81,14 @@ def notes(
         )
     if quality and quality.noise_share_mean is not None and quality.noise_share_mean >= 0.1:
         spp = f" ({several(quality.spp)} samples per pixel)" if quality.spp else ""
+        limited = ""
+        if quality.noise_limited:
+            limited = f", and at least half of it in {quality.noise_limited} of {len(quality.views)} views"
         found.append(
             f"The reference images are noisy themselves{spp}: a perfect renderer would measure about "
             f"{quality.ceiling_mean:.1f} dB against them. That noise makes up "
-            f"{100 * quality.noise_share_mean:.0f} % of the measured squared error"
-            + (
-                f", and at least half of it in {quality.noise_limited} of {len(quality.views)} views."
-                if quality.noise_limited
-                else "."
-            )
-            + " Raise raytrace.evaluation_spp, or set raytrace.evaluation_noise, before reading more into small "
-            "differences."
+            f"{100 * quality.noise_share_mean:.0f} % of the measured squared error{limited}. Raise "
+            "raytrace.evaluation_spp, or set raytrace.evaluation_noise, before reading more into small differences."
         )
     tracing = summary.tracing_all
     if tracing and tracing.net_saved_seconds < 0:

@@ -14,7 +14,7 @@ from ..core.units import duration
 from ..studies.frames.pareto_front import quality_at
 from ..studies.planning.plan_text import route_lines, why
 from ..studies.planning.records import RENDERER_STAGES, Plan, read_plan
-from .data import Budget, FrontierSummary, PlannedRow, Quality
+from .data import Budget, PlannedRow, Quality
 
 NEXT = 60.0
 """Seconds of further work that the report weighs."""
@@ -26,7 +26,7 @@ def build_budget(root: Path, quality: Quality | None, upfront: float | None) -> 
         plan = read_plan(root)
     except UserError:  # damaged, which its own command reports
         plan = None
-    frontier = _frontier_summary(root)
+    frontier = _frontier_pictures(root)
     if upfront is None and plan is None and frontier is None:
         return None
     psnr = next((row.mean for row in quality.rows if row.key == "psnr"), None) if quality else None
@@ -37,7 +37,7 @@ def build_budget(root: Path, quality: Quality | None, upfront: float | None) -> 
         rows=_rows(plan) if plan else [],
         why=why(plan) if plan else [],
         routes=[re.sub(r" {2,}", " · ", line.strip()) for line in route_lines(plan)] if plan else [],  # no columns here
-        frontier=frontier,
+        pictures=frontier or [],
     )
 
 
@@ -114,7 +114,7 @@ def _rows(plan: Plan) -> list[PlannedRow]:
     return rows
 
 
-def _frontier_summary(root: Path) -> FrontierSummary | None:
+def _frontier_pictures(root: Path) -> list[tuple[str, str]] | None:
     """What `dnrpipe frontier` measured; None where it is missing or damaged, which that command reports."""
     from ..studies.frontier.frontier_report import verdict
     from ..studies.frontier.records import read_frontier
@@ -129,4 +129,4 @@ def _frontier_summary(root: Path) -> FrontierSummary | None:
         if path.exists():
             uri = "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode()
             pictures.append((verdict(results, frames), uri))
-    return FrontierSummary(pictures=pictures)
+    return pictures

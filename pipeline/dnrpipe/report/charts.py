@@ -7,7 +7,7 @@ Colours are CSS classes ``c0`` .. ``c6`` (Okabe & Ito 2008, tuned per theme in t
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from markupsafe import Markup, escape
@@ -69,6 +69,11 @@ class _Canvas:
     def line(self, x1: float, y1: float, x2: float, y2: float, css: str) -> None:
         self.parts.append(f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" class="{css}"/>')
 
+    def value_axis(self, ticks: Sequence[float], py: Callable[[float], float], left: float, right: float) -> None:
+        for tick in ticks:
+            self.line(left, py(tick), self.width - right, py(tick), "grid")
+            self.text(left - 6, py(tick) + 4, short_number(tick), "tick", "end")
+
     def svg(self) -> Markup:
         body = "".join(self.parts)
         return Markup(
@@ -104,9 +109,7 @@ def line_chart(series: Sequence[Series], title: str, x_label: str, y_label: str,
         return top + (1 - (v - a) / (b - a)) * (height - top - bottom)
 
     canvas.text(4, 14, y_label, "axis")
-    for tick in ticks:
-        canvas.line(left, py(tick), WIDTH - right, py(tick), "grid")
-        canvas.text(left - 6, py(tick) + 4, short_number(tick), "tick", "end")
+    canvas.value_axis(ticks, py, left, right)
     for tick in linear_ticks(x0, x1, whole=True):
         if x0 <= tick <= x1:
             canvas.text(px(tick), height - bottom + 18, short_number(tick), "tick", "middle")
@@ -168,9 +171,7 @@ def dot_chart(dots: Sequence[Dot], title: str, x_label: str, y_label: str, *, fr
         return top + (1 - (y - low) / (high - low)) * (height - top - bottom)
 
     canvas.text(4, 14, y_label, "axis")
-    for tick in ticks:
-        canvas.line(left, py(tick), WIDTH - right, py(tick), "grid")
-        canvas.text(left - 6, py(tick) + 4, short_number(tick), "tick", "end")
+    canvas.value_axis(ticks, py, left, right)
     canvas.line(left, height - bottom, WIDTH - right, height - bottom, "frame")
     radius = min(5.0, max(1.5, column * 0.35))
     for index, dot in enumerate(dots):

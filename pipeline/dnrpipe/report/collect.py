@@ -21,13 +21,12 @@ from ..core.ledger import CostRecord, CostSummary, Ledger, break_even_frames, su
 from ..core.scene_files import read_census, read_summary
 from ..core.scene_records import FindingKind
 from ..stages.records import METRICS, Metrics
-from .advice import missing, notes
+from .advice import missing, notes, verdict
 from .budget import build_budget
 from .coverage import coverage_maps
 from .data import ChosenView, FindingGroup, ReportData, Selection, Sphere, SphereView, Training
 from .pictures import ExrPictures
 from .quality import build_quality
-from .words import verdict
 
 KINDS: dict[FindingKind, tuple[str, bool]] = {
     "missing": ("The file refers to something that is not there.", True),
@@ -288,16 +287,16 @@ def _summary(root: Path) -> list[tuple[str, str]]:
     summary = _of_scene(root, "summary.json", read_summary)
     if summary is None:
         return []
-    counts = (("triangles", summary.triangles), ("objects", summary.objects))
-    rows = [(name, f"{count:,}".replace(",", " ")) for name, count in counts]
-    rows.append(("blender", summary.blender_version))
+    rows = [
+        ("triangles", f"{summary.triangles:,}".replace(",", " ")),
+        ("objects", f"{summary.objects:,}".replace(",", " ")),
+        ("blender", summary.blender_version),
+    ]
     for part, facts in (("atlas", summary.atlas.data()), ("repairs", summary.repairs)):
-        rows += [(f"{part} {k}".replace("_", " "), _plain(v)) for k, v in sorted(facts.items())]
+        for key, value in sorted(facts.items()):
+            shown = f"{value:.4g}" if isinstance(value, float) else str(value)
+            rows.append((f"{part} {key}".replace("_", " "), shown))
     return rows + [("warning", text) for text in summary.warnings]
-
-
-def _plain(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _flatten(settings: dict[str, Any], overrides: dict[str, Any], prefix: str = "") -> list[tuple[str, str, bool]]:

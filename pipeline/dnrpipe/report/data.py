@@ -11,6 +11,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from ..core.ledger import CostSummary
+from ..stages.records import ViewMetrics
 
 
 class _Frozen(BaseModel):
@@ -26,7 +27,7 @@ class Picture(_Frozen):
     file: str
 
 
-class TestView(_Frozen):
+class TestView(ViewMetrics):
     """Metrics and pictures of one held-out view.
 
     noise_share: share of the measured squared error that is the reference's own noise, in [0, 1]
@@ -35,20 +36,7 @@ class TestView(_Frozen):
 
     __test__ = False  # not a pytest class
 
-    name: str
-    psnr: float | None
-    ssim: float | None
-    lpips_alex: float | None
-    lpips_vgg: float | None
-    flip: float | None
-    psnr_mask: float | None
-    ssim_mask: float | None
-    ceiling_psnr: float | None
     noise_share: float | None
-    seconds_traced: float | None
-    seconds_neural: float | None
-    seconds_base: float | None
-    spp: int | None
     truth: Picture | None
     prediction: Picture | None
     flip_map: Picture | None
@@ -203,14 +191,11 @@ class PlannedRow(_Frozen):
     actual: str
 
 
-class FrontierSummary(_Frozen):
-    """pictures: (caption, data URI) of each number of frames."""
-
-    pictures: list[tuple[str, str]] = Field(repr=False)
-
-
 class Budget(_Frozen):
-    """Cost and benefit, in sentences. following: what the next minute would buy."""
+    """Cost and benefit, in sentences.
+
+    following: what the next minute would buy. pictures: (caption, data URI) of the frontier for each number of frames.
+    """
 
     cost: str
     bought: str
@@ -218,7 +203,7 @@ class Budget(_Frozen):
     rows: list[PlannedRow]
     why: list[str]
     routes: list[str]
-    frontier: FrontierSummary | None
+    pictures: list[tuple[str, str]] = Field(repr=False)
 
 
 class ReportData(BaseModel):

@@ -68,8 +68,8 @@ class ExrPictures:
         self.root = root
         self.transform = DisplayTransform(frame, root / "scene")
 
-    def load(self, file: str, *, side: int = THUMBNAIL_SIDE) -> Picture | None:
-        """R G B A of an EXR (linear, premultiplied) as a picture; None when the file or its colour is missing.
+    def load(self, file: str) -> Picture | None:
+        """R G B A of an EXR (linear, premultiplied) as a thumbnail; None when the file or its colour is missing.
 
         Raises:
             UserError: the file is damaged.
@@ -89,7 +89,7 @@ class ExrPictures:
         alpha = torch.from_numpy(channels["A"])[None, None]
         display = self.transform.over_white(linear, alpha)[0].clamp(0, 1)
         pixels = np.rint(display.permute(1, 2, 0).numpy() * 255).astype(np.uint8)
-        return encode(Image.fromarray(pixels), file, side)
+        return encode(Image.fromarray(pixels), file, THUMBNAIL_SIDE)
 
 
 def _magma(image: Image.Image) -> Image.Image:

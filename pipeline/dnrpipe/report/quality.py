@@ -40,31 +40,29 @@ def build_quality(root: Path, metrics: Metrics, records: Sequence[CostRecord]) -
     names = {f"test/{view.name}" for view in views}
     recorded = [r.wall_seconds for r in traced_views(records, "evaluation", names)]
     passes = {r.name: r.wall_seconds for r in records if r.stage == "prepare" and r.name in names}
-    timed = [v.seconds_traced for v in views if v.seconds_traced is not None]
-    seconds = recorded or timed
-    measured = [v.seconds_neural for v in views if v.seconds_neural is not None]
-    neural = metrics.neural_ms / 1000 if metrics.neural_ms is not None else _mean(measured)
-    # A base image that is rendered brings its G-buffer along.
-    bases = [v.seconds_base for v in views if v.seconds_base is not None]
+
+    def known(key: str) -> list[float]:
+        return [value for view in views if (value := getattr(view, key)) is not None]
+
+    neural = metrics.neural_ms / 1000 if metrics.neural_ms is not None else _mean(known("seconds_neural"))
+    bases = known("seconds_base")  # a base image that is rendered brings its G-buffer along
     gbuffer = _mean(bases or list(passes.values()))
-    ceilings = [v.ceiling_psnr for v in views if v.ceiling_psnr is not None]
-    shares = [v.noise_share for v in views if v.noise_share is not None]
+    shares = known("noise_share")
+    trained = metrics.trained_with_perceptual
     return Quality(
         views=views,
         rows=[row for metric in METRICS if (row := _row(views, *metric))],
         median_view=views[middle].name,
         perceptual=metrics.perceptual,
-        trained_with_perceptual=metrics.perceptual
-        if metrics.trained_with_perceptual is None
-        else metrics.trained_with_perceptual,
+        trained_with_perceptual=metrics.perceptual if trained is None else trained,
         device=metrics.device,
         neural_seconds=neural,
         gbuffer_seconds=gbuffer,
         based=bool(bases),
         frame_seconds=None if neural is None else neural + (gbuffer or 0.0),
-        traced_seconds=_mean(seconds),
+        traced_seconds=_mean(recorded or known("seconds_traced")),
         spp=sorted({v.spp for v in views if v.spp is not None}),
-        ceiling_mean=_mean(ceilings),
+        ceiling_mean=_mean(known("ceiling_psnr")),
         noise_share_mean=_mean(shares),
         noise_limited=sum(share >= 0.5 for share in shares),
     )
@@ -88,7 +86,7 @@ def _view(root: Path, view: ViewMetrics, side: int) -> TestView:
         share = min(1.0, 10.0 ** ((view.psnr - view.ceiling_psnr) / 10.0))
     stem = f"evaluation/{view.name}"
     return TestView(
-        **view.model_dump(exclude={"reference_noise", "reference_noise_error"}),
+        **view.model_dump(),
         noise_share=share,
         truth=load_png(root, f"{stem}.truth.png", side=side),
         prediction=load_png(root, f"{stem}.prediction.png", side=side),

@@ -28,7 +28,6 @@ LOSS_NAMES = {
     "regularisation": "L_reg(T)",
     "total": "weighted sum",
 }
-PURPOSE_NAMES = {"training": "training", "evaluation": "evaluation", "inference": "inference"}
 
 
 def render_html(data: ReportData) -> str:
@@ -57,9 +56,7 @@ def render_html(data: ReportData) -> str:
         rows=_headline_rows(quality),
         featured=_featured(quality) if quality else [],
         median=next(v for v in quality.views if v.name == quality.median_view) if quality else None,
-        projections=[(name, sphere_svg(data.sphere, name)) for name in ("top", "front", "oblique")]
-        if data.sphere
-        else [],
+        projections=[(n, sphere_svg(data.sphere, n)) for n in ("top", "front", "oblique")] if data.sphere else [],
         quality_chart=_quality_chart(quality) if quality else "",
         loss_charts=[(t, [_loss_chart(t), _psnr_chart(t), _agent_chart(t)]) for t in data.training],
         stage_chart=_stage_chart(data),
@@ -108,8 +105,7 @@ def _loss_chart(training: Training) -> Markup:
 
 
 def _agent_chart(training: Training) -> Markup:
-    names = {"reward": "reward", "q": "Q"}
-    series = [charts.Series(names[name], points) for name, points in training.agent.items()]
+    series = [charts.Series({"q": "Q"}.get(name, name), points) for name, points in training.agent.items()]
     title = "Reward and action value of the view selector"
     return charts.line_chart(series, title, "epoch", "selector: mean reward and action value Q")
 
@@ -127,11 +123,7 @@ def _stage_chart(data: ReportData) -> Markup:
     bars = []
     for stage, purposes in data.costs.by_stage_and_purpose.items():
         segments = [
-            charts.Segment(
-                f"bar-{purpose}",
-                value.wall_seconds,
-                f"{stage}, {PURPOSE_NAMES[purpose]}: {duration(value.wall_seconds)}",
-            )
+            charts.Segment(f"bar-{purpose}", value.wall_seconds, f"{stage}, {purpose}: {duration(value.wall_seconds)}")
             for purpose, value in purposes.items()
         ]
         whole = sum(segment.value for segment in segments)
@@ -145,11 +137,7 @@ def _tracing_chart(data: ReportData) -> Markup:
         return Markup("")
     chosen = [
         charts.Segment("bar-training", tracing.actual_seconds, f"ray tracing: {duration(tracing.actual_seconds)}"),
-        charts.Segment(
-            "bar-choosing",
-            tracing.selection_seconds,
-            f"choosing: {duration(tracing.selection_seconds)}",
-        ),
+        charts.Segment("bar-choosing", tracing.selection_seconds, f"choosing: {duration(tracing.selection_seconds)}"),
     ]
     everything = charts.Segment("bar-training", tracing.all_seconds, f"ray tracing: {duration(tracing.all_seconds)}")
     spent = tracing.actual_seconds + tracing.selection_seconds

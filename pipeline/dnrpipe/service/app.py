@@ -4,25 +4,29 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 from collections.abc import AsyncIterator
 from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
 from .. import __version__
 from ..core.errors import UserError
 from . import routes_jobs, routes_live, routes_server, routes_workspaces
-from .config import LOOPBACK, ServerConfig
+from .config import LOOPBACK
 from .guard import Guard
-from .pruning import prune_regularly
+from .models import first_fault
 from .queue import QueueFull, WrongState
 from .root import UnknownName
 from .state import State
 
-_STATUS: dict[type[Exception], int] = {QueueFull: 429, WrongState: 409, UnknownName: 404, UserError: 422}
+LOG = logging.getLogger("dnrpipe.pruning")
+PRUNE_INTERVAL = 3600.0
+_STATUS: dict[type[UserError], int] = {QueueFull: 429, WrongState: 409, UnknownName: 404, UserError: 422}
 
 
 def create_app(state: State, token: str | None) -> FastAPI:
@@ -30,7 +34,7 @@ def create_app(state: State, token: str | None) -> FastAPI:
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        chores = (state.feed.watch(), state.live.close_idle(), prune_regularly(state.queue, state.root, state.config))
+        chores = (state.feed.watch(), state.live.close_idle(), _prune_regularly(state))
         tasks = [asyncio.create_task(chore) for chore in chores]
         yield
         for task in tasks:
@@ -50,13 +54,11 @@ def create_app(state: State, token: str | None) -> FastAPI:
     app.state.service = state
     for module in (routes_server, routes_jobs, routes_workspaces, routes_live):
         app.include_router(module.router)
-    for kind, status in _STATUS.items():
-        app.add_exception_handler(kind, _answer(status))
-    app.add_exception_handler(RequestValidationError, _invalid)
-    app.add_exception_handler(HTTPException, _refused)
+    for kind in (*_STATUS, RequestValidationError, HTTPException):
+        app.add_exception_handler(kind, _answer)
     app.add_middleware(
         Guard,
-        hosts=hosts_of(state.config),
+        hosts=LOOPBACK if state.config.loopback else (),
         token=token,
         rate=state.config.rate,
         burst=state.config.burst,
@@ -66,29 +68,26 @@ def create_app(state: State, token: str | None) -> FastAPI:
     return app
 
 
-def hosts_of(config: ServerConfig) -> set[str]:
-    """Host names that requests may address: those of the loopback interface; any, if the server has another one."""
-    return set(LOOPBACK) if config.loopback else set()
+async def _prune_regularly(state: State) -> None:
+    """Delete old logs and events at the start and every hour, for as long as the server runs."""
+    while True:
+        try:
+            pruned = await run_in_threadpool(state.queue.prune, state.root, state.config)
+            if pruned:
+                LOG.info("old logs and events removed", extra={"facts": {"jobs": len(pruned)}})
+        except Exception:  # a full disk, a busy queue: the server goes on and tries again
+            LOG.exception("old logs and events could not be removed")
+        await asyncio.sleep(PRUNE_INTERVAL)
 
 
-def _answer(status: int) -> Any:
-    async def handle(_: Request, error: Exception) -> JSONResponse:
-        return JSONResponse({"detail": " ".join(str(error).split())}, status)
-
-    return handle
-
-
-async def _refused(_: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, HTTPException)
-    return JSONResponse({"detail": str(error.detail)}, error.status_code, headers=error.headers)
-
-
-async def _invalid(_: Request, error: Exception) -> JSONResponse:
-    """The first fault of a request in one line, without what was sent (it may be anything)."""
-    assert isinstance(error, RequestValidationError)
-    first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"])
-    return JSONResponse({"detail": f"{where}: {first['msg']}"}, 422)
+async def _answer(_: Request, error: Exception) -> JSONResponse:
+    """What is wrong, in one line."""
+    if isinstance(error, HTTPException):
+        return JSONResponse({"detail": str(error.detail)}, error.status_code, headers=error.headers)
+    if isinstance(error, RequestValidationError):
+        return JSONResponse({"detail": first_fault(error)}, 422)
+    status = next(status for kind, status in _STATUS.items() if isinstance(error, kind))
+    return JSONResponse({"detail": " ".join(str(error).split())}, status)
 
 
 def _describe_token(app: FastAPI) -> None:

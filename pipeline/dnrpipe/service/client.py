@@ -10,6 +10,7 @@ with Client("http://127.0.0.1:8420") as client:
 from __future__ import annotations
 
 import functools
+import itertools
 import json
 import secrets
 import ssl
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import httpx
-from pydantic import BaseModel, TypeAdapter
+from pydantic import TypeAdapter
 
 from ..core.errors import UserError
 from ..stages.records import PreviewState
@@ -42,7 +43,7 @@ RETRY_INTERVAL = 0.5
 MAX_WAIT = 60.0
 MAX_REFUSALS = 5
 CHUNK = 1 << 20
-Answer = TypeVar("Answer", bound=BaseModel)
+Answer = TypeVar("Answer")
 
 
 class Refused(UserError):
@@ -86,36 +87,33 @@ class Client:
     def submit(self, request: JobRequest) -> Job:
         """Queue a job: one job, even if a broken connection makes the client send it again."""
         headers = {"Idempotency-Key": secrets.token_urlsafe(24)}
-        return self._read(self._ask("POST", "/jobs", json=request.model_dump(mode="json"), headers=headers), Job)
+        return self._ask("POST", "/jobs", Job, json=request.model_dump(mode="json"), headers=headers)
 
     def job(self, job: int) -> Job:
-        return self._get(f"/jobs/{job}", Job)
+        return self._ask("GET", f"/jobs/{job}", Job)
 
     def jobs(self, states: list[State] | None = None, limit: int | None = None) -> Iterator[Job]:
         """Jobs, newest first; all of them, or ``limit``."""
-        before: int | None = None
-        given = 0
+        return itertools.islice(self._all_jobs(states or []), limit)
+
+    def _all_jobs(self, states: list[State]) -> Iterator[Job]:
+        parameters: dict[str, Any] = {"state": states, "limit": 500}
         while True:
-            parameters: dict[str, Any] = {"state": states or [], "limit": 500}
-            page = self._get("/jobs", JobPage, parameters | ({"before": before} if before else {}))
-            for job in page.jobs:
-                if limit is not None and given >= limit:
-                    return
-                given += 1
-                yield job
+            page = self._ask("GET", "/jobs", JobPage, params=parameters)
+            yield from page.jobs
             if page.next is None:
                 return
-            before = page.next
+            parameters["before"] = page.next
 
     def cancel(self, job: int) -> Job:
-        return self._read(self._ask("POST", f"/jobs/{job}/cancel"), Job)
+        return self._ask("POST", f"/jobs/{job}/cancel", Job)
 
     def retry(self, job: int) -> Job:
-        return self._read(self._ask("POST", f"/jobs/{job}/retry"), Job)
+        return self._ask("POST", f"/jobs/{job}/retry", Job)
 
     def log(self, job: int, offset: int = 0) -> LogPage:
         """At most 256 KiB of the job's log; a negative offset counts from its end."""
-        return self._get(f"/jobs/{job}/logs", LogPage, {"offset": offset})
+        return self._ask("GET", f"/jobs/{job}/logs", LogPage, params={"offset": offset})
 
     def events(self, job: int, after: int = 0) -> Iterator[JobEvent]:
         """The job's events until it has ended; resumes a broken stream where it broke."""
@@ -151,14 +149,14 @@ class Client:
         return self._read(_checked(answer), Scene)
 
     def workspaces(self) -> list[WorkspaceSummary]:
-        return TypeAdapter(list[WorkspaceSummary]).validate_json(self._ask("GET", "/workspaces").content)
+        return self._ask("GET", "/workspaces", list[WorkspaceSummary])
 
     def workspace(self, name: str) -> WorkspaceDetail:
-        return self._get(f"/workspaces/{name}", WorkspaceDetail)
+        return self._ask("GET", f"/workspaces/{name}", WorkspaceDetail)
 
     def preview(self, workspace: str) -> PreviewState:
         """What the last picture of a fine-tuning shows. Raises Refused (404) before there is one."""
-        return self._get(f"/workspaces/{workspace}/preview", PreviewState)
+        return self._ask("GET", f"/workspaces/{workspace}/preview", PreviewState)
 
     def _stream(self, job: int, after: int) -> Iterator[JobEvent | None]:
         """Events; None at the end of the job."""
@@ -182,10 +180,7 @@ class Client:
                     yield JobEvent(id=int(fields["id"]), job=job, time=moment, kind=fields["event"], data=data)
                 fields = {}
 
-    def _get(self, path: str, model: type[Answer], parameters: dict[str, Any] | None = None) -> Answer:
-        return self._read(self._ask("GET", path, params=parameters), model)
-
-    def _ask(self, method: str, path: str, **options: Any) -> httpx.Response:
+    def _ask(self, method: str, path: str, model: type[Answer], **options: Any) -> Answer:
         """Send a request, with retries: safe for everything but uploads, since submissions carry a key."""
         deadline, refusals = time.monotonic() + self.retry_seconds, 0
         while True:
@@ -203,11 +198,11 @@ class Client:
                 refusals += 1
                 time.sleep(min(float(wait), MAX_WAIT))
                 continue
-            return _checked(answer)
+            return self._read(_checked(answer), model)
 
     def _read(self, answer: httpx.Response, model: type[Answer]) -> Answer:
         try:
-            return model.model_validate_json(answer.content)
+            return TypeAdapter(model).validate_json(answer.content)
         except ValueError:
             raise UserError(f"{self.server}: is not a dnrpipe server, or one of another version") from None
 

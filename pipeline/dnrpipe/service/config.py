@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import os
+import re
+import stat
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from ..core.errors import UserError
 from .models import Limits
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
+TOKEN_PATTERN = r"[A-Za-z0-9_-]{16,256}"
 
 
 class ServerConfig(BaseModel):
@@ -65,3 +69,19 @@ def tightest(job: Limits, server: Limits) -> Limits:
     """The smaller of each pair of limits; None means no limit."""
     pairs = {name: (getattr(job, name), getattr(server, name)) for name in Limits.model_fields}
     return Limits(**{name: min((v for v in pair if v is not None), default=None) for name, pair in pairs.items()})
+
+
+def read_token(path: Path) -> str:
+    """The token in a file. Raises UserError: unreadable, readable by others, too short or of other letters."""
+    try:
+        mode, text = path.stat().st_mode, path.read_text(encoding="utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: cannot be read as a token file ({error})") from None
+    if mode & (stat.S_IRGRP | stat.S_IROTH):
+        raise UserError(f"{path}: others can read it; run `chmod 600 {path}`")
+    if not re.fullmatch(TOKEN_PATTERN, text):
+        raise UserError(
+            f"{path}: a token is 16 to 256 letters, digits, dashes and underscores;"
+            f" make one with `python -c 'import secrets; print(secrets.token_urlsafe(32))' > {path}`"
+        )
+    return text

@@ -16,7 +16,6 @@ import re
 import time
 from collections import OrderedDict
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -43,47 +42,34 @@ HEADERS = {
 }
 
 
-@dataclass
-class Bucket:
-    """A token bucket: gains `rate` tokens a second, holds at most `size`."""
-
-    rate: float
-    size: float
-    level: float
-    updated: float
-
-    def take(self, now: float) -> float:
-        """Take a token: 0 if there is one, else the seconds until there is."""
-        self.level = min(self.size, self.level + (now - self.updated) * self.rate)
-        self.updated = now
-        if self.level >= 1:
-            self.level -= 1
-            return 0.0
-        return (1 - self.level) / self.rate
-
-
 class Buckets:
-    """One bucket per client; drops the clients that were silent for longest."""
+    """A token bucket per client: gains `rate` tokens a second, holds at most `size`.
+
+    Drops the clients that were silent for longest.
+    """
 
     def __init__(self, rate: float, size: float) -> None:
         self.rate, self.size = rate, size
-        self._buckets: OrderedDict[str, Bucket] = OrderedDict()
+        self._levels: OrderedDict[str, tuple[float, float]] = OrderedDict()  # level, when
 
     def take(self, client: str) -> float:
-        """Seconds until `client` may ask, 0: now; see `Bucket.take`."""
-        return self._bucket(client).take(time.monotonic())
+        """Take a token of `client`: 0 if there is one, else the seconds until there is."""
+        level = self._level(client)
+        taken = level >= 1
+        self._levels[client] = (level - taken, time.monotonic())
+        if len(self._levels) > MAX_CLIENTS:
+            self._levels.popitem(last=False)
+        return 0.0 if taken else (1 - level) / self.rate
 
     def empty(self, client: str) -> bool:
         """Whether the bucket of `client` is empty; takes nothing."""
-        bucket = self._bucket(client)
-        return bucket.level + (time.monotonic() - bucket.updated) * bucket.rate < 1
+        return self._level(client) < 1
 
-    def _bucket(self, client: str) -> Bucket:
-        bucket = self._buckets.pop(client, None) or Bucket(self.rate, self.size, self.size, time.monotonic())
-        self._buckets[client] = bucket
-        if len(self._buckets) > MAX_CLIENTS:
-            self._buckets.popitem(last=False)
-        return bucket
+    def _level(self, client: str) -> float:
+        level, updated = self._levels.get(client, (self.size, 0.0))
+        if client in self._levels:
+            self._levels.move_to_end(client)
+        return min(self.size, level + (time.monotonic() - updated) * self.rate)
 
 
 class Guard:

@@ -25,8 +25,7 @@ from dnrpipe.core.images import flip_error
 from dnrpipe.core.settings import Settings
 from dnrpipe.raytrace.base_renderer import BaseRenderer
 from dnrpipe.raytrace.base_worker import Worker as BaseWorker
-from dnrpipe.raytrace.engine import Engine
-from dnrpipe.raytrace.finite import masked, masked_channels
+from dnrpipe.raytrace.engine import Engine, masked, masked_channels
 from dnrpipe.raytrace.frames import Frames
 from dnrpipe.raytrace.light_worker import read_light
 from dnrpipe.stages.trainer import torch_device
@@ -113,18 +112,16 @@ class Worker:
             self.repaired += lost
             return channels
         self.base.repaired = self.base.masked = 0
-        channels = self._base(self.base, view, samples)
+        if samples is None or samples >= self.base.renderer.samples or self.kind != "baked":
+            channels = self.base.channels(view)
+        else:
+            if samples not in self.renderers:
+                light = read_light(Path(self.common["base"]["light"]))
+                scene = self.engine.scenes[str(self.bundle)]
+                self.renderers[samples] = BaseRenderer(self.engine.mi, scene, light, samples)
+            channels = self.base.channels(view, self.renderers[samples])
         self.repaired += self.base.repaired + self.base.masked
         return channels
-
-    def _base(self, base: BaseWorker, view: View, samples: int | None) -> dict[str, np.ndarray]:
-        if samples is None or samples >= base.renderer.samples or self.kind != "baked":
-            return base.channels(view)
-        if samples not in self.renderers:
-            light = read_light(Path(self.common["base"]["light"]))
-            scene = self.engine.scenes[str(self.bundle)]
-            self.renderers[samples] = BaseRenderer(self.engine.mi, scene, light, samples)
-        return base.channels(view, self.renderers[samples])
 
     def _neural(self, view: View, channels: dict[str, np.ndarray]) -> np.ndarray:
         """Display RGB over white, float32 [H, W, 3] in [0, 1]."""

@@ -1,4 +1,7 @@
-"""Frame processes: one per workspace that somebody views; they start on demand and end when idle."""
+"""Frame processes: one per workspace that somebody views; they start on demand and end when idle.
+
+While the camera moves, resolution and samples follow from measured frame times.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +10,12 @@ import contextlib
 import time
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from typing import Any
 
 from ..core.errors import UserError
 from ..workers.processes import MAX_ATTEMPTS, LocalWorker, TaskFailed, WorkerDied
 from .config import ServerConfig
-from .live_pace import Pace
 from .live_scene import LiveRequest, LiveScene, open_scene
 from .root import ServiceRoot
 
@@ -21,6 +24,53 @@ FRAME_SECONDS = 120.0
 IDLE_CHECK = 2.0
 REFERENCE_SPP = 4
 MOST_SPP = 1024
+BUDGET = 90.0
+"""Milliseconds that a moving frame may take."""
+LEVELS: tuple[tuple[float, int | None], ...] = ((1.0, None), (1.0, 2), (1.0, 1), (0.5, 2), (0.5, 1))
+"""(share of the side, rays per pixel of the base image; None: the model's own)."""
+START = 2
+STEP = 32
+"""Sides are multiples of this: the U-Net halves them."""
+SMOOTHING = 0.3
+SLACK = 0.45
+"""Below this share of the budget the pace tries a finer level, which costs about twice as much."""
+MIN_FRAMES = 8
+"""Frames at a level before it may change."""
+
+
+@dataclass
+class Pace:
+    """Chooses a level by frame times. The first frame at a level compiles its kernels and does not count."""
+
+    budget: float = BUDGET
+    level: int = START
+    _mean: float | None = None
+    _frames: int = 0
+    _known: set[tuple[int, int]] = field(default_factory=set)
+
+    def pick(self, size: int) -> tuple[int, int | None]:
+        """(side in pixels, samples) of the next moving frame, of a view of ``size``² at rest."""
+        share, samples = LEVELS[self.level]
+        return size if share == 1 else max(2 * STEP, round(share * size / STEP) * STEP), samples
+
+    def record(self, size: int, milliseconds: float) -> None:
+        """Record the time of a moving frame of a view of `size`²; change the level where that calls for it."""
+        if (self.level, size) not in self._known:
+            self._known.add((self.level, size))
+            return
+        mean = self._mean
+        self._mean = milliseconds if mean is None else mean + SMOOTHING * (milliseconds - mean)
+        self._frames += 1
+        if self._frames < MIN_FRAMES:
+            return
+        if self._mean > self.budget and self.level + 1 < len(LEVELS):
+            self._move(1)
+        elif self._mean < SLACK * self.budget and self.level > 0:
+            self._move(-1)
+
+    def _move(self, step: int) -> None:
+        self.level += step
+        self._mean, self._frames = None, 0
 
 
 class LiveSession:

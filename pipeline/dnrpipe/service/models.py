@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from ..report.data import SphereView
+
+if TYPE_CHECKING:
+    from fastapi.exceptions import RequestValidationError
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
 SCENE_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}\.(blend|obj|gltf|glb|fbx|ply|stl)$"
@@ -18,6 +23,12 @@ TAKES_SCENE = ("run", "prepare")
 JobId = Annotated[int, Field(ge=1, le=2**53)]
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
 SceneName = Annotated[str, Field(pattern=SCENE_PATTERN)]
+
+
+def first_fault(error: ValidationError | RequestValidationError) -> str:
+    """Field and fault in one line, without what was sent (it may be anything)."""
+    first = error.errors()[0]
+    return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
 
 
 class _Wire(BaseModel):
@@ -142,16 +153,6 @@ class Curve(_Wire):
     psnr: list[tuple[int, float]]
 
 
-class PlacedView(_Wire):
-    """A camera, relative to the scene's centre, divided by the distance of the farthest one."""
-
-    name: str
-    role: Literal["candidate", "chosen", "test"]
-    order: int | None
-    position: tuple[float, float, float]
-    psnr: float | None
-
-
 class TestPicture(_Wire):
     """A held-out view with pictures of the evaluation."""
 
@@ -210,7 +211,7 @@ class WorkspaceDetail(_Wire):
 
     name: str
     stages: list[StageState]
-    views: list[PlacedView]
+    views: list[SphereView]
     sphere: str | None
     eye: tuple[float, float]
     training: list[Curve]

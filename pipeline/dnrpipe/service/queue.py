@@ -14,15 +14,18 @@ import json
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from ..core.errors import UserError
+from .config import ServerConfig
 from .models import FINAL, STATES, Job, JobEvent, JobRequest, State
+from .root import ServiceRoot
 
 SCHEMA = 1
+DAY = 86_400.0
 MAX_STARTS = 6
 """A job fails for good once its process or server has died this often."""
 BATCH = 50
@@ -56,10 +59,7 @@ CREATE TABLE IF NOT EXISTS events (
 );
 CREATE INDEX IF NOT EXISTS events_of_job ON events (job, id);
 """
-_COLUMNS = (
-    "id, state, request, created, started, finished, device, starts, crashes, cancel_requested, exit_code, error,"
-    " progress"
-)
+_COLUMNS = ", ".join(Job.model_fields)
 
 
 class QueueFull(UserError):
@@ -203,7 +203,7 @@ class Queue:
     def cancel(self, job: int) -> Job:
         """Cancel a queued job at once, a running one when its worker sees the request. Raises WrongState."""
         with self._writing() as db:
-            state = _state(db, job)
+            state = db.execute("SELECT state FROM jobs WHERE id = ?", (job,)).fetchone()["state"]
             if state in FINAL:
                 raise WrongState(f"job {job} is {state}; only queued and running jobs can be cancelled")
             if state == "queued":
@@ -219,7 +219,7 @@ class Queue:
     def retry(self, job: int) -> Job:
         """Queue a failed or cancelled job again; it resumes from what it made. Raises WrongState."""
         with self._writing() as db:
-            state = _state(db, job)
+            state = db.execute("SELECT state FROM jobs WHERE id = ?", (job,)).fetchone()["state"]
             if state not in ("failed", "cancelled"):
                 raise WrongState(f"job {job} is {state}; only failed and cancelled jobs can be retried")
             row = db.execute(
@@ -259,30 +259,24 @@ class Queue:
             JobEvent(id=r["id"], job=r["job"], time=r["time"], kind=r["kind"], data=json.loads(r["data"])) for r in rows
         ]
 
-    def prune(
-        self, *, before: float, beyond: int, has_files: Collection[int], remove_files: Callable[[int], None]
-    ) -> list[int]:
-        """Delete events and files of old jobs; the jobs and their changes of state stay.
+    def prune(self, root: ServiceRoot, config: ServerConfig, now: float | None = None) -> list[int]:
+        """Delete logs and events of jobs that ended more than `config.keep_days` or `config.keep_jobs` jobs ago.
 
-        Each batch holds the write lock, so that nobody retries one of its jobs meanwhile.
-
-        Args:
-            before: unix seconds; jobs that ended earlier are old.
-            beyond: jobs are old, too, if this many others ended after them.
-            has_files: jobs that may have files.
-            remove_files: deletes the files of a job.
-
-        Returns:
-            The pruned jobs, by number.
+        The jobs and their changes of state stay. Each batch holds the write lock, so that nobody retries one of its
+        jobs meanwhile. Returns the pruned jobs, by number.
         """
+        before = (time.time() if now is None else now) - config.keep_days * DAY
+        folders = (root.log(0).parent, root.events(0).parent)
+        has_files = {int(path.stem) for folder in folders for path in folder.iterdir() if path.stem.isdigit()}
         pruned: list[int] = []
-        for batch in self._prunable_jobs(before, beyond, has_files):
+        for batch in self._prunable_jobs(before, config.keep_jobs, has_files):
             with self._writing() as db:
                 for job in batch:
                     row = db.execute("SELECT state FROM jobs WHERE id = ?", (job,)).fetchone()
                     if row["state"] in FINAL:  # still
                         db.execute("DELETE FROM events WHERE job = ? AND kind != 'state'", (job,))
-                        remove_files(job)
+                        for path in (root.log(job), root.events(job)):
+                            path.unlink(missing_ok=True)
                         pruned.append(job)
         return pruned
 
@@ -333,13 +327,6 @@ class Queue:
             db.execute("ROLLBACK")
             raise
         db.execute("COMMIT")
-
-
-def _state(db: sqlite3.Connection, job: int) -> State:
-    row = db.execute("SELECT state FROM jobs WHERE id = ?", (job,)).fetchone()
-    if row is None:
-        raise LookupError(job)
-    return row["state"]
 
 
 def _note_state(db: sqlite3.Connection, job: int, state: str, why: str | None = None) -> None:

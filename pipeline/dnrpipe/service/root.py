@@ -28,6 +28,7 @@ class ServiceRoot:
     def __init__(self, folder: Path) -> None:
         self.folder = folder.resolve()
         self.private = self.folder / ".service"
+        self.queue = self.private / "queue.sqlite"
         self.scenes = self.folder / "scenes"
 
     def create(self) -> ServiceRoot:
@@ -37,14 +38,6 @@ class ServiceRoot:
         for folder in (self.scenes, self.private / "logs", self.private / "events"):
             folder.mkdir(exist_ok=True)
         return self
-
-    @property
-    def queue(self) -> Path:
-        return self.private / "queue.sqlite"
-
-    @property
-    def lock(self) -> Path:
-        return self.private / "lock"
 
     def log(self, job: int) -> Path:
         return self.private / "logs" / f"{job}.log"
@@ -64,6 +57,13 @@ class ServiceRoot:
         path = self._inside(self.scenes / name, name, SCENE_PATTERN)
         if must_exist and not path.is_file():
             raise UnknownName(f"{name}: no such scene; upload it with PUT /scenes/{name}")
+        return path
+
+    def result(self, name: str, file: str, problem: str) -> Path:
+        """A file of a workspace. Raises UnknownName with `problem`: it is not there, or leads out of the root."""
+        path = self.workspace(name) / file
+        if not path.is_file() or not path.resolve().is_relative_to(self.folder):
+            raise UnknownName(problem)
         return path
 
     def workspaces(self) -> list[str]:

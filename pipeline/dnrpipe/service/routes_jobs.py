@@ -11,11 +11,8 @@ from fastapi import APIRouter, Header, HTTPException, Path, Query
 from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
-from ..core.errors import UserError
 from ..core.settings import merge, parse_assignment, resolve
-from .models import FINAL, TAKES_SCENE, Job, JobEvent, JobPage, JobRequest, LogPage, Name, Problem, State
-from .queue import QueueFull, WrongState
-from .root import UnknownName
+from .models import FINAL, TAKES_SCENE, Job, JobPage, JobRequest, LogPage, Name, Problem, State
 from .state import Shared
 from .state import State as Service
 
@@ -159,7 +156,8 @@ async def events(
                 found = await run_in_threadpool(service.queue.events, job, last)
                 for event in found:
                     last = event.id
-                    yield _line(event)
+                    data = json.dumps({"time": event.time, **event.data})
+                    yield f"id: {event.id}\nevent: {event.kind}\ndata: {data}\n\n"
                 if found:
                     continue
                 if ended:
@@ -172,11 +170,6 @@ async def events(
             stream.__exit__(None, None, None)
 
     return StreamingResponse(lines(), media_type="text/event-stream")
-
-
-def _line(event: JobEvent) -> str:
-    data = json.dumps({"time": event.time, **event.data})
-    return f"id: {event.id}\nevent: {event.kind}\ndata: {data}\n\n"
 
 
 def known_job(service: Service, job: int) -> Job:
@@ -210,6 +203,3 @@ def check_request(request: JobRequest, service: Service) -> None:
 
     if settings.cameras.source not in KEYWORDS:
         raise HTTPException(422, f"settings: cameras.source must be one of {', '.join(KEYWORDS)} on a server")
-
-
-__all__ = ["NOT_FOUND", "REFUSED", "QueueFull", "UnknownName", "UserError", "WrongState", "router"]

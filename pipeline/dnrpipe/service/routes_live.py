@@ -26,7 +26,7 @@ from ..core.errors import UserError
 from .guard import SUBPROTOCOL
 from .live_pool import MOST_SPP, LiveSession
 from .live_scene import LiveRequest
-from .models import NAME_PATTERN
+from .models import NAME_PATTERN, first_fault
 from .state import get_state
 
 SETTLED = 0.2
@@ -83,7 +83,9 @@ async def live(socket: WebSocket, name: Annotated[str, Path(pattern=NAME_PATTERN
         return
     except (UserError, HTTPException) as error:
         detail = str(error.detail) if isinstance(error, HTTPException) else str(error)
-        await _close(socket, {"kind": "problem", "detail": " ".join(detail.split())})
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+            await socket.send_json({"kind": "problem", "detail": " ".join(detail.split())})
+            await socket.close(REFUSED)
 
 
 async def _read(socket: WebSocket, latest: LatestRequest) -> None:
@@ -93,9 +95,7 @@ async def _read(socket: WebSocket, latest: LatestRequest) -> None:
             try:
                 latest.put(LiveRequest.model_validate_json(text))
             except ValidationError as error:
-                first = error.errors()[0]
-                where = ".".join(str(part) for part in first["loc"])
-                await socket.send_json({"kind": "problem", "detail": f"{where}: {first['msg']}"})
+                await socket.send_json({"kind": "problem", "detail": first_fault(error)})
     except (WebSocketDisconnect, RuntimeError, KeyError):  # gone, or sent bytes where text is wanted
         latest.close()
 
@@ -137,9 +137,3 @@ def unpack(message: bytes) -> tuple[dict[str, Any], bytes]:
     """The inverse of `pack`: (header, picture)."""
     (length,) = struct.unpack_from("<I", message)
     return json.loads(message[4 : 4 + length]), message[4 + length :]
-
-
-async def _close(socket: WebSocket, reason: dict[str, Any]) -> None:
-    with contextlib.suppress(WebSocketDisconnect, RuntimeError):
-        await socket.send_json(reason)
-        await socket.close(REFUSED)

@@ -10,22 +10,16 @@ from fastapi.responses import FileResponse, PlainTextResponse
 
 from .. import __version__
 from .models import Health
-from .processes import folder_mb
 from .routes_jobs import NOT_FOUND, REFUSED
 from .state import Shared
+from .worker import folder_mb
 
 STATIC = Path(__file__).parent / "static"
 REPORT = Path(__file__).parents[1] / "report"
-SCRIPT, STYLE, PAGE = "text/javascript", "text/css", "text/html"
+TYPES = {".js": "text/javascript", ".css": "text/css", ".html": "text/html"}
 PAGES = {
-    "api.js": (STATIC, SCRIPT),
-    "app.js": (STATIC, SCRIPT),
-    "plots.js": (STATIC, SCRIPT),
-    "viewer.js": (STATIC, SCRIPT),
-    "style.css": (STATIC, STYLE),
-    "viewer.html": (STATIC, PAGE),
-    "sphere.js": (REPORT, SCRIPT),
-    "report.css": (REPORT, STYLE),
+    **{name: STATIC / name for name in ("api.js", "app.js", "plots.js", "viewer.js", "style.css", "viewer.html")},
+    **{name: REPORT / name for name in ("sphere.js", "report.css")},
 }
 TEXT: dict[int | str, dict[str, Any]] = {200: {"content": {"text/plain": {}}, "description": "Prometheus text format"}}
 
@@ -80,5 +74,4 @@ def static(file: str) -> FileResponse:
     """One of the named files; there is no listing."""
     if file not in PAGES:
         raise HTTPException(404, "no such page")
-    folder, kind = PAGES[file]
-    return FileResponse(folder / file, media_type=kind)
+    return FileResponse(PAGES[file], media_type=TYPES[PAGES[file].suffix])

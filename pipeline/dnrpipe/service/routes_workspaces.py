@@ -28,7 +28,6 @@ from .models import (
     SCENE_PATTERN,
     CostState,
     Curve,
-    PlacedView,
     Scene,
     StageState,
     TestPicture,
@@ -93,7 +92,7 @@ def get_workspace(name: NamePath, service: Shared) -> WorkspaceDetail:
     return WorkspaceDetail(
         name=name,
         stages=[StageState(**{key: getattr(row, key) for key in StageState.model_fields}) for row in rows],
-        views=[PlacedView(**view.model_dump()) for view in sphere.views] if sphere else [],
+        views=sphere.views if sphere else [],
         sphere=str(sphere_svg(sphere, "oblique")) if sphere else None,
         eye=(AZIMUTH, ELEVATION),
         training=[Curve(title=t.title, losses=t.losses, psnr=t.psnr) for t in known.training],
@@ -127,9 +126,7 @@ def preview(name: NamePath, service: Shared) -> PreviewState:
 @router.get("/workspaces/{name}/preview/{kind}", response_class=FileResponse, responses=NOT_FOUND | PNG)
 def preview_picture(name: NamePath, kind: Literal["truth", "prediction"], service: Shared) -> FileResponse:
     """The view as fine-tuning last rendered it, or its ray-traced reference."""
-    path = service.root.workspace(name) / "preview" / f"{kind}.png"
-    if not path.is_file() or not path.resolve().is_relative_to(service.root.folder):
-        raise HTTPException(404, f"{name} has no picture {kind} of a training")
+    path = service.root.result(name, f"preview/{kind}.png", f"{name} has no picture {kind} of a training")
     return FileResponse(path, media_type="image/png")
 
 
@@ -138,18 +135,14 @@ def picture(
     name: NamePath, view: ViewPath, kind: Literal["truth", "prediction", "flip"], service: Shared
 ) -> FileResponse:
     """A held-out view of the evaluation: ray-traced, by the neural renderer, or the FLIP error map."""
-    path = service.root.workspace(name) / "evaluation" / f"{view}.{kind}.png"
-    if not path.is_file() or not path.resolve().is_relative_to(service.root.folder):
-        raise HTTPException(404, f"{name} has no picture {kind} of view {view}")
+    path = service.root.result(name, f"evaluation/{view}.{kind}.png", f"{name} has no picture {kind} of view {view}")
     return FileResponse(path, media_type="image/png")
 
 
 @router.get("/workspaces/{name}/report", response_class=FileResponse, responses=NOT_FOUND | HTML)
 def report(name: NamePath, service: Shared) -> FileResponse:
     """The report of the last `run` or `report`."""
-    path = service.root.workspace(name) / "report" / "report.html"
-    if not path.is_file() or not path.resolve().is_relative_to(service.root.folder):
-        raise HTTPException(404, f"{name} has no report yet; submit a job report")
+    path = service.root.result(name, "report/report.html", f"{name} has no report yet; submit a job report")
     return FileResponse(path, media_type="text/html", headers={"content-security-policy": REPORT_POLICY})
 
 

@@ -8,11 +8,11 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import uvicorn
-from filelock import FileLock, Timeout
+from filelock import AcquireReturnProxy, FileLock, Timeout
 
 from ..core.errors import UserError
 from .app import create_app
@@ -87,17 +87,11 @@ class _Server(uvicorn.Server):
             self.ready()
 
 
-@contextlib.contextmanager
-def _exclusive(root: ServiceRoot) -> Iterator[None]:
-    lock = FileLock(root.lock, timeout=10)  # a killed server may take a moment to end
+def _exclusive(root: ServiceRoot) -> AcquireReturnProxy:
     try:
-        lock.acquire()
+        return FileLock(root.private / "lock", timeout=10).acquire()  # a killed server may take a moment to end
     except Timeout:
         raise UserError(f"{root.folder}: another server works here; stop it or choose another --root") from None
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 class _JsonLines(logging.Formatter):

@@ -12,8 +12,8 @@ import time
 from pathlib import Path
 
 from .config import ServerConfig
-from .processes import GRACE
 from .queue import Queue
+from .worker import GRACE
 
 LOG = logging.getLogger("dnrpipe.workers")
 POLL = 0.3
@@ -67,7 +67,14 @@ class Supervisor:
                     self.processes[device] = self._spawn(device)
                     started[device] = now
             self._stopping.wait(POLL)
-        self._end()
+        for process in self.processes.values():
+            process.terminate()
+        for process in self.processes.values():
+            try:
+                process.wait(timeout=GRACE + 5)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
         self.queue.close()
 
     def _spawn(self, device: str) -> subprocess.Popen[str]:
@@ -85,13 +92,3 @@ class Supervisor:
             process.stdin.write(self.config.model_dump_json())
             process.stdin.close()
         return process
-
-    def _end(self) -> None:
-        for process in self.processes.values():
-            process.terminate()
-        for process in self.processes.values():
-            try:
-                process.wait(timeout=GRACE + 5)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()

@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +27,11 @@ from ..workers.processes import die_with_parent
 from ..workers.timeouts import TIMEOUT_VARIABLE
 from .config import ServerConfig, tightest
 from .models import Job, Limits
-from .processes import end_group, folder_mb, session_memory_mb
 from .queue import MAX_STARTS, Queue
 from .root import ServiceRoot
 
+GRACE = 15.0
+"""Seconds between SIGTERM and SIGKILL, in which a job stops its workers and writes what it has."""
 IDLE = 0.3
 WATCH = 0.2
 DISK_INTERVAL = 5.0
@@ -83,7 +84,7 @@ class Worker:
                 stderr=subprocess.STDOUT,
                 env=job_environment(self.device, events),
                 start_new_session=True,
-                preexec_fn=_die_with(os.getpid()),
+                preexec_fn=partial(die_with_parent, os.getpid()),
             )
         limits = tightest(job.request.limits, self.config.limits)
         ended = self._watch(job, process, workspace, limits, EventReader(events))
@@ -187,13 +188,39 @@ def job_environment(device: str, events: Path) -> dict[str, str]:
     return kept | {VARIABLE: str(events), "PYTHONUNBUFFERED": "1"}
 
 
-def _die_with(parent: int) -> Callable[[], None]:
-    """For `preexec_fn`: the job's process ends with `parent`, which may already be dead."""
+def session_memory_mb(session: int) -> float:
+    """Resident memory of all processes of a session, MiB (pages that several share are counted for each). Linux."""
+    pages = 0
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit():
+            continue
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            # pid (command) state ppid pgrp session ...: the command may hold anything, so split after its bracket.
+            fields = (entry / "stat").read_text(errors="replace").rpartition(")")[2].split()
+            if int(fields[3]) == session:
+                pages += int(fields[21])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
-    def prepare() -> None:
-        die_with_parent(parent)
 
-    return prepare
+def folder_mb(folder: Path) -> float:
+    """Size of the files in a folder, MiB; links are not followed."""
+    total = 0
+    for path, _, files in os.walk(folder):
+        for name in files:
+            with contextlib.suppress(OSError):
+                total += os.lstat(os.path.join(path, name)).st_size  # noqa: PTH118
+    return total / 2**20
+
+
+def end_group(process: subprocess.Popen[bytes], *, grace: float = GRACE) -> None:
+    """SIGTERM to the leader, which stops its workers itself; SIGKILL to the whole group after ``grace`` seconds."""
+    if process.poll() is None:
+        process.send_signal(signal.SIGTERM)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(timeout=grace)
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
 
 
 def _await_lock(workspace: Path) -> None:

@@ -31,41 +31,25 @@ def export_display(scene: bpy.types.Scene, scene_dir: Path) -> dict[str, Any]:
     x lies at t = log2(1 + k x) / log2(1 + k max) of each axis.
     """
     view = scene.view_settings
-    plain = (
+    fields = {"exposure": 0.0, "gamma": 1.0, "view_transform": view.view_transform, "display_lut": None}
+    if (
         view.view_transform == "Standard"
         and view.look == "None"
         and view.gamma == 1.0
         and not view.use_curve_mapping
         and not view.use_white_balance
         and scene.display_settings.display_device == "sRGB"
-    )
-    if plain:
-        return {
-            "exposure": float(view.exposure),
-            "gamma": 1.0,
-            "view_transform": "Standard",
-            "display_lut": None,
-        }
-    lut = bake_lut(scene)
+    ):
+        return fields | {"exposure": float(view.exposure)}
     with atomic_path(scene_dir / LUT_FILE) as temporary:
-        np.savez_compressed(temporary, lut=lut, max=np.float32(LUT_MAX), k=np.float32(LUT_K))
-    return {
-        "exposure": 0.0,
-        "gamma": 1.0,
-        "view_transform": view.view_transform,
-        "display_lut": LUT_FILE,
-    }
-
-
-def lut_nodes() -> np.ndarray:
-    """Linear values of the nodes of one axis, float32 [N]: inverse of t = log2(1 + k x) / log2(1 + k max)."""
-    t = np.linspace(0, 1, LUT_SIZE)
-    return ((np.exp2(t * np.log2(1 + LUT_K * LUT_MAX)) - 1) / LUT_K).astype(np.float32)
+        np.savez_compressed(temporary, lut=bake_lut(scene), max=np.float32(LUT_MAX), k=np.float32(LUT_K))
+    return fields | {"display_lut": LUT_FILE}
 
 
 def bake_lut(scene: bpy.types.Scene) -> np.ndarray:
     """Display values of all node colours under the scene's view settings, float32 [N, N, N, 3]."""
-    nodes = lut_nodes()
+    t = np.linspace(0, 1, LUT_SIZE)  # log2(1 + k x) / log2(1 + k max)
+    nodes = ((np.exp2(t * np.log2(1 + LUT_K * LUT_MAX)) - 1) / LUT_K).astype(np.float32)
     grid = np.stack(np.meshgrid(nodes, nodes, nodes, indexing="ij"), axis=-1)
     flat = grid.reshape(LUT_SIZE * LUT_SIZE, LUT_SIZE, 3)
     return display_values(scene, flat).reshape(grid.shape)

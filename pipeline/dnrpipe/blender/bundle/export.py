@@ -18,8 +18,7 @@ from dnrtrain.atomic import write_text
 
 from ..findings import Findings
 from ..geometry.frozen import FrozenMesh
-from ..lighting.lights import export_lights
-from ..lighting.ray_visibility import report_ray_visibility
+from ..lighting.lights import export_lights, report_ray_visibility
 from ..lighting.world import export_world
 from ..reading.framing import framing_pose
 from ..reading.names import find_material

@@ -2,7 +2,7 @@
 
 Mitsuba moves the origin of a secondary ray by 9e-5 (1 + the largest coordinate) (``math::RayEpsilon``, float32): a
 scene of 1e-4 units disappears in that step. Such a bundle is written larger by a power of two, which changes no
-digit; ``<default name="unit_scale">`` at its head holds the factor, and `dnrpipe.raytrace.units` scales cameras
+digit; ``<default name="unit_scale">`` at its head holds the factor, and `dnrpipe.raytrace.sensors` scales cameras
 by it. Radiance does not depend on the unit of length; intensities (W/sr) and extinction do.
 """
 

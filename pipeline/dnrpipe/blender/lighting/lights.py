@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import bpy
@@ -18,7 +19,6 @@ from ..findings import Findings
 from ..shading.sockets import Scope, resolve
 from ..shading.textures import ImageReader, Textured, TextureStore
 from ..shading.values import Evaluator
-from .visible_lights import visible_lights
 
 FAR_DISC = 100.0
 """Distance of a soft sun's disc, in radii of the scene."""
@@ -32,6 +32,13 @@ POINT_RADIUS = 1e-3
 """Radius, in radii of the scene, of a sphere that stands for a point."""
 SPOT_TEXELS = 513
 """Side of the image that carries a spot's cross-section."""
+KINDS = {
+    "visible_diffuse": "diffuse",
+    "visible_glossy": "glossy",
+    "visible_transmission": "transmission",
+    "visible_volume_scatter": "volume scatter",
+    "visible_shadow": "shadow",
+}
 
 
 def export_lights(
@@ -41,10 +48,9 @@ def export_lights(
     findings: Findings,
     center: np.ndarray,
     radius: float,
-) -> int:
-    """Append all lamps to ``root``; return their number. center, radius: bounds of the geometry."""
+) -> None:
+    """Append all lamps to ``root``. center, radius: bounds of the geometry."""
     ids = xmltree.Ids()
-    count = 0
     for obj, matrix in visible_lights(scene):
         light = obj.data
         strength = _strength(light, obj.name, findings)
@@ -64,8 +70,6 @@ def export_lights(
         else:
             element = _area(light, matrix, strength, identity)
         root.append(element)
-        count += 1
-    return count
 
 
 def _unplaceable(light: Any, matrix: np.ndarray) -> str | None:
@@ -104,15 +108,15 @@ def _node_colour(tree: bpy.types.NodeTree, name: str, findings: Findings) -> np.
         return np.ones(3)
     trial = Findings()
     evaluator = Evaluator(None, ImageReader(trial), trial)
-    colour = evaluator.colour(source.node.inputs["Color"], source.scope).mean
+    colour = evaluator.colour(source.node.inputs["Color"], source.scope)
     strength = _falloff(source.node.inputs["Strength"], source.scope, name, findings)
     if strength is None:
         strength = evaluator.scalar(source.node.inputs["Strength"], source.scope).scalar
     for finding in trial:
         findings.add(finding.kind, f"lamp's {finding.feature}", finding.note, object=name)
-    if isinstance(evaluator.colour(source.node.inputs["Color"], source.scope), Textured):
+    if isinstance(colour, Textured):
         findings.add("approximated", "textured lamp", "its mean colour shines in all directions", object=name)
-    return np.asarray(colour, dtype=np.float64) * strength
+    return np.asarray(colour.mean, dtype=np.float64) * strength
 
 
 def _falloff(socket: Any, scope: Scope, name: str, findings: Findings) -> float | None:
@@ -121,12 +125,8 @@ def _falloff(socket: Any, scope: Scope, name: str, findings: Findings) -> float 
     if not source.linked or source.node.type != "LIGHT_FALLOFF":
         return None
     if source.socket.name != "Quadratic":
-        findings.add(
-            "approximated",
-            f"{source.socket.name.lower()} light falloff",
-            "falls off with the square of the distance",
-            object=name,
-        )
+        feature = f"{source.socket.name.lower()} light falloff"
+        findings.add("approximated", feature, "falls off with the square of the distance", object=name)
     return float(source.node.inputs["Strength"].default_value)
 
 
@@ -137,9 +137,14 @@ def _note_ignored(obj: Any, light: Any, findings: Findings) -> None:
     hidden = [ray for ray in ("diffuse", "glossy", "transmission") if not getattr(obj, f"visible_{ray}")]
     if hidden:
         findings.add("ignored", "lamp's ray visibility", f"{', '.join(hidden)} rays see it", object=obj.name)
-    linking = getattr(obj, "light_linking", None)
-    if linking is not None and (linking.receiver_collection or linking.blocker_collection):
+    if _is_linked(obj):
         findings.add("ignored", "light linking", "the lamp lights everything", object=obj.name)
+
+
+def _is_linked(obj: Any) -> bool:
+    """Whether light linking says what the object lights or shades."""
+    linking = getattr(obj, "light_linking", None)
+    return linking is not None and bool(linking.receiver_collection or linking.blocker_collection)
 
 
 def _point(light: Any, matrix: np.ndarray, power: np.ndarray, identity: str, scene_radius: float) -> ET.Element:
@@ -154,16 +159,20 @@ def _point(light: Any, matrix: np.ndarray, power: np.ndarray, identity: str, sce
         _position(element, "position", position)
         xmltree.rgb(element, "intensity", power / (4 * math.pi))
         return element
-    element = xmltree.plugin("shape", "sphere", id=identity)
-    _position(element, "center", position)
-    xmltree.number(element, "radius", radius)
+    element = _sphere(position, radius, identity)
     area = 4 * math.pi * radius**2 if light.normalize else 1.0
-    if _softens(light, scene_radius):
-        emitter = _emit(element, power / (math.pi * area), "dnr_lamp")
+    softens = _softens(light, scene_radius)
+    emitter = _emit(element, power / (math.pi * area), "dnr_lamp" if softens else "area")
+    if softens:
         xmltree.text(emitter, "profile", "point")
         xmltree.number(emitter, "soft", radius)
-    else:
-        _emit(element, power / (math.pi * area))
+    return element
+
+
+def _sphere(center: np.ndarray, radius: float, identity: str) -> ET.Element:
+    element = xmltree.plugin("shape", "sphere", id=identity)
+    _position(element, "center", center)
+    xmltree.number(element, "radius", radius)
     return element
 
 
@@ -234,9 +243,7 @@ def _spot(
     if radius > 1e-5 or half > WIDEST_SPOT:
         radius = radius if radius > 1e-5 else POINT_RADIUS * scene_radius
         area = 4 * math.pi * radius**2 if light.normalize or light.shadow_soft_size <= 1e-5 else 1.0
-        element = xmltree.plugin("shape", "sphere", id=identity)
-        _position(element, "center", matrix[:3, 3])
-        xmltree.number(element, "radius", radius)
+        element = _sphere(matrix[:3, 3], radius, identity)
         emitter = _emit(element, power / (math.pi * area), "dnr_lamp")
         xmltree.text(emitter, "profile", "spot")
         xmltree.vector(emitter, "axis", direction)
@@ -323,3 +330,55 @@ def _frame(axis: np.ndarray) -> np.ndarray:
     helper = np.array([1.0, 0.0, 0.0]) if abs(axis[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     x = _unit(np.cross(helper, axis))
     return np.stack([x, np.cross(axis, x), axis], axis=1)
+
+
+def visible_lights(scene: bpy.types.Scene) -> Iterator[tuple[Any, np.ndarray]]:
+    """Lamp objects that renders see, instances included, with their world matrices (float64 [4, 4])."""
+    layer = next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
+    hidden = _hidden_objects(layer.layer_collection)
+    depsgraph = layer.depsgraph if layer.depsgraph is not None else bpy.context.evaluated_depsgraph_get()
+    for obj in sorted(layer.objects, key=lambda o: o.name):
+        if obj.type == "LIGHT" and not obj.hide_render and obj.name not in hidden:
+            evaluated = obj.evaluated_get(depsgraph)
+            yield evaluated, np.array(evaluated.matrix_world, dtype=np.float64)
+    for instance in depsgraph.object_instances:
+        if instance.is_instance and instance.object.type == "LIGHT" and instance.show_self:
+            parent = instance.parent
+            if parent is not None and (parent.hide_render or parent.name in hidden):
+                continue
+            yield instance.object, np.array(instance.matrix_world, dtype=np.float64)
+
+
+def _hidden_objects(collection: bpy.types.LayerCollection) -> set[str]:
+    """Names of objects that only lie in excluded or render-hidden collections."""
+    shown: set[str] = set()
+    masked: set[str] = set()
+
+    def visit(layer: bpy.types.LayerCollection, above: bool) -> None:
+        off = above or layer.collection.hide_render
+        target = masked if off or layer.exclude else shown
+        target.update(obj.name for obj in layer.collection.objects)
+        for child in layer.children:
+            visit(child, off)
+
+    visit(collection, False)
+    return masked - shown
+
+
+def report_ray_visibility(names: Iterable[str], findings: Findings) -> None:
+    """A finding for each object that is hidden from some rays, a shadow catcher, a holdout, or has linked light.
+
+    names: objects of the frozen scene. Camera rays are not among them: those are obeyed.
+    """
+    objects = {obj.name_full: obj for obj in bpy.data.objects}
+    for name in sorted(set(names) & set(objects)):
+        obj = objects[name]
+        hidden = [kind for flag, kind in KINDS.items() if not getattr(obj, flag, True)]
+        if hidden:
+            findings.add("ignored", "ray visibility", f"{', '.join(hidden)} rays see it", object=name)
+        if obj.is_shadow_catcher:
+            findings.add("ignored", "shadow catcher", "an ordinary surface", object=name)
+        if obj.is_holdout:
+            findings.add("ignored", "holdout object", "an ordinary surface", object=name)
+        if _is_linked(obj):
+            findings.add("ignored", "light linking", "it lights and shades everything", object=name)

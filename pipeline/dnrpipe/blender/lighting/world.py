@@ -13,9 +13,8 @@ from ..findings import Findings
 from ..shading.sockets import find_input, resolve, surface_source, walk
 from ..shading.textures import ImageReader, TextureStore, finite_texels, srgb_to_linear
 from .lights import far_disc
-from .sky_sun import find_sun, measure, without_disc
+from .sky_sun import find_sun, measure, plain_colour, rotation, without_disc
 from .world_images import SIZE, render_equirect
-from .world_rotation import plain_colour, rotation
 
 ENVMAP_TO_BLENDER = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=np.float64)
 """B: Mitsuba's envmap frame (Y up) to Blender's equirectangular frame."""

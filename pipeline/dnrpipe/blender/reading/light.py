@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 
 from ..geometry.frozen import FrozenMesh
-from ..lighting.visible_lights import visible_lights
+from ..lighting.lights import visible_lights
 from ..shading.sockets import find_input, resolve, surface_source, walk
 from .names import find_material
 

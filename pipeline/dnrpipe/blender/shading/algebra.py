@@ -19,6 +19,11 @@ def equals(value: Value, number: float) -> bool:
     return isinstance(value, Constant) and abs(value.scalar - number) < 1e-5
 
 
+def is_white(value: Value) -> bool:
+    """Whether the value is a colour of 1 everywhere."""
+    return isinstance(value, Constant) and bool(np.allclose(value.mean, 1.0, atol=1e-3))
+
+
 def below(value: Value, limit: float) -> bool:
     """Whether the value is a constant below ``limit``."""
     return isinstance(value, Constant) and value.scalar < limit

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -71,12 +72,12 @@ class ShaderBase:
         """``value`` times ``factor``; see `algebra.product`."""
         value, weight = self._alike(value, factor)
         assert weight is not None
-        return product(value, weight, lambda feature, text: self.note("approximated", feature, text))
+        return product(value, weight, partial(self.note, "approximated"))
 
     def sum(self, a: Value | None, b: Value | None) -> Value | None:
         """``a`` + ``b``; see `algebra.total`."""
         a, b = self._alike(a, b)
-        return total(a, b, lambda feature, text: self.note("approximated", feature, text))
+        return total(a, b, partial(self.note, "approximated"))
 
     def _diffuse_element(self, colour: Value) -> ET.Element:
         element = xmltree.plugin("bsdf", "diffuse")
@@ -96,6 +97,10 @@ class ShaderBase:
     def _number(self, node: Any, scope: Scope, default: float, *names: str) -> float:
         socket = find_input(node, *names)
         return default if socket is None else self.values.number(socket, scope)
+
+    def _note_thin_film(self, node: Any, scope: Scope) -> None:
+        if self._number(node, scope, 0.0, "Thin Film Thickness") > 0:
+            self.note("ignored", "thin film", "no interference colours")
 
     def _put(self, element: ET.Element, name: str, value: Value) -> None:
         """A scalar parameter in [0, 1]."""
@@ -139,17 +144,13 @@ class ShaderBase:
                 return self._mesh_attribute(value, name)
             value = self.values.flat(value)
         if value.placement.region is not None:
-            return self._sheet(value, name)
+            assert self.sheets is not None
+            element = ET.Element("ref", {"id": self.sheets.place(value, name), "name": name})
+            self._lookups.append(_Lookup(element, ATLAS_LAYER, name))
+            return element
         element = self.store.element(value, name, f"{self.blender.name}-{label}", raw=raw)
         if value.texels.shape[:2] != (1, 1):  # a single texel looks the same under any coordinates
             self._lookups.append(_Lookup(element, layer, name))
-        return element
-
-    def _sheet(self, value: Textured, name: str) -> ET.Element:
-        """``<ref>`` to the sheet that holds this parameter of all baked materials."""
-        assert self.sheets is not None
-        element = ET.Element("ref", {"id": self.sheets.place(value, name), "name": name})
-        self._lookups.append(_Lookup(element, ATLAS_LAYER, name))
         return element
 
     def _mesh_attribute(self, value: Textured, name: str) -> ET.Element:

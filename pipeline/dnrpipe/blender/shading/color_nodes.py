@@ -16,17 +16,16 @@ from .textures import LUMINANCE
 Arrays = list[np.ndarray]
 
 
-def _first_input(node: Any) -> int:
-    return 0
-
-
 @dataclass(frozen=True)
 class Operation:
-    """inputs: socket identifiers or names, in the order of the arrays; evaluate: result, None if unsupported."""
+    """inputs: socket identifiers or names, in the order of the arrays; evaluate: result, None if unsupported.
+
+    fallback: the input that stands for an unsupported result.
+    """
 
     inputs: Callable[[Any], list[tuple[str, ...]]]
     evaluate: Callable[[Any, Any, Arrays], np.ndarray | None]
-    fallback: Callable[[Any], int] = _first_input
+    fallback: int = 0
 
 
 def _grey(x: np.ndarray) -> np.ndarray:
@@ -49,36 +48,20 @@ def _bright_contrast(node: Any, socket: Any, a: Arrays) -> np.ndarray:
     return np.maximum(a[0] * (1 + contrast) + _grey(a[1]) - contrast * 0.5, 0)
 
 
-def _to_grey(node: Any, socket: Any, a: Arrays) -> np.ndarray:
-    return _grey(a[0])
-
-
-def _blend(kind: str, t: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray | None:
-    """Blend modes of Mix Color (Cycles svm_mix)."""
-    if kind == "MIX":
-        return x + (y - x) * t
-    if kind == "MULTIPLY":
-        return x * (1 - t + t * y)
-    if kind == "ADD":
-        return x + t * y
-    if kind == "SUBTRACT":
-        return x - t * y
-    if kind == "SCREEN":
-        return 1 - (1 - t + t * (1 - y)) * (1 - x)
-    if kind == "DIFFERENCE":
-        return x + (np.abs(x - y) - x) * t
-    if kind == "DARKEN":
-        return x + (np.minimum(x, y) - x) * t
-    if kind == "LIGHTEN":
-        return x + (np.maximum(x, y) - x) * t
-    if kind == "DIVIDE":
-        return np.where(np.abs(y) > 0, (1 - t) * x + t * x / np.where(y == 0, 1, y), x)
-    if kind == "OVERLAY":
-        low = x * (1 - t + 2 * t * y)
-        return np.where(x < 0.5, low, 1 - (1 - t + 2 * t * (1 - y)) * (1 - x))
-    if kind == "LINEAR_LIGHT":
-        return x + t * (2 * y - 1)
-    return None
+BLEND: dict[str, Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]] = {
+    "MIX": lambda t, x, y: x + (y - x) * t,
+    "MULTIPLY": lambda t, x, y: x * (1 - t + t * y),
+    "ADD": lambda t, x, y: x + t * y,
+    "SUBTRACT": lambda t, x, y: x - t * y,
+    "SCREEN": lambda t, x, y: 1 - (1 - t + t * (1 - y)) * (1 - x),
+    "DIFFERENCE": lambda t, x, y: x + (np.abs(x - y) - x) * t,
+    "DARKEN": lambda t, x, y: x + (np.minimum(x, y) - x) * t,
+    "LIGHTEN": lambda t, x, y: x + (np.maximum(x, y) - x) * t,
+    "DIVIDE": lambda t, x, y: np.where(np.abs(y) > 0, (1 - t) * x + t * x / np.where(y == 0, 1, y), x),
+    "OVERLAY": lambda t, x, y: np.where(x < 0.5, x * (1 - t + 2 * t * y), 1 - (1 - t + 2 * t * (1 - y)) * (1 - x)),
+    "LINEAR_LIGHT": lambda t, x, y: x + t * (2 * y - 1),
+}
+"""Blend modes of Mix Color (Cycles svm_mix), t the factor."""
 
 
 def _mix_inputs(node: Any) -> list[tuple[str, ...]]:
@@ -93,13 +76,13 @@ def _mix(node: Any, socket: Any, a: Arrays) -> np.ndarray | None:
     modern = node.type == "MIX"
     if modern and node.data_type == "ROTATION":
         return None
-    clamp_factor = node.clamp_factor if modern else True
     t = _grey(a[0])
-    t = np.clip(t, 0, 1) if clamp_factor else t
+    t = np.clip(t, 0, 1) if not modern or node.clamp_factor else t
     kind = node.blend_type if not modern or node.data_type == "RGBA" else "MIX"
-    result = _blend(kind, t, a[1], a[2])
-    clamp_result = node.clamp_result if modern else node.use_clamp
-    return np.clip(result, 0, 1) if result is not None and clamp_result else result
+    if kind not in BLEND:
+        return None
+    result = BLEND[kind](t, a[1], a[2])
+    return np.clip(result, 0, 1) if (node.clamp_result if modern else node.use_clamp) else result
 
 
 MATH: dict[str, Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]] = {
@@ -122,10 +105,6 @@ MATH: dict[str, Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]] = {
     "SINE": lambda x, y, z: np.sin(x),
     "COSINE": lambda x, y, z: np.cos(x),
 }
-
-
-def _math_inputs(node: Any) -> list[tuple[str, ...]]:
-    return [("Value",), ("Value_001",), ("Value_002",)]
 
 
 def _math(node: Any, socket: Any, a: Arrays) -> np.ndarray | None:
@@ -214,34 +193,29 @@ def _hsv_to_rgb(h: np.ndarray, s: np.ndarray, v: np.ndarray) -> np.ndarray:
     return v[..., None] * (1 - s[..., None] * fall)
 
 
-def _sockets(*names: str) -> Callable[[Any], list[tuple[str, ...]]]:
-    return lambda node: [(name,) for name in names]
+def _sockets(*names: str | tuple[str, ...]) -> Callable[[Any], list[tuple[str, ...]]]:
+    """Inputs that are the same whatever the node's settings; a tuple holds other names of the same socket."""
+    return lambda node: [(name,) if isinstance(name, str) else name for name in names]
 
 
-def _combine_inputs(node: Any) -> list[tuple[str, ...]]:
-    return [("Red", "R", "X"), ("Green", "G", "Y"), ("Blue", "B", "Z")]
-
-
-def _separate_inputs(node: Any) -> list[tuple[str, ...]]:
-    return [("Color", "Image", "Vector")]
-
-
+_SEPARATE = Operation(_sockets(("Color", "Image", "Vector")), _separate)
+_COMBINE = Operation(_sockets(("Red", "R", "X"), ("Green", "G", "Y"), ("Blue", "B", "Z")), _combine)
 OPERATIONS: dict[str, Operation] = {
-    "INVERT": Operation(_sockets("Fac", "Color"), _invert, lambda node: 1),
+    "INVERT": Operation(_sockets("Fac", "Color"), _invert, fallback=1),
     "GAMMA": Operation(_sockets("Color", "Gamma"), _gamma),
-    "BRIGHTCONTRAST": Operation(lambda node: [("Color",), ("Bright", "Brightness"), ("Contrast",)], _bright_contrast),
-    "RGBTOBW": Operation(_sockets("Color"), _to_grey),
-    "MIX": Operation(_mix_inputs, _mix, lambda node: 1),
-    "MIX_RGB": Operation(_mix_inputs, _mix, lambda node: 1),
-    "MATH": Operation(_math_inputs, _math),
+    "BRIGHTCONTRAST": Operation(_sockets("Color", ("Bright", "Brightness"), "Contrast"), _bright_contrast),
+    "RGBTOBW": Operation(_sockets("Color"), lambda node, socket, a: _grey(a[0])),
+    "MIX": Operation(_mix_inputs, _mix, fallback=1),
+    "MIX_RGB": Operation(_mix_inputs, _mix, fallback=1),
+    "MATH": Operation(_sockets("Value", "Value_001", "Value_002"), _math),
     "CLAMP": Operation(_sockets("Value", "Min", "Max"), _clamp),
     "MAP_RANGE": Operation(_sockets("Value", "From Min", "From Max", "To Min", "To Max"), _map_range),
     "VALTORGB": Operation(_sockets("Fac"), _ramp),
-    "SEPARATE_COLOR": Operation(_separate_inputs, _separate),
-    "SEPRGB": Operation(_separate_inputs, _separate),
-    "SEPXYZ": Operation(_separate_inputs, _separate),
-    "COMBINE_COLOR": Operation(_combine_inputs, _combine),
-    "COMBRGB": Operation(_combine_inputs, _combine),
-    "COMBXYZ": Operation(_combine_inputs, _combine),
+    "SEPARATE_COLOR": _SEPARATE,
+    "SEPRGB": _SEPARATE,
+    "SEPXYZ": _SEPARATE,
+    "COMBINE_COLOR": _COMBINE,
+    "COMBRGB": _COMBINE,
+    "COMBXYZ": _COMBINE,
     "HUE_SAT": Operation(_sockets("Hue", "Saturation", "Value", "Fac", "Color"), _hue_saturation),
 }

@@ -25,8 +25,7 @@ class InterfaceShaders(NormalShaders):
         colour = self._colour(node, scope, "Color")
         roughness = self._scalar(node, scope, "Roughness")
         element = self._interface(colour, colour, self._index(node, scope), roughness, node.distribution)
-        if self._number(node, scope, 0.0, "Thin Film Thickness") > 0:
-            self.note("ignored", "thin film", "no interference colours")
+        self._note_thin_film(node, scope)
         return self._bent(element, node, scope, both_sides=True)
 
     def _refraction(self, node: Any, scope: Scope) -> Surface:

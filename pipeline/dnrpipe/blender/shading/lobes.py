@@ -69,8 +69,7 @@ class LobeShaders(NormalShaders):
         roughness = self._scalar(node, scope, "Roughness")
         if self._number(node, scope, 0.0, "Anisotropy") != 0:
             self.note("ignored", "anisotropy", "treated as isotropic")
-        if self._number(node, scope, 0.0, "Thin Film Thickness") > 0:
-            self.note("ignored", "thin film", "no interference colours")
+        self._note_thin_film(node, scope)
         if getattr(node, "fresnel_type", "F82") != "PHYSICAL_CONDUCTOR":
             element = xmltree.plugin("bsdf", "dnr_principled")
             self._put_colour(element, "base_color", self._colour(node, scope, "Base Color"))

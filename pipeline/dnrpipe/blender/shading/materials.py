@@ -11,8 +11,9 @@ import numpy as np
 from ..baking.cache import BakeCache
 from ..bundle import xmltree
 from ..findings import Findings
-from .shaders import ShaderWalker, default_grey, twosided
+from .shaders import ShaderWalker
 from .sheets import AtlasSheets
+from .surface import CYCLES_DEFAULT_GREY, diffuse, twosided
 from .textures import ImageReader, Placement, Textured, TextureStore, Value, constant
 from .view_dependent import average
 
@@ -67,10 +68,13 @@ class MaterialConverter:
     def _convert(self, material: Any | None) -> Converted:
         identity = self.ids.take("mat", "default" if material is None else material.name)
         if material is None:
-            return Converted(identity, _with_id(twosided(default_grey()), identity), None, None, False, None)
+            bsdf = twosided(diffuse(CYCLES_DEFAULT_GREY))
+            bsdf.set("id", identity)
+            return Converted(identity, bsdf, None, None, False, None)
         walker = ShaderWalker(material, self.store, self.images, self.findings, self.bakes, self.sheets)
         surface = walker.material()
-        bsdf = _with_id(walker.finish(surface), identity)
+        bsdf = walker.finish(surface)
+        bsdf.set("id", identity)
         emission = self._image(walker, self._sampleable(walker, surface.emission))
         own, layers = walker.settle(emission)
         textured = walker.textured or isinstance(emission, Textured)
@@ -125,8 +129,3 @@ class MaterialConverter:
         else:
             xmltree.rgb(element, "radiance", np.maximum(emission.mean, 0))
         return element
-
-
-def _with_id(element: ET.Element, identity: str) -> ET.Element:
-    element.set("id", identity)
-    return element

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from typing import Any
 
 from ..bundle import xmltree
-from .algebra import complement, equals
+from .algebra import complement, equals, is_white
 from .base import ShaderBase
 from .sockets import Scope, resolve
 from .surface import Surface
@@ -110,7 +110,7 @@ class MixShaders(ShaderBase, ABC):
         """
         if equals(surface.opacity, 1.0):
             return surface.sided()
-        tinted = not all(equals_colour(surface.tint, 1.0))
+        tinted = not is_white(surface.tint)
         empty = equals(surface.opacity, 0.0)
         if empty and not tinted:
             return xmltree.plugin("bsdf", "null")
@@ -121,10 +121,3 @@ class MixShaders(ShaderBase, ABC):
             self._put(element, "opacity", surface.opacity)
             element.append(surface.sided())
         return element
-
-
-def equals_colour(value: Value, number: float) -> tuple[bool, ...]:
-    """Per channel: whether the value is the same number everywhere."""
-    if not isinstance(value, Constant):
-        return (False,) * 3
-    return tuple(abs(channel - number) < 1e-3 for channel in value.rgb)

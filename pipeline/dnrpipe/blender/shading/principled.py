@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from ..bundle import xmltree
-from .algebra import equals, square_root
+from .algebra import equals, is_white, square_root
 from .calibration import diffuse_gain, eta_of, metal_gain, normal_reflectance
 from .interfaces import MIN_ETA, InterfaceShaders
 from .lobes import LobeShaders
 from .sockets import Scope, find_input, resolve
 from .surface import Surface
-from .textures import Constant, Textured, Value, constant, scale
+from .textures import Textured, Value, constant, scale
 
 
 class PrincipledShader(LobeShaders, InterfaceShaders):
@@ -70,11 +70,10 @@ class PrincipledShader(LobeShaders, InterfaceShaders):
             xmltree.number(element, "specular", 0.0)
         else:
             xmltree.number(element, "eta", max(eta_of(f0), MIN_ETA))
-        if not equals(anisotropic, 0.0):
-            # Both stretch alpha by sqrt(1 - 0.9 a).
-            self._put(element, "anisotropic", anisotropic)
-            self._note_tangent()
-            self._coat_and_sheen(element, node, scope)
+        # Both stretch alpha by sqrt(1 - 0.9 a).
+        self._put(element, "anisotropic", anisotropic)
+        self._note_tangent()
+        self._coat_and_sheen(element, node, scope)
         return element
 
     def _native(self, base: Value, roughness: Value, metallic: Value, transmission: Value, f0: float) -> ET.Element:
@@ -90,11 +89,13 @@ class PrincipledShader(LobeShaders, InterfaceShaders):
         )
         self._put_colour(element, "base_color", scale(base, gain))
         self._put(element, "roughness", roughness)
-        if not equals(metallic, 0.0):
-            self._put(element, "metallic", metallic)
-        if not equals(transmission, 0.0):
-            self._put(element, "spec_trans", transmission)
+        self._put_positive(element, "metallic", metallic)
+        self._put_positive(element, "spec_trans", transmission)
         return element
+
+    def _put_positive(self, element: ET.Element, name: str, value: Value) -> None:
+        if not equals(value, 0.0):
+            self._put(element, name, value)
 
     def _is_layered(self, node: Any, scope: Scope) -> bool:
         """Whether there is a coat or sheen."""
@@ -104,21 +105,17 @@ class PrincipledShader(LobeShaders, InterfaceShaders):
         )
 
     def _principled_notes(self, node: Any, scope: Scope) -> None:
-        subsurface = self._number(node, scope, 0.0, "Subsurface Weight", "Subsurface")
-        if subsurface > 0:
+        if self._number(node, scope, 0.0, "Subsurface Weight", "Subsurface") > 0:
             self.note("approximated", "subsurface scattering", "treated as diffuse reflection of the base colour")
         if self._number(node, scope, 0.0, "Diffuse Roughness") > 0:
             self.note("approximated", "diffuse roughness", "the target's own retro-reflection is used")
-        if self._number(node, scope, 0.0, "Thin Film Thickness") > 0:
-            self.note("ignored", "thin film", "no interference colours")
+        self._note_thin_film(node, scope)
 
-    def _tint(self, node: Any, scope: Scope, name: str) -> Value:
-        """A tint; sockets of older versions that hold a number mean none."""
-        socket = find_input(node, name)
-        return self.values.colour(socket, scope) if socket is not None and socket.type == "RGBA" else constant(1.0)
-
-    def _is_white(self, value: Value) -> bool:
-        return isinstance(value, Constant) and bool(np.allclose(value.mean, 1.0, atol=1e-3))
+    def _put_tint(self, element: ET.Element, name: str, node: Any, scope: Scope, socket_name: str) -> None:
+        """Write a tint that is not white; sockets of older versions that hold a number mean none."""
+        socket = find_input(node, socket_name)
+        if socket is not None and socket.type == "RGBA" and not is_white(tint := self.values.colour(socket, scope)):
+            self._put_colour(element, name, tint)
 
     def _layered(
         self, node: Any, scope: Scope, base: Value, roughness: Value, metallic: Value, f0: float
@@ -127,21 +124,16 @@ class PrincipledShader(LobeShaders, InterfaceShaders):
         element = xmltree.plugin("bsdf", "dnr_principled")
         self._put_colour(element, "base_color", base)
         self._put(element, "roughness", roughness)
-        if not equals(metallic, 0.0):
-            self._put(element, "metallic", metallic)
+        self._put_positive(element, "metallic", metallic)
         xmltree.number(element, "eta", max(eta_of(f0), MIN_ETA))
-        tint = self._tint(node, scope, "Specular Tint")
-        if not self._is_white(tint):
-            self._put_colour(element, "specular_tint", tint)
+        self._put_tint(element, "specular_tint", node, scope, "Specular Tint")
         coat = self._scalar(node, scope, "Coat Weight", "Clearcoat")
         if not equals(coat, 0.0):
             self._put(element, "coat", coat)
             xmltree.number(element, "coat_eta", max(self._number(node, scope, 1.5, "Coat IOR"), MIN_ETA))
             own = self._number(node, scope, 0.03, "Coat Roughness", "Clearcoat Roughness")
             xmltree.number(element, "coat_roughness", own)
-            colour = self._tint(node, scope, "Coat Tint")
-            if not self._is_white(colour):
-                self._put_colour(element, "coat_tint", colour)
+            self._put_tint(element, "coat_tint", node, scope, "Coat Tint")
             normal = find_input(node, "Coat Normal", "Clearcoat Normal")
             if normal is not None and resolve(normal, scope).linked:
                 self.note("approximated", "coat normal", "the coat has the normal of what it covers")
@@ -149,9 +141,7 @@ class PrincipledShader(LobeShaders, InterfaceShaders):
         if not equals(sheen, 0.0):
             self._put(element, "sheen", sheen)
             xmltree.number(element, "sheen_roughness", self._number(node, scope, 0.5, "Sheen Roughness"))
-            colour = self._tint(node, scope, "Sheen Tint")
-            if not self._is_white(colour):
-                self._put_colour(element, "sheen_tint", colour)
+            self._put_tint(element, "sheen_tint", node, scope, "Sheen Tint")
             self.note("approximated", "sheen", "Cycles' albedo by angle of view, spread like diffuse light")
         return element
 
@@ -168,7 +158,8 @@ class PrincipledShader(LobeShaders, InterfaceShaders):
         if not equals(sheen, 0.0):
             self._put(element, "sheen", sheen)
             self.note("approximated", "sheen", "Disney sheen: roughness and tint are not converted")
-        if not self._is_white(self._tint(node, scope, "Specular Tint")):
+        tint = find_input(node, "Specular Tint")
+        if tint is not None and tint.type == "RGBA" and not is_white(self.values.colour(tint, scope)):
             self.note("ignored", "specular tint", "reflections stay untinted")
 
     def _viewport_material(self) -> Surface:

@@ -1,8 +1,8 @@
 """Blender's shader nodes -> Mitsuba BSDFs: the walk over a material's shader tree.
 
-One method per node, by family: `lobes` (what reflects), `interfaces` (what transmits), `principled`, `mixing` and
-`volumes` (what fills a mesh); `normals` bends their normals. The numbers of `calibration` make them agree with Cycles.
-Whatever is not converted exactly becomes a finding with the material's name.
+One method per node, by family: `lobes` (what reflects), `interfaces` (what transmits), `principled`, `mixing`,
+`volumes` (what fills a mesh); `normals` bends their normals. Whatever is not converted exactly is recorded as a finding
+with the material's name.
 """
 
 from __future__ import annotations
@@ -12,11 +12,9 @@ import xml.etree.ElementTree as ET
 from .mixing import MixShaders
 from .principled import PrincipledShader
 from .sockets import Source, surface_source
-from .surface import Surface, default_grey, twosided
+from .surface import Surface
 from .textures import constant
 from .volumes import VolumeShaders
-
-__all__ = ["ShaderWalker", "Surface", "default_grey", "twosided"]
 
 
 class ShaderWalker(PrincipledShader, MixShaders, VolumeShaders):

@@ -100,9 +100,10 @@ def walk(tree: bpy.types.NodeTree | None, seen: set[str] | None = None) -> Itera
     if tree is None:
         return
     seen = set() if seen is None else seen
-    if tree.name_full + str(tree.as_pointer()) in seen:
+    key = tree.name_full + str(tree.as_pointer())
+    if key in seen:
         return
-    seen.add(tree.name_full + str(tree.as_pointer()))
+    seen.add(key)
     for node in tree.nodes:
         yield node
         if node.type == "GROUP":

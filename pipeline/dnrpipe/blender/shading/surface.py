@@ -31,21 +31,14 @@ class Surface:
     def sided(self) -> ET.Element:
         """The BSDF for both sides of the surface, as all of Blender's shaders are; black where there is none."""
         if self.bsdf is None:
-            return twosided(black())
+            return twosided(diffuse((0.0, 0.0, 0.0)))
         return self.bsdf if self.both_sides else twosided(self.bsdf)
 
 
-def black() -> ET.Element:
-    """Absorbs all light."""
+def diffuse(colour: tuple[float, float, float]) -> ET.Element:
+    """Lambertian reflection of a linear colour."""
     element = xmltree.plugin("bsdf", "diffuse")
-    xmltree.rgb(element, "reflectance", (0.0, 0.0, 0.0))
-    return element
-
-
-def default_grey() -> ET.Element:
-    """What Cycles shows where there is no material."""
-    element = xmltree.plugin("bsdf", "diffuse")
-    xmltree.rgb(element, "reflectance", CYCLES_DEFAULT_GREY)
+    xmltree.rgb(element, "reflectance", colour)
     return element
 
 

@@ -15,12 +15,13 @@ from typing import Any, Literal
 
 import numpy as np
 
+from dnrtrain.atomic import atomic_path
 from dnrtrain.srgb import decode, encode
 
 from ..bundle import xmltree
 from ..findings import Findings
-from .image_files import HALF_MAX, write_colour_exr, write_png
 
+HALF_MAX = 65504.0
 MISSING_COLOUR = (1.0, 0.0, 1.0)
 """What Blender shows for an image that cannot be read."""
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
@@ -77,7 +78,8 @@ class Textured:
         """Texels as float32, linear."""
         if self.texels.dtype != np.uint8:
             return self.texels
-        return _decode_table(self.srgb)[self.texels]
+        codes = np.arange(256, dtype=np.float32) / 255
+        return (srgb_to_linear(codes) if self.srgb else codes)[self.texels]
 
     @property
     def mean(self) -> np.ndarray:
@@ -137,11 +139,6 @@ def srgb_to_linear(x: np.ndarray) -> np.ndarray:
 def linear_to_srgb(x: np.ndarray) -> np.ndarray:
     """Linear light -> sRGB code values, float32."""
     return encode(x).astype(np.float32)
-
-
-def _decode_table(srgb: bool) -> np.ndarray:
-    codes = np.arange(256, dtype=np.float32) / 255
-    return srgb_to_linear(codes) if srgb else codes
 
 
 @dataclass
@@ -251,7 +248,9 @@ class TextureStore:
         xmltree.flag(element, "raw", raw or not value.srgb)
         affine = np.asarray(value.placement.to_uv, dtype=np.float64)
         if not np.allclose(affine, np.eye(3)):
-            xmltree.matrix(element, "to_uv", embed_affine(affine))
+            full = np.eye(4)  # Mitsuba reduces it to a planar map, whose translation is in the last column
+            full[:2, :2], full[:2, 3] = affine[:2, :2], affine[:2, 2]
+            xmltree.matrix(element, "to_uv", full)
         return element
 
     def save(self, texels: np.ndarray, srgb: bool, label: str) -> str:
@@ -269,9 +268,22 @@ class TextureStore:
         return self._written[key]
 
 
-def embed_affine(affine: np.ndarray) -> np.ndarray:
-    """A 3x3 planar affine map as the 4x4 that Mitsuba reduces to it (translation in the last column)."""
-    full = np.eye(4)
-    full[:2, :2] = affine[:2, :2]
-    full[:2, 3] = affine[:2, 2]
-    return full
+def write_png(path: Path, texels: np.ndarray) -> None:
+    """8-bit grey or RGB PNG from uint8 [H, W, 1 or 3]."""
+    from PIL import Image
+
+    picture = Image.fromarray(texels[..., 0] if texels.shape[2] == 1 else texels)
+    with atomic_path(path) as temporary:
+        picture.save(temporary, format="PNG", compress_level=4)
+
+
+def write_colour_exr(path: Path, texels: np.ndarray) -> None:
+    """EXR from float [H, W, 1 or 3], linear Rec.709; half precision unless a value exceeds its range."""
+    import OpenEXR
+
+    kind = np.float16 if np.abs(texels).max(initial=0.0) < HALF_MAX else np.float32
+    data = np.ascontiguousarray(texels, dtype=kind)
+    channels = {"Y": data[..., 0].copy()} if data.shape[2] == 1 else {"RGB": data}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with atomic_path(path) as temporary, OpenEXR.File(header, channels) as file:
+        file.write(str(temporary))

@@ -7,9 +7,11 @@ its average. Baking and averaging are findings.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
+import bpy
 import numpy as np
 
 from ..baking.cache import BakeCache
@@ -17,8 +19,6 @@ from ..baking.trees import ACTIVE_COLOUR
 from ..findings import Findings
 from ..geometry.corner_colours import colour_corners, is_uv_layer
 from ..tasks import ValueKind
-from .averages import procedural_mean
-from .blackbody import blackbody_colour
 from .color_nodes import OPERATIONS
 from .filtering import finer
 from .placing import image_placement
@@ -190,7 +190,7 @@ class Evaluator:
         result = operation.evaluate(source.node, source.socket, arrays)
         if result is None:
             self._inexact(f"{source.node.bl_label} node", "this mode is not converted: first input used")
-            result = arrays[operation.fallback(source.node)]
+            result = arrays[operation.fallback]
         result = np.asarray(result, dtype=np.float32)
         if lead is None:
             return constant(result.reshape(-1, result.shape[-1])[0] * np.ones(3, dtype=np.float32))
@@ -325,3 +325,29 @@ def _alpha_in_use(node: Any) -> bool:
         for other in node.id_data.nodes
         if other.type == "TEX_IMAGE" and not other.mute and content(other) == content(node)
     )
+
+
+def procedural_mean(source: Source, evaluate: Callable[[Any, Scope], Value]) -> Constant:
+    """Average of a node's output over space; ``evaluate(socket, scope)`` gives its inputs."""
+    node = source.node
+    if node.type in {"TEX_CHECKER", "TEX_BRICK"} and source.socket.name == "Color":
+        pair = [find_input(node, "Color1"), find_input(node, "Color2")]
+        means = [evaluate(socket, source.scope).mean for socket in pair if socket is not None]
+        return constant(np.mean(means, axis=0))
+    if node.type == "BLACKBODY" or node.type == "WAVELENGTH":
+        return constant(1.0)
+    if source.socket.type in {"RGBA", "VECTOR", "VALUE"} and node.type.startswith("TEX_"):
+        return constant(0.5)
+    own = next((s for s in node.inputs if s.type in {"RGBA", "VALUE"} and s.enabled), None)
+    return constant(0.5) if own is None else constant(evaluate(own, source.scope).mean)
+
+
+def blackbody_colour(kelvin: float) -> np.ndarray:
+    """Linear Rec.709 colour of luminance 1 (Blackbody node; a lamp's temperature), float64 [3], not below 0."""
+    lamp = bpy.data.lights.new("dnrpipe.blackbody", "POINT")
+    try:
+        lamp.use_temperature = True
+        lamp.temperature = kelvin
+        return np.maximum(np.array(lamp.temperature_color, dtype=np.float64), 0.0)
+    finally:
+        bpy.data.lights.remove(lamp)

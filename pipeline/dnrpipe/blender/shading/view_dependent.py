@@ -5,7 +5,7 @@ Notation
     f(c) the node's output; one row for the front of the surface, one for its back
 
 A table is a `Textured` of its own placement, so that arithmetic on it (Math, ColorRamp, Mix, ...) is exact;
-texture plugin ``dnr_view`` (dnrpipe/raytrace/plugins/views.py) looks it up while rendering.
+texture plugin ``dnr_view`` (dnrpipe/raytrace/plugins/lookups.py) looks it up while rendering.
 """
 
 from __future__ import annotations
@@ -20,18 +20,15 @@ from .textures import Placement, Textured, Value, constant
 VIEW_LAYER = "dnrpipe.view"
 """Name of the layer of coordinates (c, side) in `Placement`."""
 COSINES = 256
+COSINE = np.linspace(0.0, 1.0, COSINES)
+"""The cosines of a table's columns, from grazing to straight on."""
 PLACEMENT = Placement(uv=VIEW_LAYER, wrap="clamp")
 
 
 def table(front: np.ndarray, back: np.ndarray) -> Textured:
-    """Table from f at the cosines of `cosines`, [COSINES] or [COSINES, 3] for each side."""
+    """Table from f at each COSINE, [COSINES] or [COSINES, 3] for each side."""
     rows = np.stack([front, back]).astype(np.float32)
     return Textured(rows.reshape(2, COSINES, -1), False, PLACEMENT)
-
-
-def cosines() -> np.ndarray:
-    """The cosines of a table's columns, float64 [COSINES], from grazing to straight on."""
-    return np.linspace(0.0, 1.0, COSINES)
 
 
 def dielectric_fresnel(cosine: np.ndarray, eta: float) -> np.ndarray:
@@ -49,20 +46,20 @@ def dielectric_fresnel(cosine: np.ndarray, eta: float) -> np.ndarray:
 def fresnel_node(ior: float) -> Textured:
     """Fresnel node: dielectric Fresnel of ``ior``, of 1 / ior from behind."""
     eta = max(ior, 1e-5)
-    return table(dielectric_fresnel(cosines(), eta), dielectric_fresnel(cosines(), 1 / eta))
+    return table(dielectric_fresnel(COSINE, eta), dielectric_fresnel(COSINE, 1 / eta))
 
 
 def layer_weight_fresnel(blend: float) -> Textured:
     """Layer Weight node, Fresnel: dielectric Fresnel of index 1 / (1 - blend), inverted from behind."""
     eta = max(1 - blend, 1e-5)
-    return table(dielectric_fresnel(cosines(), 1 / eta), dielectric_fresnel(cosines(), eta))
+    return table(dielectric_fresnel(COSINE, 1 / eta), dielectric_fresnel(COSINE, eta))
 
 
 def layer_weight_facing(blend: float) -> Textured:
     """Layer Weight node, Facing: 1 - c^p, p = 2 blend below a blend of 0.5, else 0.5 / (1 - blend)."""
     blend = min(max(blend, 0.0), 1 - 1e-5)
     power = 2 * blend if blend < 0.5 else 0.5 / (1 - blend)
-    values = 1 - cosines() ** power
+    values = 1 - COSINE**power
     return table(values, values)
 
 
@@ -75,7 +72,7 @@ def average(value: Value) -> Value:
     """``value``, or the constant that stands for a view-dependent one: its cosine-weighted mean over the front."""
     if not (isinstance(value, Textured) and is_view_dependent(value)):
         return value
-    weights = cosines() / cosines().sum()
+    weights = COSINE / COSINE.sum()
     return constant(np.broadcast_to(weights @ value.linear()[0].astype(np.float64), (3,)))
 
 

@@ -8,7 +8,7 @@ Notation (coefficients per scene unit, linear RGB)
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -26,8 +26,8 @@ VARYING = {"ATTRIBUTE", "VOLUME_INFO"}
 class Coefficients:
     """Homogeneous medium: absorption a, scattering s, [3] each; g; emitted radiance per unit length [3]."""
 
-    absorption: np.ndarray
-    scattering: np.ndarray
+    absorption: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    scattering: np.ndarray = field(default_factory=lambda: np.zeros(3))
     g: float = 0.0
     emission: float = 0.0
     rayleigh: bool = False
@@ -71,7 +71,7 @@ class VolumeShaders(ShaderBase):
         if handler is not None:
             return handler(source.node, source.scope)
         self.note("ignored", f"{source.node.bl_label} node as a volume", "the inside is empty")
-        return _empty()
+        return Coefficients()
 
     def _density(self, node: Any, scope: Scope) -> float:
         """Density per scene unit. A texture or a grid that varies in space is a finding."""
@@ -103,13 +103,13 @@ class VolumeShaders(ShaderBase):
     def _absorption(self, node: Any, scope: Scope) -> Coefficients:
         """Volume Absorption: a = density (1 - colour)."""
         colour = np.minimum(self._mean(node, scope, "Color"), 1.0)
-        return Coefficients(self._density(node, scope) * (1 - colour), np.zeros(3))
+        return Coefficients(self._density(node, scope) * (1 - colour))
 
     def _scatter(self, node: Any, scope: Scope) -> Coefficients:
         """Volume Scatter: s = density colour; nothing is absorbed."""
         g, rayleigh = self._phase(node, scope)
         scattering = self._density(node, scope) * self._mean(node, scope, "Color")
-        return Coefficients(np.zeros(3), scattering, g, rayleigh=rayleigh)
+        return Coefficients(scattering=scattering, g=g, rayleigh=rayleigh)
 
     def _principled_volume(self, node: Any, scope: Scope) -> Coefficients:
         """Principled Volume: s = density colour, a = density (1 - colour)(1 - sqrt(absorption colour))."""
@@ -117,9 +117,8 @@ class VolumeShaders(ShaderBase):
         colour = self._mean(node, scope, "Color")
         kept = np.sqrt(self._mean(node, scope, "Absorption Color"))
         absorption = density * np.maximum(1 - colour, 0) * np.maximum(1 - kept, 0)
-        emission = self._number(node, scope, 0.0, "Emission Strength") + self._number(
-            node, scope, 0.0, "Blackbody Intensity"
-        )
+        glow = ("Emission Strength", "Blackbody Intensity")
+        emission = sum(self._number(node, scope, 0.0, name) for name in glow)
         return Coefficients(absorption, density * colour, self._number(node, scope, 0.0, "Anisotropy"), emission)
 
     def _volume_coefficients(self, node: Any, scope: Scope) -> Coefficients:
@@ -133,7 +132,7 @@ class VolumeShaders(ShaderBase):
     def _parts(self, node: Any, scope: Scope) -> list[Coefficients]:
         sockets = [socket for socket in node.inputs if socket.type == "SHADER"]
         sources = [resolve(socket, scope) for socket in sockets]
-        return [self._volume(source) if source.linked else _empty() for source in sources]
+        return [self._volume(source) if source.linked else Coefficients() for source in sources]
 
     def _add_volumes(self, node: Any, scope: Scope) -> Coefficients:
         """Add Shader of volumes: coefficients add up; g is their mean, weighted by scattering."""
@@ -143,10 +142,6 @@ class VolumeShaders(ShaderBase):
         """Mix Shader of volumes: weighted sum."""
         factor = min(max(self._number(node, scope, 0.5, "Fac", "Factor"), 0.0), 1.0)
         return _sum(self._parts(node, scope), (1 - factor, factor))
-
-
-def _empty() -> Coefficients:
-    return Coefficients(np.zeros(3), np.zeros(3))
 
 
 def _sum(parts: list[Coefficients], weights: tuple[float, float]) -> Coefficients:

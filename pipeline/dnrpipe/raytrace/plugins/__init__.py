@@ -10,9 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from . import emitters, layers, lookups, normals, refraction, sums, translucency, transparency, views
-
-FAMILIES = (lookups, views, normals, sums, transparency, translucency, refraction, emitters, layers)
+from . import emitters, layers, lookups, normals, refraction, sums, transparency
 
 
 def register(mi: Any) -> None:
@@ -20,5 +18,5 @@ def register(mi: Any) -> None:
 
     Calling it again for the same variant is harmless.
     """
-    for family in FAMILIES:
+    for family in (lookups, normals, sums, transparency, refraction, emitters, layers):
         family.register(mi)

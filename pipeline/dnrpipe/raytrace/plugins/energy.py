@@ -1,4 +1,4 @@
-"""Energy of GGX lobes: albedo tables that layering and multiple scattering need. numpy only.
+"""Energy of GGX lobes: albedo tables that layering and multiple scattering need, and Mitsuba textures of them.
 
 Notation
     m       cosine between view and normal; r roughness, alpha = r^2
@@ -11,6 +11,7 @@ So a lobe with Fresnel term f0 + (1 - f0) s has the albedo f0 E + (1 - f0) S.
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -99,3 +100,22 @@ def _visible_normals(view: np.ndarray, alpha: float, u1: np.ndarray, u2: np.ndar
     h = np.stack([flat * np.cos(phi), flat * np.sin(phi), z], axis=-1) + std
     h = np.stack([h[..., 0] * alpha, h[..., 1] * alpha, np.maximum(h[..., 2], 1e-9)], axis=-1)
     return h / np.linalg.norm(h, axis=-1, keepdims=True)
+
+
+def table_of(mi: Any, channels: list[np.ndarray]) -> Any:
+    """Raw ``bitmap`` texture of three float arrays [H, W]."""
+    texels = np.ascontiguousarray(np.stack(channels, axis=-1), dtype=np.float32)
+    data = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True, "wrap_mode": "clamp"}
+    return mi.load_dict(data, parallel=False)  # a worker's thread pool may be empty
+
+
+def look_up(mi: Any, table: Any, si: Any, cosine: Any, row: Any, active: Any) -> Any:
+    """The three channels at (cosine, row)."""
+    at = mi.SurfaceInteraction3f(si)
+    at.uv = mi.Point2f(cosine, row)
+    return table.eval_3(at, active)
+
+
+def row_of(roughness: Any) -> Any:
+    """Where a roughness in [0, 1] lies along v."""
+    return (roughness * (ROUGHNESSES - 1) + 0.5) / ROUGHNESSES

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from . import energy
+from .energy import look_up, row_of, table_of
 from .nesting import parameter
-from .tables import look_up, row_of, table_of
 
 SHEEN_ROUGHNESS = (0.1, 0.3, 0.5, 0.7, 1.0)
 SHEEN_COSINES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)

@@ -30,19 +30,3 @@ def parameter(mi: Any, value: float) -> Any:
     import drjit as dr
 
     return dr.opaque(mi.Float, value) if dr.is_jit_v(mi.Float) else value
-
-
-def wrapped_texture(mi: Any) -> Any:
-    """Base class of textures that look another one, ``self.inner``, up elsewhere: what both have in common."""
-
-    class Wrapped(mi.Texture):
-        def mean(self) -> Any:
-            return self.inner.mean()
-
-        def is_spatially_varying(self) -> bool:
-            return True
-
-        def traverse(self, callback: Any) -> None:
-            callback.put("inner", self.inner, mi.ParamFlags.Differentiable)
-
-    return Wrapped

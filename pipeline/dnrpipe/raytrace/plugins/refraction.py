@@ -7,8 +7,8 @@ from __future__ import annotations
 from typing import Any
 
 from . import energy
+from .energy import look_up, row_of, table_of
 from .nesting import only, parameter
-from .tables import look_up, row_of, table_of
 
 
 def register(mi: Any) -> None:

@@ -23,7 +23,7 @@ import numpy as np
 from dnrtrain.contract import View
 
 from ...raytrace.denoise import Quality, denoise
-from ...raytrace.finite import masked
+from ...raytrace.engine import masked
 from .scene import BenchScene, Clock
 
 MANY = 16

@@ -23,7 +23,7 @@ from ...core.errors import UserError
 from ...raytrace.base_renderer import BaseRenderer
 from ...raytrace.base_worker import denoised
 from ...raytrace.light_worker import read_light
-from ...raytrace.units import scaled_view
+from ...raytrace.sensors import scaled_view
 from ...stages.base_images import light_path
 from .scene import BenchScene, Clock
 
