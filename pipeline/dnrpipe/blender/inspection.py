@@ -32,8 +32,11 @@ def inspect(task: InspectTask) -> InspectAnswer:
     """Census, findings of the conversion, and warnings. Raises UserError for unusable input."""
     try:
         loaded = load_scene(task.source)
-    except NothingVisible as nothing:
-        return _without_surface(str(nothing))
+    except NothingVisible as nothing:  # what can be said of the open file
+        findings = Findings()
+        note_missing(findings)
+        note_drivers(findings)
+        return InspectAnswer(census=take_census(bpy.context.scene, findings, []), warnings=[str(nothing)])
     task.folder.mkdir(parents=True)
     meshes, findings = loaded.frozen.meshes, loaded.findings
     place_atlas(meshes, task.folder)
@@ -43,11 +46,3 @@ def inspect(task: InspectTask) -> InspectAnswer:
     export_bundle(meshes, task.folder, findings, convert_materials(meshes, task.folder, findings, bakes))
     census = census.model_copy(update={"findings": list(findings)})
     return InspectAnswer(census=census, warnings=loaded.warnings)
-
-
-def _without_surface(reason: str) -> InspectAnswer:
-    """What can be said of the open file when there is nothing to convert; ``reason`` is a warning."""
-    findings = Findings()
-    note_missing(findings)
-    note_drivers(findings)
-    return InspectAnswer(census=take_census(bpy.context.scene, findings, []), warnings=[reason])

@@ -49,7 +49,7 @@ def share_instances(
     groups: dict[tuple[bytes, bool], list[Placed]] = {}
     single: list[Shared] = []
     for item in ordered:
-        if _invertible(item.matrix):
+        if invertible(item.matrix):
             groups.setdefault((item.digest, item.camera_visible), []).append(item)
         else:
             single.append(Shared(item))
@@ -78,9 +78,10 @@ def copy_matrices(shared: Shared) -> np.ndarray:
     return np.stack([item.matrix for item in shared.others]) @ np.linalg.inv(shared.lead.matrix)
 
 
-def _invertible(matrix: np.ndarray) -> bool:
+def invertible(matrix: np.ndarray, least: float = SINGULAR) -> bool:
+    """Whether a matrix [4, 4] is finite, and |det| with columns scaled to length 1 above ``least``."""
     linear = matrix[:3, :3]
     length = np.linalg.norm(linear, axis=0)
     if not np.isfinite(matrix).all() or not (length > 0).all():
         return False
-    return abs(float(np.linalg.det(linear / length))) > SINGULAR
+    return abs(float(np.linalg.det(linear / length))) > least

@@ -75,12 +75,10 @@ def _simplify(mesh: FrozenMesh, ratio: float, repairs: dict[str, int]) -> None:
         bpy.data.batch_remove([obj, data])
     if local is None or not len(local.material_index):
         return
-    local.materials = mesh.materials
     simple = to_world(mesh.name, np.eye(4), local, repairs)
-    if not simple.triangles:
-        return
-    mesh.positions, mesh.normals, mesh.material_index = simple.positions, simple.normals, simple.material_index
-    mesh.uv_layers, mesh.colors, mesh.atlas = simple.uv_layers, simple.colors, simple.atlas
+    if simple.triangles:
+        for name in ("positions", "normals", "material_index", "uv_layers", "colors", "atlas"):
+            setattr(mesh, name, getattr(simple, name))
 
 
 def _connected(mesh: FrozenMesh) -> bpy.types.Mesh:

@@ -10,6 +10,8 @@ import bpy
 import mathutils
 import numpy as np
 
+from ..geometry.instances import invertible
+
 CAMERA = "dnrpipe.framing"
 LENS, SENSOR = 50.0, 36.0  # mm: Blender's default camera
 AZIMUTH, ELEVATION = math.radians(-60), math.radians(25)
@@ -59,11 +61,7 @@ def usable(obj: Any) -> bool:
     """Whether an object is a camera with a finite, invertible matrix."""
     if obj is None or obj.type != "CAMERA" or obj.data is None:
         return False
-    matrix = np.array(obj.matrix_world, np.float64)
-    if not np.isfinite(matrix).all():
-        return False
-    lengths = np.linalg.norm(matrix[:3, :3], axis=0)
-    return bool(lengths.min() > 0 and abs(np.linalg.det(matrix[:3, :3] / lengths)) > 1e-6)
+    return invertible(np.array(obj.matrix_world, np.float64), least=1e-6)
 
 
 def _framing_distance(scene: bpy.types.Scene, center: np.ndarray, points: Iterable[np.ndarray]) -> tuple[float, float]:
