@@ -133,7 +133,7 @@ def freeze(depsgraph: bpy.types.Depsgraph) -> Frozen:
                     cache[key] = unique.setdefault(digest, local), digest
             if (found := cache[key]) is not None:
                 placed.append(Placed(obj.name_full, persistent, matrix, *found, obj.visible_camera))
-    repairs = dict.fromkeys(REPAIRS, 0)
+    repairs: dict[str, int] = dict.fromkeys(REPAIRS, 0)
     ids: dict[str, int] = {}
     taken: set[str] = set()
     meshes = []

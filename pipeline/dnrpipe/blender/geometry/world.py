@@ -18,7 +18,7 @@ def to_world(name: str, matrix: np.ndarray, local: LocalMesh, repairs: dict[str,
     linear = matrix[:3, :3]
     # det(M) inv(M)^T = cofactor matrix: the inverse transpose without a division, so flat scales survive.
     columns = linear.T
-    cofactor = np.stack(np.cross(np.roll(columns, -1, axis=0), np.roll(columns, -2, axis=0)), axis=1)
+    cofactor = np.stack([*np.cross(np.roll(columns, -1, axis=0), np.roll(columns, -2, axis=0))], axis=1)
     mirrored = bool(np.linalg.det(linear) < 0)
     count = len(local.material_index)
     positions = np.empty((count, 3, 3), np.float32)
