@@ -231,7 +231,7 @@ def test_cached_by_content(tmp_path: Path) -> None:
     again.value("kept", "colour", source_of(kept), "Base Color", Findings())
     assert not again.missing
     again.value("edited", "colour", source_of(edited), "Base Color", Findings())
-    assert [item.material for item in again.missing.values()] == ["edited"]
+    assert [material for material, _ in again.missing.values()] == ["edited"]
     refused = BakeCache.open(bench.meshes, bench.folder, SIZE, list(again.missing))
     findings = Findings()
     value = Evaluator("edited", ImageReader(findings), findings, refused).colour(
@@ -277,7 +277,7 @@ def test_what_is_exact_is_not_baked(tmp_path: Path) -> None:
     np.testing.assert_array_equal(plain.texels[:, 0], mesh.colors["Col"][:, :3])
     assert not bench.book.missing
     colour(materials[2])
-    assert [item.material for item in bench.book.missing.values()] == ["inverted"]
+    assert [material for material, _ in bench.book.missing.values()] == ["inverted"]
     bench.bake()
     other = next(mesh for mesh in meshes if mesh.materials == ["inverted"])
     expected = 1 - bench.expected("inverted", lambda m: m.colors["Col"] if m is other else m.colors["Col"] * 0)

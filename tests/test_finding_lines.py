@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dnrpipe.blender.finding_lines import LISTED, finding_lines
+from dnrpipe.blender.findings import LISTED, finding_lines
 from dnrpipe.core.scene_records import Finding, FindingKind
 
 

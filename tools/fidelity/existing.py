@@ -7,7 +7,7 @@ from typing import Any
 
 import bpy
 
-from dnrpipe.blender.passes.rendering import render_to
+from dnrpipe.blender.passes.raster import render_to
 from dnrpipe.blender.reading.opening import open_scene
 
 from .reference import configure_cycles

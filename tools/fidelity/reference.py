@@ -8,7 +8,7 @@ from typing import Any
 
 import bpy
 
-from dnrpipe.blender.passes.rendering import output_exr, render_to
+from dnrpipe.blender.passes.raster import output_exr, render_to
 
 from .reference_settings import BOUNCES
 

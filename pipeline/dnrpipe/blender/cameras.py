@@ -50,14 +50,11 @@ def camera_animation(scene: bpy.types.Scene, max_frames: int = MAX_FRAMES) -> li
 
 def _camera_at(scene: bpy.types.Scene, frame: int) -> Any:
     """The active camera at a frame: of the last marker that binds one, of the first before that, or the scene's."""
-    bound = sorted(
-        ((m.frame, m.camera) for m in scene.timeline_markers if m.camera and not m.camera.hide_render),
-        key=lambda pair: pair[0],
-    )
+    bound = [marker for marker in scene.timeline_markers if marker.camera and not marker.camera.hide_render]
     if not bound:
         return scene.camera
-    past = [camera for start, camera in bound if start <= frame]
-    return past[-1] if past else bound[0][1]
+    bound.sort(key=lambda marker: marker.frame)
+    return next((marker.camera for marker in reversed(bound) if marker.frame <= frame), bound[0].camera)
 
 
 def _may_move(scene: bpy.types.Scene) -> bool:

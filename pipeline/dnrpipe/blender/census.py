@@ -14,8 +14,10 @@ from dnrpipe.core.scene_records import Census, ImageFacts, LightFacts, MaterialF
 
 from .census_materials import describe_material
 from .findings import Findings
+from .geometry.freeze import render_layer
 from .geometry.frozen import FrozenMesh
 from .lighting.lights import visible_lights
+from .reading.missing import SHAPELESS_IMAGES
 from .reading.names import find_material
 from .shading.sockets import find_input, resolve, surface_source, walk
 
@@ -27,13 +29,13 @@ def take_census(scene: bpy.types.Scene, findings: Findings, meshes: Sequence[Fro
 
     meshes: the frozen geometry, so that nothing is evaluated twice. Adds missing images to the findings as
     ``missing``, and motion blur as ``ignored``; freezing reports hair and volumes. The census holds all findings so
-    far; `with_findings` replaces them.
+    far.
     """
     instances, triangles, by_object = _counts(meshes)
-    layer = next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
-    types = Counter(obj.type for obj in layer.objects if not obj.hide_render)
+    types = Counter(obj.type for obj in render_layer(scene).objects if not obj.hide_render)
     users = _users(meshes)
-    described = {name: describe_material(material, users[name]) for name, material in _materials(users).items()}
+    found = {name: find_material(name) for name in sorted(filter(None, users))}
+    described = {name: describe_material(material, users[name]) for name, material in found.items() if material}
     volumes = sorted(obj.name for obj in scene.objects if obj.type == "VOLUME" and not obj.hide_render)
     return Census(
         scene=scene.name,
@@ -68,11 +70,6 @@ def take_census(scene: bpy.types.Scene, findings: Findings, meshes: Sequence[Fro
     )
 
 
-def with_findings(census: Census, findings: Findings) -> Census:
-    """The census with all that was found since."""
-    return census.model_copy(update={"findings": list(findings)})
-
-
 def _counts(meshes: Sequence[FrozenMesh]) -> tuple[int, int, dict[str, int]]:
     """Instances, triangles that rays can hit, and triangles of one instance by object."""
     by_object: dict[str, int] = {}
@@ -93,25 +90,17 @@ def _users(meshes: Sequence[FrozenMesh]) -> dict[str | None, list[str]]:
     return {name: list(objects)[:NAMES_PER_MATERIAL] for name, objects in users.items()}
 
 
-def _materials(users: dict[str | None, list[str]]) -> dict[str, Any]:
-    """The materials in use, by the names that the geometry gives them."""
-    found = {name: find_material(name) for name in users if name is not None}
-    return {name: material for name, material in sorted(found.items()) if material is not None}
-
-
 def _lights(scene: bpy.types.Scene) -> list[LightFacts]:
     found = []
     for obj, _ in visible_lights(scene):
         light = obj.data
         facts: dict[str, Any] = {"name": obj.name, "type": light.type, "color": tuple(light.color)}
         facts["power"] = float(light.energy) * 2.0 ** float(light.exposure)
-        if light.type == "SUN":
-            facts["size"] = light.angle
-        elif light.type == "AREA":
+        if light.type == "AREA":
             both = light.shape in {"RECTANGLE", "ELLIPSE"}
             facts |= {"shape": light.shape, "size": (light.size, light.size_y if both else light.size)}
         else:
-            facts["size"] = light.shadow_soft_size
+            facts["size"] = light.angle if light.type == "SUN" else light.shadow_soft_size
         found.append(LightFacts.model_validate(facts))
     return found
 
@@ -145,10 +134,7 @@ def _world_emits(world: Any) -> bool:
     colour, strength = (find_input(surface.node, name) for name in ("Color", "Strength"))
     for socket in (colour, strength):
         source = None if socket is None else resolve(socket)
-        if source is None or source.linked:
-            continue
-        values = [source.default] if isinstance(source.default, float | int) else list(source.default)[:3]
-        if not any(v > 0 for v in values):
+        if source is not None and not source.linked and not np.any(np.ravel(source.default)[:3] > 0):
             return False
     return True
 
@@ -161,11 +147,8 @@ def _images(findings: Findings) -> list[ImageFacts]:
             continue
         missing = is_missing(image)
         if missing:
-            findings.add(
-                "missing",
-                f"image '{image.name}'",
-                f"file not found: {image.filepath}; put it there or pack it into the .blend",
-            )
+            note = f"file not found: {image.filepath}; put it there or pack it into the .blend"
+            findings.add("missing", f"image '{image.name}'", note)
         found.append(
             ImageFacts(
                 name=image.name,
@@ -181,9 +164,7 @@ def _images(findings: Findings) -> list[ImageFacts]:
 
 def is_missing(image: Any) -> bool:
     """Whether an image refers to a file that is neither packed nor on disk."""
-    if image.source not in {"FILE", "SEQUENCE", "MOVIE", "TILED"} or image.packed_file is not None:
-        return False
-    if len(image.packed_files):
+    if image.source in SHAPELESS_IMAGES or image.packed_file or image.packed_files:
         return False
     path = bpy.path.abspath(image.filepath, library=image.library)
     if image.source == "TILED":
@@ -193,16 +174,13 @@ def is_missing(image: Any) -> bool:
 
 def _hair(scene: bpy.types.Scene) -> list[str]:
     """Objects with hair: curves objects and particle systems of type hair that renders draw as strands."""
-    names = set()
+    found = []
     for obj in scene.objects:
-        if obj.hide_render:
-            continue
-        strands = any(
-            system.settings.type == "HAIR" and system.settings.render_type == "PATH" for system in obj.particle_systems
-        )
-        if obj.type == "CURVES" or strands:
-            names.add(obj.name)
-    return sorted(names)
+        settings = [system.settings for system in obj.particle_systems]
+        strands = any(entry.type == "HAIR" and entry.render_type == "PATH" for entry in settings)
+        if not obj.hide_render and (obj.type == "CURVES" or strands):
+            found.append(obj.name)
+    return sorted(found)
 
 
 def _motion(scene: bpy.types.Scene, findings: Findings) -> list[str]:

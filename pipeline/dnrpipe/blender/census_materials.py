@@ -8,37 +8,20 @@ from typing import Any
 
 from dnrpipe.core.scene_records import MaterialFacts
 
+from .baking.trees import IMPLICIT_GENERATED
 from .shading.sockets import find_input, resolve, surface_source, walk
 
-PROCEDURAL = {
-    "TEX_BRICK",
-    "TEX_CHECKER",
-    "TEX_GABOR",
-    "TEX_GRADIENT",
-    "TEX_MAGIC",
-    "TEX_MUSGRAVE",
-    "TEX_NOISE",
-    "TEX_VORONOI",
-    "TEX_WAVE",
-    "TEX_WHITE_NOISE",
-}
+PROCEDURAL = {*IMPLICIT_GENERATED, "TEX_MUSGRAVE", "TEX_WHITE_NOISE"}
 """Texture nodes without image."""
 VIEW_DEPENDENT = {"FRESNEL", "LAYER_WEIGHT", "LIGHT_PATH", "CAMERA", "AMBIENT_OCCLUSION"}
 VOLUME_NODES = {"VOLUME_ABSORPTION", "VOLUME_SCATTER", "PRINCIPLED_VOLUME", "VOLUME_COEFFICIENTS"}
-TRANSMISSIVE = {"BSDF_GLASS", "BSDF_REFRACTION", "BSDF_TRANSLUCENT"}
 REFRACTIVE = {"BSDF_GLASS", "BSDF_REFRACTION"}
-GLOSSY = {
-    "BSDF_GLASS",
-    "BSDF_REFRACTION",
-    "BSDF_GLOSSY",
-    "BSDF_METALLIC",
-    "BSDF_HAIR",
-    "BSDF_HAIR_PRINCIPLED",
-    "EEVEE_SPECULAR",
-}
+TRANSMISSIVE = REFRACTIVE | {"BSDF_TRANSLUCENT"}
 HAIR = {"BSDF_HAIR", "BSDF_HAIR_PRINCIPLED"}
+GLOSSY = REFRACTIVE | HAIR | {"BSDF_GLOSSY", "BSDF_METALLIC", "EEVEE_SPECULAR"}
 NOT_REFLECTING = {"EMISSION", "HOLDOUT", "BACKGROUND", "BSDF_TRANSPARENT", "MIX_SHADER", "ADD_SHADER", *VOLUME_NODES}
 STRUCTURE = {"GROUP", "GROUP_INPUT", "REROUTE"}
+GLASS, COAT = ("Transmission Weight", "Transmission"), ("Coat Weight", "Clearcoat")
 
 
 def describe_material(material: Any, objects: list[str]) -> MaterialFacts:
@@ -47,10 +30,8 @@ def describe_material(material: Any, objects: list[str]) -> MaterialFacts:
     nodes = list(_reachable(tree))
     kinds = {node.type for node in nodes}
     principled = [node for node in nodes if node.type == "BSDF_PRINCIPLED"]
-    glossy = [node for node in nodes if node.type in GLOSSY] + [node for node in principled if _specular(node)]
-    refracting = [n for n in nodes if n.type in REFRACTIVE] + [
-        n for n in principled if _active(n, "Transmission Weight", "Transmission")
-    ]
+    glossy = [n for n in nodes if n.type in GLOSSY] + [n for n in principled if _specular(n)]
+    refracting = [n for n in nodes if n.type in REFRACTIVE] + [n for n in principled if _active(n, *GLASS)]
     rough = [_roughness(node) for node in glossy]
     return MaterialFacts(
         bsdfs=sorted({node.bl_label for node in nodes if _is_shader(node)}),
@@ -61,7 +42,7 @@ def describe_material(material: Any, objects: list[str]) -> MaterialFacts:
         transparent="BSDF_TRANSPARENT" in kinds or any(_active(n, "Alpha", off=1.0) for n in principled),
         transmissive=bool(kinds & TRANSMISSIVE) or bool(refracting),
         refractive=bool(refracting),
-        ior=max((_number(n, 1.45, "IOR") for n in refracting), default=None),
+        ior=max((_ior(n) for n in refracting), default=None),
         emissive=any(_emits(n) for n in nodes if n.type in {"EMISSION", "BSDF_PRINCIPLED"}),
         subsurface="SUBSURFACE_SCATTERING" in kinds
         or any(_active(n, "Subsurface Weight", "Subsurface") for n in principled),
@@ -112,8 +93,8 @@ def _active(node: Any, *names: str, off: float = 0.0) -> bool:
 
 def _specular(node: Any) -> bool:
     """Whether a Principled BSDF has a mirror-like lobe: base, metal, glass or coat."""
-    features = (("Metallic",), ("Transmission Weight", "Transmission"), ("Coat Weight", "Clearcoat"))
-    return _active(node, "Specular IOR Level", "Specular") or any(_active(node, *names) for names in features)
+    features = (("Specular IOR Level", "Specular"), ("Metallic",), GLASS, COAT)
+    return any(_active(node, *names) for names in features)
 
 
 def _emits(node: Any) -> bool:
@@ -129,7 +110,7 @@ def _roughness(node: Any) -> float | None:
     """Roughness of a lobe, of its coat where that is smoother; None where it is linked."""
     values = []
     names: list[tuple[str, ...]] = [("Roughness",)]
-    if _active(node, "Coat Weight", "Clearcoat"):
+    if _active(node, *COAT):
         names.append(("Coat Roughness", "Clearcoat Roughness"))
     for name in names:
         socket = find_input(node, *name)
@@ -140,7 +121,7 @@ def _roughness(node: Any) -> float | None:
     return min(values)
 
 
-def _number(node: Any, default: float, *names: str) -> float:
-    socket = find_input(node, *names)
+def _ior(node: Any) -> float:
+    socket = find_input(node, "IOR")
     source = None if socket is None else resolve(socket)
-    return default if source is None or source.linked else float(source.default)
+    return 1.45 if source is None or source.linked else float(source.default)

@@ -10,7 +10,7 @@ from dnrpipe.core.errors import NothingVisible
 
 from .baking.pending import convert_materials, place_atlas
 from .bundle.export import export_bundle
-from .census import take_census, with_findings
+from .census import take_census
 from .findings import Findings
 from .reading.loading import load_scene
 from .reading.missing import note_missing
@@ -32,8 +32,11 @@ def inspect(task: InspectTask) -> InspectAnswer:
     """Census, findings of the conversion, and warnings. Raises UserError for unusable input."""
     try:
         loaded = load_scene(task.source)
-    except NothingVisible as nothing:
-        return _without_surface(str(nothing))
+    except NothingVisible as nothing:  # what can be said of the open file
+        findings = Findings()
+        note_missing(findings)
+        note_drivers(findings)
+        return InspectAnswer(census=take_census(bpy.context.scene, findings, []), warnings=[str(nothing)])
     task.folder.mkdir(parents=True)
     meshes, findings = loaded.frozen.meshes, loaded.findings
     place_atlas(meshes, task.folder)
@@ -41,12 +44,5 @@ def inspect(task: InspectTask) -> InspectAnswer:
     # What would be baked is in the findings; placeholders stand for it in the bundle.
     bakes = BakeOptions(folder=task.folder / "bakes", size=task.bake_size)
     export_bundle(meshes, task.folder, findings, convert_materials(meshes, task.folder, findings, bakes))
-    return InspectAnswer(census=with_findings(census, findings), warnings=loaded.warnings)
-
-
-def _without_surface(reason: str) -> InspectAnswer:
-    """What can be said of the open file when there is nothing to convert; ``reason`` is a warning."""
-    findings = Findings()
-    note_missing(findings)
-    note_drivers(findings)
-    return InspectAnswer(census=take_census(bpy.context.scene, findings, []), warnings=[reason])
+    census = census.model_copy(update={"findings": list(findings)})
+    return InspectAnswer(census=census, warnings=loaded.warnings)

@@ -7,7 +7,7 @@ from typing import Any
 
 import bpy
 
-from dnrpipe.core.scene_records import Bounds, SceneSummary
+from dnrpipe.core.scene_records import SceneSummary
 from dnrpipe.core.workspace import file_sha256
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import SceneFrame
@@ -16,7 +16,7 @@ from .baking.pending import convert_materials, missing_bakes, place_atlas
 from .bundle.display import export_display
 from .bundle.export import export_bundle
 from .cameras import camera_animation, scene_cameras
-from .census import take_census, with_findings
+from .census import take_census
 from .geometry.frozen import save_geometry
 from .passes.gbuffer_scene import add_gbuffer_scene
 from .reading.loading import load_scene
@@ -57,8 +57,16 @@ def prepare(
     if pending is not None:
         return pending
     materials = export_bundle(frozen.meshes, scene_dir, findings, converter)
-    census = with_findings(census, findings)
-    frame = _frame(loaded.bounds, export_display(scene, scene_dir))
+    census = census.model_copy(update={"findings": list(findings)})
+    radius = loaded.bounds.radius
+    # near and far are placeholders for a camera at four radii; camera placement replaces them.
+    frame = SceneFrame(
+        near=1e-3 * radius,
+        far=5 * radius,
+        center=loaded.bounds.center,
+        radius=radius,
+        **export_display(scene, scene_dir),
+    )
     save_geometry(scene_dir / "geometry.npz", frozen.meshes)
     cameras, animation = scene_cameras(scene), camera_animation(scene)
     # A missing file counts too: the scene is out of date when it turns up.
@@ -90,13 +98,6 @@ def prepare(
     if converter.bakes is not None:
         converter.bakes.prune()
     return summary
-
-
-def _frame(bounds: Bounds, display: dict[str, Any]) -> SceneFrame:
-    """near and far are placeholders for a camera at four radii; camera placement replaces them."""
-    return SceneFrame(
-        near=1e-3 * bounds.radius, far=5 * bounds.radius, center=bounds.center, radius=bounds.radius, **display
-    )
 
 
 def _resolution(scene: bpy.types.Scene) -> tuple[int, int]:

@@ -27,7 +27,7 @@ def freeze_visible(scene: bpy.types.Scene) -> Frozen:
         frozen = _later(scene)
         if frozen is None:
             raise NothingVisible(f"{nothing} (it holds {_contents(scene)}){_remoteness(scene)}") from None
-    frozen.warnings += repair_warnings(frozen)
+    frozen.warnings += _repair_warnings(frozen)
     return frozen
 
 
@@ -49,7 +49,7 @@ def _later(scene: bpy.types.Scene) -> Frozen | None:
     return None
 
 
-def repair_warnings(frozen: Frozen) -> list[str]:
+def _repair_warnings(frozen: Frozen) -> list[str]:
     """What was wrong with the geometry itself, one line each."""
     lines = []
     broken = frozen.repairs["non_finite_triangles"]

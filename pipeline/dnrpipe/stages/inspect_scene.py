@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..blender.finding_lines import finding_lines
+from ..blender.findings import finding_lines
 from ..blender.tasks import InspectAnswer, InspectTask
 from ..core.errors import UserError
 from ..core.scene_records import Census, Finding, FindingKind

@@ -6,12 +6,12 @@ import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import SPLITS, View, write_cameras
 
-from ..blender.finding_lines import finding_lines
+from ..blender.findings import finding_lines
 from ..blender.tasks import (
     BakeCommon,
     BakeOptions,

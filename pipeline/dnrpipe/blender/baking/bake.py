@@ -6,8 +6,7 @@ An EMIT bake yields the value itself; a DIFFUSE bake would be black on metals.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import bpy
@@ -53,7 +52,9 @@ class Worker:
                 repaired[material] = lost
             for index, tap in enumerate(taps):
                 kept = values[:, index : index + 1] if tap.kind == "scalar" else values
-                _save(self.folder / f"{tap.key}.npy", kept)
+                half = np.abs(kept).max(initial=0.0) < HALF_MAX
+                with atomic_path(self.folder / f"{tap.key}.npy") as temporary, temporary.open("wb") as file:
+                    np.save(file, np.ascontiguousarray(kept, np.float16 if half else np.float32))
         return {"seconds": time.monotonic() - started, "repaired": repaired}
 
 
@@ -77,10 +78,10 @@ def bake_layer(meshes: Sequence[FrozenMesh], layer: Mapping[str, Sequence[Tap]],
         groups = [[mesh] for mesh in own] + ([shared] if shared else [])
         for group in groups:
             add_object(scene, group, materials, dark, local=group is not shared)
-        if _looks_around(layer):  # ambient occlusion: the rest of the scene is there, but not baked
-            rest = [mesh for mesh in meshes if not any(mesh is other for other in wanted)]
-            if rest:
-                add_object(scene, rest, {}, dark, local=False, selected=False)
+        nodes = (node for name in layer for node in walk(_material(name).node_tree))
+        rest = [mesh for mesh in meshes if not any(mesh is other for other in wanted)]
+        if rest and any(node.type == "AMBIENT_OCCLUSION" for node in nodes):  # it sees them, but they are not baked
+            add_object(scene, rest, {}, dark, local=False, selected=False)
         scene.view_layers[0].update()
         bpy.ops.object.bake(
             type="EMIT",
@@ -123,10 +124,6 @@ def _material(name: str) -> bpy.types.Material:
     return found
 
 
-def _looks_around(layer: Iterable[str]) -> bool:
-    return any(node.type == "AMBIENT_OCCLUSION" for name in layer for node in walk(_material(name).node_tree))
-
-
 def _complete(pixels: np.ndarray, texels: np.ndarray, size: int) -> tuple[np.ndarray, int]:
     """(values of the region [N, 3], how many were not finite).
 
@@ -154,9 +151,3 @@ def _complete(pixels: np.ndarray, texels: np.ndarray, size: int) -> tuple[np.nda
             return values, repaired
     values[lost] = values[reached].mean(0) if reached.any() else 0.0
     return values, repaired
-
-
-def _save(path: Path, values: np.ndarray) -> None:
-    half = np.abs(values).max(initial=0.0) < HALF_MAX
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.save(file, np.ascontiguousarray(values, np.float16 if half else np.float32))

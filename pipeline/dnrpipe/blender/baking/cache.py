@@ -12,7 +12,6 @@ import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -29,25 +28,18 @@ BAKE_VERSION = 4  # raise when a bake of the same inputs would come out differen
 SCALARS_PER_BAKE = 3
 
 
-class BakeItem(NamedTuple):
-    """One value to bake."""
-
-    material: str
-    tap: Tap
-
-
 @dataclass
 class BakeCache:
     """Baked values of one conversion.
 
-    folder: the cache. refused: keys that could not be baked; they are approximated instead. used: keys that were
-    asked for. used_atlas: whether other values were resampled into the atlas.
+    folder: the cache. refused: keys that could not be baked; they are approximated instead. missing: (material, value)
+    by key, to be baked. used: keys that were asked for. used_atlas: whether other values were resampled into the atlas.
     """
 
     atlas: Atlas
     folder: Path
     refused: frozenset[str] = frozenset()
-    missing: dict[str, BakeItem] = field(default_factory=dict)
+    missing: dict[str, tuple[str, Tap]] = field(default_factory=dict)
     used: set[str] = field(default_factory=set)
     used_atlas: bool = False
     _graphs: GraphHasher = field(default_factory=GraphHasher)
@@ -88,7 +80,7 @@ class BakeCache:
                 return Textured(values.astype(np.float32)[:, None, :], False, placement)
         groups = tuple(group.name for group in source.scope)
         tap = Tap(kind=kind, groups=groups, node=source.node.name, socket=source.socket.identifier, key=key)
-        self.missing[key] = BakeItem(material, tap)
+        self.missing[key] = material, tap
         return Textured(np.full((1, 1, channels), 0.5, np.float32), False, placement)
 
     def layers(self) -> list[list[MaterialTaps]]:
@@ -101,15 +93,12 @@ class BakeCache:
                 last.append(tap)
             else:
                 stack.append([tap])
-        depth = max((len(stack) for stack in stacks.values()), default=0)
-        return [
-            [
-                MaterialTaps(material=material, taps=tuple(stack[level]))
-                for material, stack in stacks.items()
-                if level < len(stack)
-            ]
-            for level in range(depth)
-        ]
+        found: list[list[MaterialTaps]] = []
+        for material, stack in stacks.items():
+            found += [[] for _ in range(len(stack) - len(found))]
+            for level, taps in zip(found, stack, strict=False):
+                level.append(MaterialTaps(material=material, taps=tuple(taps)))
+        return found
 
     def image(self, value: Textured) -> Textured:
         """A region's texture as a full image over the atlas, margins included."""
@@ -128,19 +117,19 @@ class BakeCache:
             if node.type in VIEW_DEPENDENT:
                 note = f"depends on the ray, which a bake has not: {VIEW_DEPENDENT[node.type]} is used"
                 findings.add("approximated", f"{node.bl_label} node", note, material=material)
-        for entry in nodes:
-            in_use = {output.name for output in entry.node.outputs if output.is_linked}
-            if entry.node.type == "TEX_COORD":
+        for node in (entry.node for entry in nodes):
+            in_use = {output.name for output in node.outputs if output.is_linked}
+            if node.type == "TEX_COORD":
                 for name in sorted(in_use & set(FROM_CAMERA)):
                     note = "depends on the camera: baked once, as the scene's own camera sees it"
                     findings.add("approximated", f"{FROM_CAMERA[name]} coordinates", note, material=material)
-            if entry.node.type == "NEW_GEOMETRY" and "Random Per Island" in in_use:
+            if node.type == "NEW_GEOMETRY" and "Random Per Island" in in_use:
                 note = "every island has a number of its own, but not the same one as in Blender"
                 findings.add("approximated", "Random Per Island", note, material=material)
-            if entry.node.type == "ATTRIBUTE" and entry.node.attribute_type != "GEOMETRY":
-                name = f"attribute '{entry.node.attribute_name}' of the {entry.node.attribute_type.lower()}"
+            if node.type == "ATTRIBUTE" and node.attribute_type != "GEOMETRY":
+                name = f"attribute '{node.attribute_name}' of the {node.attribute_type.lower()}"
                 findings.add("ignored", name, "only attributes of the mesh are kept: 0 is used", material=material)
-            if entry.node.type == "SCRIPT":
+            if node.type == "SCRIPT":
                 findings.add("ignored", "Script node", "Open Shading Language is not run", material=material)
         if len(self.atlas.parts(material)) > MAX_OWN and any(is_object_space(entry.node) for entry in nodes):
             note = f"on more than {MAX_OWN} objects: baked as if their axes were the world's"
@@ -171,10 +160,8 @@ class BakeCache:
             digest.update(mesh.object_to_world.tobytes())
             for array in (mesh.positions, mesh.normals, mesh.atlas):
                 digest.update(np.ascontiguousarray(array).data)
-            for layers in (mesh.uv_layers, mesh.colors):
-                for name, array in layers.items():
-                    if name.startswith("dnrpipe."):  # made by the conversion itself
-                        continue
+            for name, array in (*mesh.uv_layers.items(), *mesh.colors.items()):
+                if not name.startswith("dnrpipe."):  # else made by the conversion itself
                     digest.update(name.encode())
                     digest.update(np.ascontiguousarray(array).data)
             self._meshes[id(mesh)] = digest.hexdigest()

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import bpy
+import numpy as np
 
 from ..shading.sockets import Scope, Source, resolve
 
@@ -49,8 +50,7 @@ def upstream(source: Source) -> list[Source]:
 
 def labels(sources: list[Source]) -> str:
     """Readable list of the node types, for findings."""
-    names = dict.fromkeys(source.node.bl_label for source in sources)
-    return ", ".join(names)
+    return ", ".join(dict.fromkeys(source.node.bl_label for source in sources))
 
 
 class GraphHasher:
@@ -67,14 +67,13 @@ class GraphHasher:
         for entry in nodes:
             digest.update(repr(list(self._node(entry.node))).encode())
             for socket in entry.node.inputs:
-                digest.update(repr(self._input(socket, entry.scope, index)).encode())
+                below = resolve(socket, entry.scope)
+                if below.linked:
+                    place: tuple[Any, ...] = (index[_identity(below.node, below.scope)], below.socket.identifier)
+                else:
+                    place = (_plain(below.default),)
+                digest.update(repr((socket.identifier, *place)).encode())
         return digest.hexdigest()
-
-    def _input(self, socket: Any, scope: Scope, index: dict[tuple[int, ...], int]) -> Any:
-        below = resolve(socket, scope)
-        if below.linked:
-            return (socket.identifier, index[_identity(below.node, below.scope)], below.socket.identifier)
-        return (socket.identifier, _plain(below.default))
 
     def _node(self, node: Any) -> Iterator[Any]:
         yield node.bl_idname
@@ -126,7 +125,9 @@ class GraphHasher:
 def _contents(image: Any) -> Iterator[bytes]:
     """The bytes of an image; none where it has no file and no pixels."""
     if image.is_dirty or image.source == "GENERATED":
-        yield memoryview(_pixels(image)).tobytes()
+        values = np.empty(len(image.pixels), np.float32)
+        image.pixels.foreach_get(values)
+        yield values.tobytes()
     elif image.packed_files:
         for packed in image.packed_files:
             if packed.packed_file is not None:
@@ -134,18 +135,9 @@ def _contents(image: Any) -> Iterator[bytes]:
     else:
         path = Path(bpy.path.abspath(image.filepath, library=image.library))
         pattern = path.name.replace("<UDIM>", "*").replace("<UVTILE>", "*")
-        files = sorted(path.parent.glob(pattern)) if "*" in pattern else [path]
-        for file in files:
+        for file in sorted(path.parent.glob(pattern)) if "*" in pattern else [path]:
             if file.is_file():
                 yield file.read_bytes()
-
-
-def _pixels(image: Any) -> Any:
-    import numpy as np
-
-    values = np.empty(len(image.pixels), np.float32)
-    image.pixels.foreach_get(values)
-    return values
 
 
 def _plain(value: Any) -> Any:

@@ -6,9 +6,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import bpy
+import mathutils
 import numpy as np
 
 from ..geometry.frozen import ATLAS_LAYER, FrozenMesh
+from ..geometry.local_mesh import new_mesh
 from ..reading.names import find_material
 from ..shading.sockets import walk
 from .trees import (
@@ -31,13 +33,8 @@ def needs_own_space(mesh: FrozenMesh, materials: Iterable[str]) -> bool:
     """Whether one of these materials, on this mesh, converts to or from object space, and the mesh has one."""
     if abs(np.linalg.det(mesh.object_to_world[:3, :3])) < 1e-30:
         return False
-    names = {name for name in mesh.materials if name} & set(materials)
-    return any(is_object_space(node) for name in names for node in walk(_tree(name)))
-
-
-def _tree(name: str) -> Any:
-    material = find_material(name)
-    return None if material is None else material.node_tree
+    found = [find_material(name) for name in {name for name in mesh.materials if name} & set(materials)]
+    return any(is_object_space(node) for material in found if material for node in walk(material.node_tree))
 
 
 def is_object_space(node: Any) -> bool:
@@ -70,15 +67,14 @@ def add_object(
     matrix = meshes[0].object_to_world if local else np.eye(4)
     into = np.linalg.inv(matrix)
     positions = np.concatenate([mesh.positions.astype(np.float64) for mesh in meshes]) @ into[:3, :3].T + into[:3, 3]
-    normals = np.concatenate([mesh.normals.astype(np.float64) for mesh in meshes]) @ matrix[:3, :3]
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    normals = _object_normals(np.concatenate([mesh.normals for mesh in meshes]), matrix)
+    order = np.arange(len(positions))
     if np.linalg.det(matrix[:3, :3]) < 0:  # Blender turns the winding of mirrored objects again
-        order = np.arange(len(positions)).reshape(-1, 3)[:, [0, 2, 1]].ravel()
-    else:
-        order = np.arange(len(positions))
-    data = _triangles(positions[order], normals[order])
-    slots = [*materials.values(), dark]
-    for material in slots:
+        order = order.reshape(-1, 3)[:, [0, 2, 1]].ravel()
+    corners = np.arange(len(order), dtype=np.int32).reshape(-1, 3)
+    data = new_mesh("dnrpipe.bake", positions[order].astype(np.float32), corners)
+    _attribute(data, "custom_normal", "FLOAT_VECTOR", normals[order], domain="POINT")
+    for material in (*materials.values(), dark):
         data.materials.append(material)
     index = {name: i for i, name in enumerate(materials)}
     data.polygons.foreach_set("material_index", np.concatenate([_slots(mesh, index) for mesh in meshes]))
@@ -88,7 +84,7 @@ def add_object(
     _object_attributes(data, meshes, order)
     data.update()
     obj = bpy.data.objects.new("dnrpipe.bake", data)
-    obj.matrix_world = _matrix(matrix)
+    obj.matrix_world = mathutils.Matrix(matrix.tolist())
     scene.collection.objects.link(obj)
     layer = scene.view_layers[0]
     layer.update()
@@ -98,80 +94,56 @@ def add_object(
     return obj
 
 
-def _matrix(values: np.ndarray) -> Any:
-    import mathutils
-
-    return mathutils.Matrix(values.tolist())
-
-
 def _slots(mesh: FrozenMesh, index: Mapping[str, int]) -> np.ndarray:
     table = np.array([index.get(name, len(index)) if name else len(index) for name in mesh.materials], np.int32)
     return table[mesh.material_index]
 
 
-def _triangles(positions: np.ndarray, normals: np.ndarray) -> bpy.types.Mesh:
-    corners = len(positions)
-    data = bpy.data.meshes.new("dnrpipe.bake")
-    data.vertices.add(corners)
-    data.loops.add(corners)
-    data.polygons.add(corners // 3)
-    data.vertices.foreach_set("co", positions.astype(np.float32).ravel())
-    data.loops.foreach_set("vertex_index", np.arange(corners, dtype=np.int32))
-    data.polygons.foreach_set("loop_start", np.arange(0, corners, 3, dtype=np.int32))
-    data.update(calc_edges=True)
-    attribute = data.attributes.new("custom_normal", "FLOAT_VECTOR", "POINT")
-    attribute.data.foreach_set("vector", normals.astype(np.float32).ravel())
-    return data
-
-
 def _uv_layers(data: bpy.types.Mesh, meshes: Sequence[FrozenMesh], names: set[str], order: np.ndarray) -> None:
     """The atlas; every mesh's own render layer as one; and the layers that nodes name."""
     wanted = {ATLAS_LAYER: [mesh.atlas for mesh in meshes]}
-    wanted[ACTIVE_UV] = [_layer(mesh, mesh.active_uv) for mesh in meshes]
+    wanted[ACTIVE_UV] = [_layer(mesh, mesh.uv_layers, mesh.active_uv, 2) for mesh in meshes]
     for name in sorted({name for mesh in meshes for name in mesh.uv_layers} & names):
-        wanted[name] = [_layer(mesh, name) for mesh in meshes]
+        wanted[name] = [_layer(mesh, mesh.uv_layers, name, 2) for mesh in meshes]
     for name, parts in wanted.items():
-        attribute = data.attributes.new(name, "FLOAT2", "CORNER")
-        attribute.data.foreach_set("vector", np.concatenate(parts)[order].astype(np.float32).ravel())
+        _attribute(data, name, "FLOAT2", np.concatenate(parts)[order])
     data.uv_layers[ATLAS_LAYER].active = True
     data.uv_layers[ACTIVE_UV].active_render = True
 
 
-def _layer(mesh: FrozenMesh, name: str | None) -> np.ndarray:
-    found = None if name is None else mesh.uv_layers.get(name)
-    return np.zeros((len(mesh.positions), 2), np.float32) if found is None else found
+def _layer(mesh: FrozenMesh, layers: Mapping[str, np.ndarray], name: str | None, width: int) -> np.ndarray:
+    """A layer of the mesh, [3T, width]; zeros where it has none of the name."""
+    found = layers.get(name or "")
+    return np.zeros((len(mesh.positions), width), np.float32) if found is None else found
 
 
 def _colours(data: bpy.types.Mesh, meshes: Sequence[FrozenMesh], names: set[str], order: np.ndarray) -> None:
-    wanted = {name: [_colour(mesh, name) for mesh in meshes] for name in sorted(names - {ACTIVE_COLOUR})}
-    wanted = {name: parts for name, parts in wanted.items() if any(name in mesh.colors for mesh in meshes)}
+    present = {name for mesh in meshes for name in mesh.colors} & names - {ACTIVE_COLOUR}
+    wanted = {name: [_layer(mesh, mesh.colors, name, 4) for mesh in meshes] for name in sorted(present)}
     if any(mesh.active_color for mesh in meshes):
-        wanted[ACTIVE_COLOUR] = [_colour(mesh, mesh.active_color) for mesh in meshes]
+        wanted[ACTIVE_COLOUR] = [_layer(mesh, mesh.colors, mesh.active_color, 4) for mesh in meshes]
     for name, parts in wanted.items():
-        _attribute(data, name, "FLOAT_COLOR", "color", np.concatenate(parts)[order])
-
-
-def _colour(mesh: FrozenMesh, name: str | None) -> np.ndarray:
-    found = None if name is None else mesh.colors.get(name)
-    return np.zeros((len(mesh.positions), 4), np.float32) if found is None else found
+        _attribute(data, name, "FLOAT_COLOR", np.concatenate(parts)[order])
 
 
 def _object_attributes(data: bpy.types.Mesh, meshes: Sequence[FrozenMesh], order: np.ndarray) -> None:
     """Object and generated coordinates, object normal, and Object Info, per corner."""
     inside = [object_positions(mesh) for mesh in meshes]
     generated = [generated_positions(mesh) for mesh in meshes]
-    normals = [mesh.normals.astype(np.float64) @ mesh.object_to_world[:3, :3] for mesh in meshes]
-    normals = [n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-30) for n in normals]
+    normals = [_object_normals(mesh.normals, mesh.object_to_world) for mesh in meshes]
     for name, parts in ((OBJECT, inside), (GENERATED, generated), (OBJECT_NORMAL, normals)):
-        _attribute(data, name, "FLOAT_VECTOR", "vector", np.concatenate(parts)[order])
+        _attribute(data, name, "FLOAT_VECTOR", np.concatenate(parts)[order])
     rows = [object_info(mesh) for mesh in meshes]
     counts = [len(mesh.positions) for mesh in meshes]
-    for name, kind, field, column in (
-        (LOCATION, "FLOAT_VECTOR", "vector", 0),
-        (OBJECT_COLOUR, "FLOAT_COLOR", "color", 1),
-        (OBJECT_NUMBERS, "FLOAT_VECTOR", "vector", 2),
-    ):
-        _attribute(data, name, kind, field, np.repeat(np.array([row[column] for row in rows]), counts, axis=0)[order])
+    kinds = {LOCATION: "FLOAT_VECTOR", OBJECT_COLOUR: "FLOAT_COLOR", OBJECT_NUMBERS: "FLOAT_VECTOR"}
+    for column, (name, kind) in enumerate(kinds.items()):
+        _attribute(data, name, kind, np.repeat(np.array([row[column] for row in rows]), counts, axis=0)[order])
+
+
+def _object_normals(normals: np.ndarray, object_to_world: np.ndarray) -> np.ndarray:
+    """World-space normals [N, 3] as unit ones in the object's space, float64."""
+    turned = normals.astype(np.float64) @ object_to_world[:3, :3]
+    return turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-30)
 
 
 def object_positions(mesh: FrozenMesh) -> np.ndarray:
@@ -184,22 +156,20 @@ def object_positions(mesh: FrozenMesh) -> np.ndarray:
     extent = float(np.abs(points).max(initial=0.0))
     if not 0 < extent < np.inf:
         return points
-    return _rounded(points, 2.0 ** (np.ceil(np.log2(extent)) - 20))
+    step = 2.0 ** (np.ceil(np.log2(extent)) - 20)
+    return np.round(points / step) * step
 
 
 def generated_positions(mesh: FrozenMesh) -> np.ndarray:
     """Generated coordinates [3T, 3]: 0 to 1 over the texture space; rounded to 2^-18, so that its ends are exact."""
     location, size = (np.asarray(part, np.float64) for part in mesh.texture_space)
-    return _rounded((_unrounded(mesh) - location) / np.where(size == 0, 1, 2 * size) + 0.5, 2.0**-18)
+    generated = (_unrounded(mesh) - location) / np.where(size == 0, 1, 2 * size) + 0.5
+    return np.round(generated * 2**18) / 2**18
 
 
 def _unrounded(mesh: FrozenMesh) -> np.ndarray:
     inverse = np.linalg.pinv(mesh.object_to_world)
     return mesh.positions.astype(np.float64) @ inverse[:3, :3].T + inverse[:3, 3]
-
-
-def _rounded(values: np.ndarray, step: float) -> np.ndarray:
-    return np.round(values / step) * step
 
 
 def object_info(mesh: FrozenMesh) -> tuple[list[float], list[float], list[float]]:
@@ -226,6 +196,7 @@ def object_random(name: str) -> float:
     return state["c"] / mask
 
 
-def _attribute(data: bpy.types.Mesh, name: str, kind: str, field: str, values: np.ndarray) -> None:
-    attribute = data.attributes.new(name, kind, "CORNER")
+def _attribute(data: bpy.types.Mesh, name: str, kind: str, values: np.ndarray, domain: str = "CORNER") -> None:
+    attribute = data.attributes.new(name, kind, domain)
+    field = "color" if kind == "FLOAT_COLOR" else "vector"
     attribute.data.foreach_set(field, np.ascontiguousarray(values, np.float32).ravel())

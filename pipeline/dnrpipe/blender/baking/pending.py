@@ -27,12 +27,9 @@ PENDING = "pending.json"
 def place_atlas(meshes: Sequence[FrozenMesh], scene_dir: Path) -> AtlasFacts:
     """Pack the scene atlas, or take the one that the bakes were made for."""
     pending = scene_dir / PENDING
-    if not pending.is_file():
-        return build_atlas(meshes)
-    kept = load_geometry(scene_dir / "geometry.npz")
-    names = [(mesh.name, mesh.triangles) for mesh in meshes]
-    if names != [(mesh.name, mesh.triangles) for mesh in kept]:
-        return build_atlas(meshes)  # the file changed in between
+    kept = load_geometry(scene_dir / "geometry.npz") if pending.is_file() else []
+    if [(mesh.name, mesh.triangles) for mesh in meshes] != [(mesh.name, mesh.triangles) for mesh in kept]:
+        return build_atlas(meshes)  # the first attempt, or the file changed in between
     for mesh, before in zip(meshes, kept, strict=True):
         mesh.atlas = before.atlas
     return read_record(pending, AtlasFacts)
@@ -66,5 +63,4 @@ def missing_bakes(
     shutil.rmtree(scene_dir / "textures", ignore_errors=True)  # made of placeholders
     save_geometry(scene_dir / "geometry.npz", meshes)
     write_json(pending, atlas.data())
-    layers = tuple(tuple(layer) for layer in converter.bakes.layers())
-    return PendingBakes(layers=layers, frame=frame)
+    return PendingBakes(layers=tuple(map(tuple, converter.bakes.layers())), frame=frame)

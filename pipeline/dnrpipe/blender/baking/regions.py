@@ -53,10 +53,9 @@ class Region:
 
     def interpolate(self, corners: np.ndarray) -> np.ndarray:
         """Values float32 [N, C] at the texel centres from values [3T, C] at the stacked corners."""
-        weights = self._weights
         result = np.zeros((len(self.texels), corners.shape[1]), np.float32)
         for k in range(3):
-            result += weights[:, k : k + 1] * corners[3 * self.triangle + k]
+            result += self._weights[:, k : k + 1] * corners[3 * self.triangle + k]
         return result
 
     @functools.cached_property
@@ -74,8 +73,8 @@ def rasterise(triangles: np.ndarray, size: int) -> Region:
     corners = triangles.astype(np.float64) * size
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     owner = np.full(size * size, -1, np.int32)
-    low = np.clip(np.ceil(np.minimum(np.minimum(a, b), c) - 0.5 - 1e-4), 0, size).astype(np.int32)
-    high = np.clip(np.floor(np.maximum(np.maximum(a, b), c) - 0.5 + 1e-4) + 1, 0, size).astype(np.int32)
+    low = np.clip(np.ceil(corners.min(1) - 0.5 - 1e-4), 0, size).astype(np.int32)
+    high = np.clip(np.floor(corners.max(1) - 0.5 + 1e-4) + 1, 0, size).astype(np.int32)
     sign = np.sign(_cross(b - a, c - a))
     extent = np.maximum(high - low, 0)
     boxes = extent[:, 0].astype(np.int64) * extent[:, 1]
@@ -83,9 +82,8 @@ def rasterise(triangles: np.ndarray, size: int) -> Region:
     edges = [_distance(p, q, sign) for p, q in ((a, b), (b, c), (c, a))]
     todo = np.flatnonzero(boxes)
     starts = np.cumsum(boxes[todo]) - boxes[todo]
-    groups = starts // CHUNK
-    for group in np.unique(groups):
-        part = todo[groups == group]
+    for group in np.unique(starts // CHUNK):
+        part = todo[starts // CHUNK == group]
         counts = boxes[part]
         which = np.repeat(part, counts)
         local = (np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)).astype(np.int32)

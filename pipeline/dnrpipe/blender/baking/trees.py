@@ -77,8 +77,6 @@ class TreeCopier:
     def dark(self) -> Any:
         """A material that emits nothing, for faces that are not baked."""
         made = bpy.data.materials.new("dnrpipe.dark")
-        if made.node_tree is None:
-            made.use_nodes = True
         made.cycles.emission_sampling = "NONE"
         _emitting(made.node_tree).inputs["Color"].default_value = (0, 0, 0, 1)
         _target(made.node_tree, self.image)
@@ -174,10 +172,8 @@ def _target(tree: Any, image: Any) -> None:
 
 
 def _group_output(tree: Any) -> Any:
-    ends = [node for node in tree.nodes if node.type == "GROUP_OUTPUT"]
-    return next((node for node in ends if node.is_active_output), None) or (
-        ends[0] if ends else tree.nodes.new("NodeGroupOutput")
-    )
+    ends = [node for node in tree.nodes if node.type == "GROUP_OUTPUT"] or [tree.nodes.new("NodeGroupOutput")]
+    return next((node for node in ends if node.is_active_output), ends[0])
 
 
 def _replace(tree: Any, node: Any, output: str, make: Any, *arguments: Any) -> None:

@@ -15,6 +15,7 @@ from dnrpipe.core.scene_records import AtlasFacts
 
 from .charts import chart_atlas, count_pieces
 from .frozen import ATLAS_LAYER, FrozenMesh
+from .local_mesh import new_mesh
 
 SMART_LIMIT = 200_000  # triangles; beyond it island packing takes minutes
 SMART_MESHES = 400
@@ -43,14 +44,10 @@ def build_atlas(meshes: Sequence[FrozenMesh], *, smart_limit: int = SMART_LIMIT)
     total = sum(mesh.triangles for mesh in meshes)
     density = texel_density(meshes)
     simple = total <= smart_limit and len(meshes) <= SMART_MESHES and count_pieces(meshes) <= SMART_PIECES
-    method = "smart" if simple else "charts"
-    if method == "smart":
-        _smart_atlas(meshes, density)
-    else:
-        chart_atlas(meshes, density)
+    (_smart_atlas if simple else chart_atlas)(meshes, density)
     _fit(meshes)
-    numbers = measure_atlas(meshes, MEASURE_SIZE)
-    return AtlasFacts(method=method, seconds=time.perf_counter() - started, **numbers)
+    numbers = measure_atlas(meshes)
+    return AtlasFacts(method="smart" if simple else "charts", seconds=time.perf_counter() - started, **numbers)
 
 
 def texel_density(meshes: Sequence[FrozenMesh]) -> np.ndarray:
@@ -90,10 +87,9 @@ def _smart_atlas(meshes: Sequence[FrozenMesh], density: np.ndarray) -> None:
 
 def _filled(meshes: Sequence[FrozenMesh]) -> float:
     """Area of all triangles in the atlas' square, whose side they span."""
-    low = np.min([mesh.atlas.min(0) for mesh in meshes], axis=0)
-    high = np.max([mesh.atlas.max(0) for mesh in meshes], axis=0)
-    area = sum(float(np.abs(_doubled_area(mesh.atlas.astype(np.float64).reshape(-1, 3, 2))).sum()) for mesh in meshes)
-    return area / 2 / max(float((high - low).max()) ** 2, 1e-20)
+    low, high = _span(meshes)
+    area = sum(_area(mesh.atlas) for mesh in meshes)
+    return area / max(float((high - low).max()) ** 2, 1e-20)
 
 
 @contextmanager
@@ -130,15 +126,7 @@ def _welded(mesh: FrozenMesh) -> bpy.types.Mesh:
     """Triangles that share vertices (equal positions), so that Blender sees connected islands."""
     rows = np.ascontiguousarray(mesh.positions + np.float32(0)).view(np.dtype((np.void, 12))).ravel()
     _, first, corner_vertex = np.unique(rows, return_index=True, return_inverse=True)
-    count = mesh.triangles
-    data = bpy.data.meshes.new("dnrpipe.unwrap")
-    data.vertices.add(len(first))
-    data.loops.add(3 * count)
-    data.polygons.add(count)
-    data.vertices.foreach_set("co", mesh.positions[first].ravel())
-    data.loops.foreach_set("vertex_index", corner_vertex.astype(np.int32).ravel())
-    data.polygons.foreach_set("loop_start", np.arange(0, 3 * count, 3, dtype=np.int32))
-    data.update(calc_edges=True)
+    data = new_mesh("dnrpipe.unwrap", mesh.positions[first], corner_vertex.astype(np.int32).reshape(-1, 3))
     data.uv_layers.new(name=ATLAS_LAYER)
     return data
 
@@ -149,7 +137,7 @@ def _set_density(objects: Sequence[bpy.types.Object], meshes: Sequence[FrozenMes
     layouts = [
         _read_uv(obj, mesh) * np.float32(factor) for obj, mesh, factor in zip(objects, meshes, density, strict=True)
     ]
-    area = sum(float(np.abs(_doubled_area(uv.astype(np.float64).reshape(-1, 3, 2))).sum()) / 2 for uv in layouts)
+    area = sum(_area(uv) for uv in layouts)
     scale = np.float32(math.sqrt(EXPECTED_OCCUPANCY / area) if area > 0 else 1.0)
     for obj, uv in zip(objects, layouts, strict=True):
         obj.data.uv_layers[ATLAS_LAYER].uv.foreach_set("vector", (uv * scale).ravel())
@@ -168,8 +156,7 @@ def _read_uv(obj: bpy.types.Object, mesh: FrozenMesh) -> np.ndarray:
 
 def _fit(meshes: Sequence[FrozenMesh]) -> None:
     """Keep the packed layout, whatever its frame, inside [0, 1)."""
-    low = np.min([mesh.atlas.min(0) for mesh in meshes], axis=0)
-    high = np.max([mesh.atlas.max(0) for mesh in meshes], axis=0)
+    low, high = _span(meshes)
     if (low < 0).any() or (high > 1).any():
         scale = float((high - low).max()) or 1.0
         for mesh in meshes:
@@ -189,20 +176,25 @@ def measure_atlas(meshes: Sequence[FrozenMesh], size: int = MEASURE_SIZE) -> dic
     covered = int((counts > 0).sum())
     density = []
     for mesh in meshes:
-        world = 2 * world_area(mesh)
-        uv = mesh.atlas.astype(np.float64).reshape(-1, 3, 2) * size
-        density.append(math.sqrt(float(np.abs(_doubled_area(uv)).sum() / world)))
+        density.append(size * math.sqrt(_area(mesh.atlas) / world_area(mesh)))
     return {
         "size": size,
         "occupancy": covered / size**2,
         "overlap": float((counts > 1).sum()) / max(covered, 1),
         "triangles_without_texel": float((hits == 0).mean()),
-        "texels_per_unit": {
-            "median": float(np.median(density)),
-            "min": float(np.min(density)),
-            "max": float(np.max(density)),
-        },
+        "texels_per_unit": {"median": float(np.median(density)), "min": min(density), "max": max(density)},
     }
+
+
+def _span(meshes: Sequence[FrozenMesh]) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest atlas coordinates, [2] each."""
+    low = np.min([mesh.atlas.min(0) for mesh in meshes], axis=0)
+    return low, np.max([mesh.atlas.max(0) for mesh in meshes], axis=0)
+
+
+def _area(uv: np.ndarray) -> float:
+    """Area of all triangles with these corners [3T, 2]."""
+    return np.abs(_doubled_area(uv.astype(np.float64).reshape(-1, 3, 2))).sum() / 2
 
 
 def _doubled_area(triangles: np.ndarray) -> np.ndarray:

@@ -52,11 +52,12 @@ def chart_atlas(meshes: Sequence[FrozenMesh], density: np.ndarray) -> None:
 
 def count_pieces(meshes: Sequence[FrozenMesh]) -> int:
     """Number of connected parts of all meshes."""
-    total = 0
-    for mesh in meshes:
-        faces = weld(mesh.positions, np.zeros_like(mesh.positions), None).faces
-        total += len(np.unique(_components(faces.astype(np.int64))))
-    return total
+    return sum(len(np.unique(_components(_faces(mesh)))) for mesh in meshes)
+
+
+def _faces(mesh: FrozenMesh) -> np.ndarray:
+    """int64 [T, 3]: triangles that share vertices where positions are equal."""
+    return weld(mesh.positions, np.zeros_like(mesh.positions), None).faces.astype(np.int64)
 
 
 def _charts(mesh: FrozenMesh) -> tuple[np.ndarray, np.ndarray]:
@@ -68,8 +69,7 @@ def _charts(mesh: FrozenMesh) -> tuple[np.ndarray, np.ndarray]:
     u, v = np.array([1, 2, 0])[axis], np.array([2, 0, 1])[axis]
     rows = np.arange(len(corners))[:, None]
     plane = np.stack([corners[rows, np.arange(3), u[:, None]], corners[rows, np.arange(3), v[:, None]]], axis=2)
-    faces = weld(mesh.positions, np.zeros_like(mesh.positions), None).faces
-    label = _components(faces.astype(np.int64) * 6 + side[:, None])
+    label = _components(_faces(mesh) * 6 + side[:, None])
     size = np.bincount(label)
     small = size[label] < SMALL_CHART
     if small.any():

@@ -10,10 +10,6 @@ from ..baking.cache import BakeCache
 from ..baking.regions import Atlas
 from ..shading.textures import Textured
 
-ACTIVE_COLOUR = "dnrpipe.color"
-"""Name of 'the active colour attribute', whichever a mesh has, among `FrozenMesh.colors`."""
-OWN = "dnrpipe."
-
 
 def colour_corners(bakes: BakeCache, material: str, name: str) -> np.ndarray | None:
     """RGBA [M, 4], linear, of colour attribute ``name`` ('' for each mesh's active one); None where no mesh has it."""
@@ -41,7 +37,7 @@ def as_attribute(atlas: Atlas, material: str, value: Textured) -> str:
     found = {id(part.mesh): part.mesh.colors[name] for part in atlas.parts(material) if name in part.mesh.colors}
     if found and np.array_equal(atlas.stacked(material, found, 3), texels):
         return name
-    name = f"{OWN}{hashlib.sha256(material.encode() + texels.tobytes()).hexdigest()[:12]}"
+    name = f"dnrpipe.{hashlib.sha256(material.encode() + texels.tobytes()).hexdigest()[:12]}"
     start = 0
     for part in atlas.parts(material):
         corners = part.corners

@@ -65,20 +65,13 @@ def freeze_scene(scene: bpy.types.Scene) -> Frozen:
         UserError: nothing in the scene is visible in renders.
     """
     render = scene.render
-    kept = {
-        name: getattr(render, name)
-        for name in (
-            "engine",
-            "resolution_x",
-            "resolution_y",
-            "resolution_percentage",
-            "use_border",
-            "use_multiview",
-            "use_compositing",
-            "use_sequencer",
-            "use_simplify",
-        )
+    wanted = {
+        "engine": _FreezeEngine.bl_idname,
+        **dict.fromkeys(("resolution_x", "resolution_y"), 8),
+        "resolution_percentage": 100,
+        **dict.fromkeys(("use_border", "use_multiview", "use_compositing", "use_sequencer", "use_simplify"), False),
     }
+    kept = {name: getattr(render, name) for name in wanted}
     layer = render_layer(scene)
     used = layer.use
     camera = None
@@ -89,11 +82,8 @@ def freeze_scene(scene: bpy.types.Scene) -> Frozen:
     _FreezeEngine.outcome = None
     try:
         layer.use = True
-        render.engine = _FreezeEngine.bl_idname
-        render.resolution_x = render.resolution_y = 8
-        render.resolution_percentage = 100
-        render.use_border = render.use_multiview = False
-        render.use_compositing = render.use_sequencer = render.use_simplify = False
+        for name, value in wanted.items():
+            setattr(render, name, value)
         bpy.ops.render.render(scene=scene.name, layer=layer.name)
         outcome = _FreezeEngine.outcome
     finally:
@@ -125,7 +115,7 @@ def freeze(depsgraph: bpy.types.Depsgraph) -> Frozen:
     budget instances share it (see `instances`).
     """
     cache: dict[tuple[object, ...], tuple[LocalMesh, bytes] | None] = {}
-    unique: dict[bytes, LocalMesh] = {}
+    unique: dict[bytes, LocalMesh] = {}  # one mesh for all that evaluate to the same content
     placed: list[Placed] = []
     findings = Findings()
     for instance in depsgraph.object_instances:
@@ -137,10 +127,13 @@ def freeze(depsgraph: bpy.types.Depsgraph) -> Frozen:
         for key, read in _surfaces(obj, instance.show_self, instance.show_particles, findings):
             if key not in cache:
                 local = read()
-                cache[key] = None if local is None or not len(local.material_index) else _intern(local, unique)
+                cache[key] = None
+                if local is not None and len(local.material_index):
+                    digest = local.digest()
+                    cache[key] = unique.setdefault(digest, local), digest
             if (found := cache[key]) is not None:
                 placed.append(Placed(obj.name_full, persistent, matrix, *found, obj.visible_camera))
-    repairs = dict.fromkeys(REPAIRS, 0)
+    repairs: dict[str, int] = dict.fromkeys(REPAIRS, 0)
     ids: dict[str, int] = {}
     taken: set[str] = set()
     meshes = []
@@ -181,12 +174,6 @@ def _surfaces(
     if show_particles and isinstance(data, bpy.types.Mesh):
         for name, read in hair_systems(obj, findings):
             yield (obj.name, data.as_pointer(), "hair", name), read
-
-
-def _intern(local: LocalMesh, unique: dict[bytes, LocalMesh]) -> tuple[LocalMesh, bytes]:
-    """One LocalMesh for all that evaluate to the same content."""
-    digest = local.digest()
-    return unique.setdefault(digest, local), digest
 
 
 def _note_sharing(shared: Shared, findings: Findings) -> None:

@@ -18,21 +18,14 @@ GEOMETRY_VERSION = 2
 
 ATLAS_LAYER = "dnrpipe.atlas"
 """The scene atlas as a UV layer: ``FrozenMesh.atlas``."""
-
-
-UNIT_TEXTURE_SPACE = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
-
-
-def _empty_atlas() -> np.ndarray:
-    return np.zeros((0, 2), np.float32)
-
-
-def _no_copies() -> np.ndarray:
-    return np.zeros((0, 4, 4), np.float64)
-
-
-def _identity() -> np.ndarray:
-    return np.eye(4, dtype=np.float64)
+TextureSpace = tuple[tuple[float, float, float], tuple[float, float, float]]
+UNIT_TEXTURE_SPACE: TextureSpace = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+ARRAY_FIELDS = ("positions", "normals", "material_index", "atlas", "object_to_world", "copies")
+HEADER_FIELDS = (
+    *("name", "object_name", "object_id", "materials", "active_uv", "uv_layers", "colors", "active_color"),
+    *("texture_space", "camera_visible", "strands"),
+)
+"""Fields of `FrozenMesh` in the JSON header of the file; of the layers, their names."""
 
 
 @dataclass
@@ -62,17 +55,17 @@ class FrozenMesh:
     """float32 [3T, 2] each: the artist's layers, V up."""
     active_uv: str | None = None
     """The layer that renders use by default, or None when there is no layer."""
-    atlas: np.ndarray = field(default_factory=_empty_atlas)
+    atlas: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), np.float32))
     """float32 [3T, 2] in [0, 1), V up: this instance's own place in the scene's atlas ([0, 2] until packed)."""
     colors: dict[str, np.ndarray] = field(default_factory=dict)
     """float32 [3T, 4] each: colour attributes, linear Rec.709 and alpha."""
     active_color: str | None = None
     """The colour attribute that renders use by default, or None when there is none."""
-    object_to_world: np.ndarray = field(default_factory=_identity)
+    object_to_world: np.ndarray = field(default_factory=lambda: np.eye(4))
     """float64 [4, 4]: the object's matrix; its inverse takes ``positions`` to Blender's Object coordinates."""
-    texture_space: tuple[tuple[float, float, float], tuple[float, float, float]] = UNIT_TEXTURE_SPACE
+    texture_space: TextureSpace = UNIT_TEXTURE_SPACE
     """(location, size), object space: Generated = (object position - location) / (2 size) + 1/2."""
-    copies: np.ndarray = field(default_factory=_no_copies)
+    copies: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
     """float64 [K, 4, 4]: further instances, as maps from this mesh's world space to the copy's (identity not listed).
 
     They share the atlas place and the object id of this mesh.
@@ -106,27 +99,9 @@ def save_geometry(path: Path, meshes: Sequence[FrozenMesh]) -> None:
     arrays: dict[str, Any] = {}
     index = []
     for i, mesh in enumerate(meshes):
-        index.append(
-            {
-                "name": mesh.name,
-                "object_name": mesh.object_name,
-                "object_id": mesh.object_id,
-                "materials": mesh.materials,
-                "active_uv": mesh.active_uv,
-                "uv_layers": list(mesh.uv_layers),
-                "colors": list(mesh.colors),
-                "active_color": mesh.active_color,
-                "texture_space": mesh.texture_space,
-                "camera_visible": mesh.camera_visible,
-                "strands": mesh.strands,
-            }
-        )
-        arrays[f"{i}.positions"] = mesh.positions
-        arrays[f"{i}.normals"] = mesh.normals
-        arrays[f"{i}.material_index"] = mesh.material_index
-        arrays[f"{i}.atlas"] = mesh.atlas
-        arrays[f"{i}.object_to_world"] = mesh.object_to_world
-        arrays[f"{i}.copies"] = mesh.copies
+        names = {"uv_layers": list(mesh.uv_layers), "colors": list(mesh.colors)}
+        index.append({key: names.get(key, getattr(mesh, key)) for key in HEADER_FIELDS})
+        arrays |= {f"{i}.{key}": getattr(mesh, key) for key in ARRAY_FIELDS}
         for j, uv in enumerate(mesh.uv_layers.values()):
             arrays[f"{i}.uv.{j}"] = uv
         for j, color in enumerate(mesh.colors.values()):
@@ -146,34 +121,16 @@ def load_geometry(path: Path) -> list[FrozenMesh]:
             header = json.loads(data["header"].tobytes())
             if header["version"] != GEOMETRY_VERSION:
                 raise UserError(f"{path}: geometry of version {header['version']}; run `dnrpipe prepare` again")
-            return [
-                FrozenMesh(
-                    name=entry["name"],
-                    object_name=entry["object_name"],
-                    object_id=entry["object_id"],
-                    positions=data[f"{i}.positions"],
-                    normals=data[f"{i}.normals"],
-                    material_index=data[f"{i}.material_index"],
-                    materials=entry["materials"],
-                    uv_layers={name: data[f"{i}.uv.{j}"] for j, name in enumerate(entry["uv_layers"])},
-                    active_uv=entry["active_uv"],
-                    atlas=data[f"{i}.atlas"],
-                    colors={name: data[f"{i}.color.{j}"] for j, name in enumerate(entry["colors"])},
-                    active_color=entry["active_color"],
-                    object_to_world=data[f"{i}.object_to_world"],
-                    texture_space=_texture_space(entry["texture_space"]),
-                    copies=data[f"{i}.copies"],
-                    camera_visible=entry["camera_visible"],
-                    strands=entry["strands"],
-                )
-                for i, entry in enumerate(header["meshes"])
-            ]
+            meshes = []
+            for i, entry in enumerate(header["meshes"]):
+                known = {key: entry[key] for key in HEADER_FIELDS}
+                known["uv_layers"] = {name: data[f"{i}.uv.{j}"] for j, name in enumerate(entry["uv_layers"])}
+                known["colors"] = {name: data[f"{i}.color.{j}"] for j, name in enumerate(entry["colors"])}
+                location, size = entry["texture_space"]
+                known["texture_space"] = tuple(location), tuple(size)
+                meshes.append(FrozenMesh(**known, **{key: data[f"{i}.{key}"] for key in ARRAY_FIELDS}))
+            return meshes
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; run `dnrpipe prepare` first") from None
     except NPZ_ERRORS as error:
         raise UserError(f"{path}: damaged geometry ({error}); run `dnrpipe prepare` again") from None
-
-
-def _texture_space(value: list[list[float]]) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    location, size = value
-    return (location[0], location[1], location[2]), (size[0], size[1], size[2])

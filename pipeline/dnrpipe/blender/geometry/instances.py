@@ -20,7 +20,7 @@ SINGULAR = 1e-9  # |det| of a matrix with columns scaled to length 1: flat ones 
 
 @dataclass
 class Placed:
-    """One visible instance of a local mesh: ``identity`` (object name, persistent id) makes the order stable."""
+    """One visible instance of a local mesh; object name and persistent id make the order stable."""
 
     name: str
     persistent: tuple[int, ...]
@@ -49,7 +49,7 @@ def share_instances(
     groups: dict[tuple[bytes, bool], list[Placed]] = {}
     single: list[Shared] = []
     for item in ordered:
-        if _invertible(item.matrix):
+        if invertible(item.matrix):
             groups.setdefault((item.digest, item.camera_visible), []).append(item)
         else:
             single.append(Shared(item))
@@ -78,9 +78,10 @@ def copy_matrices(shared: Shared) -> np.ndarray:
     return np.stack([item.matrix for item in shared.others]) @ np.linalg.inv(shared.lead.matrix)
 
 
-def _invertible(matrix: np.ndarray) -> bool:
+def invertible(matrix: np.ndarray, least: float = SINGULAR) -> bool:
+    """Whether a matrix [4, 4] is finite, and |det| with columns scaled to length 1 above ``least``."""
     linear = matrix[:3, :3]
     length = np.linalg.norm(linear, axis=0)
     if not np.isfinite(matrix).all() or not (length > 0).all():
         return False
-    return abs(float(np.linalg.det(linear / length))) > SINGULAR
+    return abs(float(np.linalg.det(linear / length))) > least

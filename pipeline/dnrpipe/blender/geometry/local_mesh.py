@@ -8,12 +8,20 @@ from dataclasses import dataclass, field
 import bpy
 import numpy as np
 
-from .frozen import UNIT_TEXTURE_SPACE
-from .named_attributes import named_attributes
+from ..baking.trees import attribute_names
+from .frozen import UNIT_TEXTURE_SPACE, TextureSpace
 
+FIELDS = {
+    "FLOAT": ("value", 1),
+    "INT": ("value", 1),
+    "BOOLEAN": ("value", 1),
+    "FLOAT_VECTOR": ("vector", 3),
+    "FLOAT2": ("vector", 2),
+    "FLOAT_COLOR": ("color", 4),
+    "BYTE_COLOR": ("color", 4),
+}
+"""Type of attribute -> (its property, numbers per element)."""
 UV_STEPS = 2**20  # artist's UVs are rounded to multiples of 1 / UV_STEPS
-
-TextureSpace = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 @dataclass
@@ -34,10 +42,9 @@ class LocalMesh:
     def digest(self) -> bytes:
         """Hash of all content: equal for meshes that evaluate to the same geometry with the same materials."""
         state = hashlib.blake2b(digest_size=16)
-        for array in (self.positions, self.normals, self.material_index, *self.uv_layers.values()):
+        layers = (*self.uv_layers.values(), *self.colors.values())
+        for array in (self.positions, self.normals, self.material_index, *layers):
             state.update(np.ascontiguousarray(array).data)
-        for array in self.colors.values():
-            state.update(array.data)
         names = (self.materials, list(self.uv_layers), self.active_uv, list(self.colors), self.active_color)
         state.update(repr((names, self.texture_space)).encode())
         return state.digest()
@@ -83,12 +90,25 @@ def read_local(obj: bpy.types.Object) -> LocalMesh | None:
             materials=materials,
             uv_layers=uv_layers,
             active_uv=active,
-            colors=colors | named_attributes(obj, mesh, known, corner_vertex, loops, polygons),
+            colors=colors | _named_attributes(obj, mesh, known, corner_vertex, loops, polygons),
             active_color=mesh.attributes.default_color_name or None,
             texture_space=(_triple(mesh.texspace_location), _triple(mesh.texspace_size)),
         )
     finally:
         obj.to_mesh_clear()
+
+
+def new_mesh(name: str, vertices: np.ndarray, faces: np.ndarray) -> bpy.types.Mesh:
+    """A Blender mesh of triangles. vertices: float32 [V, 3]; faces: int32 [T, 3]."""
+    data = bpy.data.meshes.new(name)
+    data.vertices.add(len(vertices))
+    data.loops.add(faces.size)
+    data.polygons.add(len(faces))
+    data.vertices.foreach_set("co", np.ascontiguousarray(vertices).ravel())
+    data.loops.foreach_set("vertex_index", np.ascontiguousarray(faces).ravel())
+    data.polygons.foreach_set("loop_start", np.arange(0, faces.size, 3, dtype=np.int32))
+    data.update(calc_edges=True)
+    return data
 
 
 def slot_names(obj: bpy.types.Object) -> list[str | None]:
@@ -105,6 +125,47 @@ def _colors(mesh: bpy.types.Mesh, corner_vertex: np.ndarray, loops: np.ndarray) 
         values = np.empty((len(attribute.data), 4), np.float32)
         attribute.data.foreach_get("color", values.ravel())
         result[attribute.name] = values[corner_vertex[loops] if attribute.domain == "POINT" else loops]
+    return result
+
+
+def _named_attributes(
+    obj: bpy.types.Object,
+    mesh: bpy.types.Mesh,
+    known: set[str],
+    corner_vertex: np.ndarray,
+    loops: np.ndarray,
+    polygons: np.ndarray,
+) -> dict[str, np.ndarray]:
+    """Attributes other than UV layers and colours that the object's materials name, float32 [3T, 4].
+
+    A number fills all three channels, as Cycles shows it as a colour; alpha is 1 unless the attribute has one.
+
+    Args:
+        known: names that are read elsewhere.
+        corner_vertex: vertex of every corner of the mesh. loops, polygons: corner [3T] and polygon [T] of the
+            triangles.
+    """
+    wanted = set[str]()
+    for slot in obj.material_slots:
+        if slot.material is not None:
+            wanted |= attribute_names(slot.material)
+    places = {"POINT": corner_vertex[loops], "CORNER": loops, "FACE": np.repeat(polygons, 3)}
+    result = {}
+    for name in sorted(wanted - known):
+        attribute = mesh.attributes.get(name)
+        if attribute is None or attribute.domain not in places or attribute.data_type not in FIELDS:
+            continue
+        if attribute.is_required or attribute.is_internal:
+            continue  # Blender's own, such as the positions themselves
+        field, width = FIELDS[attribute.data_type]
+        kind = {"INT": np.int32, "BOOLEAN": bool}.get(attribute.data_type, np.float32)
+        values = np.empty(len(attribute.data) * width, kind)
+        attribute.data.foreach_get(field, values)
+        rows = values.reshape(-1, width).astype(np.float32)
+        full = np.zeros((len(rows), 4), np.float32)
+        full[:, 3] = 1
+        full[:, : 3 if width == 1 else width] = rows  # a single number is broadcast
+        result[name] = full[places[attribute.domain]]
     return result
 
 

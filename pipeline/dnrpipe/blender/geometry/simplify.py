@@ -15,7 +15,7 @@ from ..bundle.ply import weld
 from ..findings import Findings
 from ..reading.names import find_material
 from .frozen import FrozenMesh
-from .local_mesh import read_local
+from .local_mesh import new_mesh, read_local
 from .world import to_world
 
 WRITTEN_TRIANGLES = 6_000_000
@@ -75,23 +75,15 @@ def _simplify(mesh: FrozenMesh, ratio: float, repairs: dict[str, int]) -> None:
         bpy.data.batch_remove([obj, data])
     if local is None or not len(local.material_index):
         return
-    local.materials = mesh.materials
     simple = to_world(mesh.name, np.eye(4), local, repairs)
-    if not simple.triangles:
-        return
-    mesh.positions, mesh.normals, mesh.material_index = simple.positions, simple.normals, simple.material_index
-    mesh.uv_layers, mesh.colors, mesh.atlas = simple.uv_layers, simple.colors, simple.atlas
+    if simple.triangles:
+        for name in ("positions", "normals", "material_index", "uv_layers", "colors", "atlas"):
+            setattr(mesh, name, getattr(simple, name))
 
 
 def _connected(mesh: FrozenMesh) -> bpy.types.Mesh:
     welded = weld(mesh.positions, np.zeros_like(mesh.positions), None)
-    data = bpy.data.meshes.new("dnrpipe.simplify")
-    data.vertices.add(len(welded.vertices))
-    data.loops.add(3 * mesh.triangles)
-    data.polygons.add(mesh.triangles)
-    data.vertices.foreach_set("co", np.ascontiguousarray(welded.vertices[:, :3]).ravel())
-    data.loops.foreach_set("vertex_index", welded.faces.ravel())
-    data.polygons.foreach_set("loop_start", np.arange(0, 3 * mesh.triangles, 3, dtype=np.int32))
+    data = new_mesh("dnrpipe.simplify", welded.vertices[:, :3], welded.faces)
     for name in mesh.materials:
         data.materials.append(None if name is None else find_material(name))
     data.polygons.foreach_set("material_index", mesh.material_index)
@@ -100,7 +92,7 @@ def _connected(mesh: FrozenMesh) -> bpy.types.Mesh:
     face /= np.maximum(np.linalg.norm(face, axis=1, keepdims=True), 1e-30)
     smooth = (np.einsum("tkc,tc->tk", mesh.normals.reshape(-1, 3, 3), face) < FLAT).any(1)
     data.polygons.foreach_set("use_smooth", smooth)
-    data.update(calc_edges=True)
+    data.update()
     for name, uv in mesh.uv_layers.items():
         data.uv_layers.new(name=name).uv.foreach_set("vector", uv.ravel())
     for name, color in mesh.colors.items():

@@ -6,6 +6,7 @@ small spheres. Beyond a budget strands and points are thinned out evenly and thi
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -47,20 +48,17 @@ def hair_systems(obj: bpy.types.Object, findings: Findings) -> list[tuple[str, R
         system = modifier.particle_system
         settings = system.settings
         if settings.type == "HAIR" and settings.render_type == "PATH":
-
-            def read(
-                system: bpy.types.ParticleSystem = system, modifier: bpy.types.Modifier = modifier
-            ) -> LocalMesh | None:
-                names = slot_names(obj)
-                slot = min(max(system.settings.material - 1, 0), len(names) - 1)
-                return _tubes(_particle_strands(obj, system, modifier), names, slot, obj.name, findings)
-
-            found.append((system.name, read))
+            found.append((system.name, functools.partial(_read_particles, obj, modifier, findings)))
         elif settings.render_type in {"HALO", "LINE"}:
-            findings.add(
-                "ignored", f"particles shown as {settings.render_type.lower()}", "not rendered", object=obj.name
-            )
+            shown = settings.render_type.lower()
+            findings.add("ignored", f"particles shown as {shown}", "not rendered", object=obj.name)
     return found
+
+
+def _read_particles(obj: bpy.types.Object, modifier: bpy.types.Modifier, findings: Findings) -> LocalMesh | None:
+    names, system = slot_names(obj), modifier.particle_system
+    slot = min(max(system.settings.material - 1, 0), len(names) - 1)
+    return _tubes(_particle_strands(obj, system, modifier), names, slot, obj.name, findings)
 
 
 def read_curves(obj: bpy.types.Object, findings: Findings) -> LocalMesh | None:
@@ -71,8 +69,7 @@ def read_curves(obj: bpy.types.Object, findings: Findings) -> LocalMesh | None:
         return None
     offsets = np.empty(count + 1, np.int32)
     data.curve_offset_data.foreach_get("value", offsets)
-    positions = _attribute(data, "position", 3)
-    radius = _attribute(data, "radius", 1)
+    positions, radius = _attribute(data, "position", 3), _attribute(data, "radius", 1)
     if positions is None:
         return None
     if radius is None:
@@ -106,13 +103,8 @@ def read_points(obj: bpy.types.Object, findings: Findings) -> LocalMesh | None:
     grow = (1.09 if len(ball) == 60 else 1.22) * math.sqrt(len(centers) / len(kept))
     positions = centers[kept, None] + ball[None] * radius[kept, None] * grow
     findings.add("approximated", "point cloud", _note("points", len(centers), len(kept), "spheres"), object=obj.name)
-    count = len(kept) * len(ball)
-    return LocalMesh(
-        positions.reshape(-1, 3).astype(np.float32),
-        np.broadcast_to(ball, positions.shape).reshape(-1, 3).astype(np.float32),
-        np.zeros(count // 3, np.int32),
-        slot_names(obj),
-    )
+    normals = np.broadcast_to(ball, positions.shape)
+    return _local_mesh(positions, normals, slot_names(obj), 0)
 
 
 def _particle_strands(obj: bpy.types.Object, system: bpy.types.ParticleSystem, modifier: bpy.types.Modifier) -> Strands:
@@ -182,19 +174,21 @@ def _tubes(strands: Strands, materials: list[str | None], slot: int, name: str, 
     lower = s[:, None] * SIDES + k
     ahead = s[:, None] * SIDES + (k + 1) % SIDES
     faces = np.stack([lower, ahead, ahead + SIDES, lower, ahead + SIDES, lower + SIDES], axis=-1).reshape(-1)
-    positions = rings.reshape(len(kept), -1, 3)[:, faces].reshape(-1, 3)
-    normals = round_.reshape(len(kept), -1, 3)[:, faces].reshape(-1, 3)
-    mesh = LocalMesh(
-        positions.astype(np.float32),
-        normals.astype(np.float32),
-        np.full(len(positions) // 3, slot, np.int32),
-        materials,
-        strands=True,
-    )
+    positions = rings.reshape(len(kept), -1, 3)[:, faces]
+    normals = round_.reshape(len(kept), -1, 3)[:, faces]
+    mesh = _local_mesh(positions, normals, materials, slot)
+    mesh.strands = True
     if strands.uv is not None:
         mesh.uv_layers = {strands.uv_name: np.repeat(strands.uv[kept], len(faces), axis=0)}
         mesh.active_uv = strands.uv_name
     return mesh
+
+
+def _local_mesh(positions: np.ndarray, normals: np.ndarray, materials: list[str | None], slot: int) -> LocalMesh:
+    """Positions and normals of corners, [..., 3], as a mesh of one material."""
+    corners = positions.reshape(-1, 3).astype(np.float32)
+    index = np.full(len(corners) // 3, slot, np.int32)
+    return LocalMesh(corners, normals.reshape(-1, 3).astype(np.float32), index, materials)
 
 
 def _note(what: str, total: int, kept: int, shape: str) -> str:

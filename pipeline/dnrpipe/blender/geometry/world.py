@@ -9,13 +9,7 @@ from .local_mesh import LocalMesh
 
 # A triangle whose doubled area is below this fraction of its longest edge squared has no usable normal.
 DEGENERATE = 1e-12
-REPAIRS: tuple[str, ...] = (
-    "degenerate_triangles",
-    "non_finite_triangles",
-    "normals_replaced",
-    "uv_replaced",
-    "colors_replaced",
-)
+REPAIRS = ("degenerate_triangles", "non_finite_triangles", "normals_replaced", "uv_replaced", "colors_replaced")
 BLOCK = 1 << 17  # triangles transformed at a time
 
 
@@ -24,10 +18,7 @@ def to_world(name: str, matrix: np.ndarray, local: LocalMesh, repairs: dict[str,
     linear = matrix[:3, :3]
     # det(M) inv(M)^T = cofactor matrix: the inverse transpose without a division, so flat scales survive.
     columns = linear.T
-    cofactor = np.stack(
-        [np.cross(columns[1], columns[2]), np.cross(columns[2], columns[0]), np.cross(columns[0], columns[1])],
-        axis=1,
-    )
+    cofactor = np.stack([*np.cross(np.roll(columns, -1, axis=0), np.roll(columns, -2, axis=0))], axis=1)
     mirrored = bool(np.linalg.det(linear) < 0)
     count = len(local.material_index)
     positions = np.empty((count, 3, 3), np.float32)
@@ -54,9 +45,8 @@ def to_world(name: str, matrix: np.ndarray, local: LocalMesh, repairs: dict[str,
         keep[block] = finite & solid
         repairs["non_finite_triangles"] += int((~finite).sum())
         repairs["degenerate_triangles"] += int((finite & ~solid).sum())
-        unit, bad = _unit_normals(turned, face)
+        normals[block], bad = _unit_normals(turned, face)
         repairs["normals_replaced"] += int(bad[keep[block]].sum())
-        normals[block] = unit
 
     def corner(values: np.ndarray, kind: str) -> np.ndarray:
         """Corner values [3T, C] of the kept triangles, in their winding; non-finite ones become 0."""
@@ -69,7 +59,6 @@ def to_world(name: str, matrix: np.ndarray, local: LocalMesh, repairs: dict[str,
         return ordered
 
     colors = {layer: corner(values, "colors_replaced") for layer, values in local.colors.items()}
-    kept = int(keep.sum())
     return FrozenMesh(
         name=name,
         object_name=name,
@@ -80,7 +69,7 @@ def to_world(name: str, matrix: np.ndarray, local: LocalMesh, repairs: dict[str,
         materials=list(local.materials),
         uv_layers={layer: corner(values, "uv_replaced") for layer, values in local.uv_layers.items()},
         active_uv=local.active_uv,
-        atlas=np.zeros((3 * kept, 2), np.float32),
+        atlas=np.zeros((3 * int(keep.sum()), 2), np.float32),
         colors=colors,
         active_color=local.active_color if local.active_color in colors else None,
         object_to_world=matrix,

@@ -10,6 +10,11 @@ from dnrpipe.core.scene_records import Lens, SceneCamera
 from dnrtrain.contract import View
 
 SENSOR = 36.0  # mm; only its ratio to the focal length counts
+LENS = (
+    *("type", "lens", "sensor_width", "sensor_height", "sensor_fit"),
+    *("shift_x", "shift_y", "clip_start", "clip_end", "ortho_scale"),
+)
+"""Blender's settings of a camera that `SceneCamera` has by the same names."""
 
 
 def apply_view(
@@ -59,20 +64,10 @@ def rigid(matrix: mathutils.Matrix) -> list[list[float]]:
 
 def describe(camera: bpy.types.Object) -> SceneCamera:
     """Pose and lens of a camera object."""
-    data = camera.data
     return SceneCamera(
         name=camera.name,
         c2w=tuple(map(tuple, rigid(camera.matrix_world))),
-        type=data.type,
-        lens=data.lens,
-        sensor_width=data.sensor_width,
-        sensor_height=data.sensor_height,
-        sensor_fit=data.sensor_fit,
-        shift_x=data.shift_x,
-        shift_y=data.shift_y,
-        clip_start=data.clip_start,
-        clip_end=data.clip_end,
-        ortho_scale=data.ortho_scale,
+        **{name: getattr(camera.data, name) for name in LENS},
         dof=_depth_of_field(camera),
     )
 

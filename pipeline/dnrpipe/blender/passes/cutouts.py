@@ -27,9 +27,7 @@ EXTENSIONS = {"repeat": "REPEAT", "clamp": "EXTEND", "mirror": "MIRROR"}
 
 def is_opaque(opacity: Value) -> bool:
     """Whether a surface of this opacity is there everywhere."""
-    if isinstance(opacity, Constant):
-        return opacity.scalar >= 1
-    return bool(opacity.linear().min() >= 1)
+    return opacity.scalar >= 1 if isinstance(opacity, Constant) else bool(opacity.linear().min() >= 1)
 
 
 def is_absent(opacity: Value) -> bool:
@@ -45,8 +43,7 @@ def placed(opacity: Value) -> Value:
 
 def emission_material(name: str) -> bpy.types.Material:
     """Emission: the cheapest shader, and the only kind whose Normal pass is the geometry's, not a BSDF's."""
-    material, _, _ = _emission(name)
-    return material
+    return _emission(name)[0]
 
 
 def cutout_material(name: str, opacity: Value) -> bpy.types.Material:

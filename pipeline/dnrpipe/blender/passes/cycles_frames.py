@@ -43,14 +43,9 @@ class Worker:
         return made
 
     def _render(self, task: CyclesTask) -> CyclesAnswer:
-        scene_settings = PassesCommon(
-            scene_dir=task.scene_dir,
-            raster_engine="cycles",
-            raster_samples=1,
-            coverage_samples=1,
-            threads=self.threads,
-        )
-        draw = make_renderer("raster", scene_settings)
+        samples = {"raster_samples": 1, "coverage_samples": 1}
+        common = PassesCommon(scene_dir=task.scene_dir, raster_engine="cycles", threads=self.threads, **samples)
+        draw = make_renderer("raster", common)
         scene = bpy.context.scene
         ms: dict[str, list[float]] = {}
         for spp in task.samples:

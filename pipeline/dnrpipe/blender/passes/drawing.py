@@ -14,8 +14,7 @@ from ..reading.opening import open_blend
 from ..tasks import PassesCommon
 from .camera import apply_view, clip_range
 from .gbuffer_scene import GBUFFER_SCENE, gbuffer_bounds, set_up_coverage
-from .raster import configure_raster
-from .rendering import output_exr, render_to
+from .raster import configure_raster, output_exr, render_to
 
 
 def make_renderer(kind: str, common: PassesCommon) -> Callable[[View, Path], None]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..bundle.ply import weld
 from ..geometry.frozen import ATLAS_LAYER, FrozenMesh
+from ..geometry.local_mesh import new_mesh
 from ..shading.textures import Value
 from .cutouts import (
     CUT_LAYER,
@@ -57,7 +58,9 @@ def add_gbuffer_scene(
         if name:
             _add_copies(scene, obj, group[0].copies, object_id)
     configure_exact(scene)
-    scene[BOUNDS] = _bounding_sphere(meshes)
+    points = np.array([[points.min(0), points.max(0)] for points in (mesh.extent() for mesh in meshes)])
+    low, high = points[:, 0].min(0), points[:, 1].max(0)
+    scene[BOUNDS] = [*((low + high) / 2).tolist(), float(np.linalg.norm(high - low) / 2)]
     layer = scene.view_layers[0]
     if materials:
         scene.cycles.transparent_max_bounces = TRANSPARENT_BOUNCES
@@ -113,13 +116,6 @@ def configure_exact(scene: bpy.types.Scene) -> None:
     scene.view_layers[0].use_pass_combined = True
 
 
-def _bounding_sphere(meshes: Sequence[FrozenMesh]) -> list[float]:
-    extents = [mesh.extent() for mesh in meshes]
-    low = np.min([points.min(0) for points in extents], axis=0)
-    high = np.max([points.max(0) for points in extents], axis=0)
-    return [*((low + high) / 2).tolist(), float(np.linalg.norm(high - low) / 2)]
-
-
 def _add(scene: bpy.types.Scene, data: bpy.types.Mesh, object_id: int) -> bpy.types.Object:
     obj = bpy.data.objects.new(data.name, data)
     obj.pass_index = object_id
@@ -165,8 +161,7 @@ def _mesh(
 ) -> bpy.types.Mesh | None:
     """The meshes of a group as one, with atlas UVs and corner normals; None when nothing of it is there."""
     names = list(materials)
-    slots = [_slots(mesh, cut, names) for mesh in group]
-    slot = np.concatenate(slots)
+    slot = np.concatenate([_slots(mesh, cut, names) for mesh in group])
     corners = np.repeat(slot >= 0, 3)
     if not corners.any():
         return None
@@ -175,15 +170,7 @@ def _mesh(
         np.concatenate([mesh.normals for mesh in group])[corners],
         None,
     )
-    count = len(welded.faces)
-    data = bpy.data.meshes.new(name)
-    data.vertices.add(len(welded.vertices))
-    data.loops.add(3 * count)
-    data.polygons.add(count)
-    data.vertices.foreach_set("co", np.ascontiguousarray(welded.vertices[:, :3]).ravel())
-    data.loops.foreach_set("vertex_index", welded.faces.ravel())
-    data.polygons.foreach_set("loop_start", np.arange(0, 3 * count, 3, dtype=np.int32))
-    data.update(calc_edges=True)
+    data = new_mesh(name, welded.vertices[:, :3], welded.faces)
     atlas = np.concatenate([mesh.atlas for mesh in group])[corners]
     data.uv_layers.new(name=ATLAS_LAYER).uv.foreach_set("vector", np.ascontiguousarray(atlas).ravel())
     # "Free" custom normals (since 4.5): plain vectors, not the two angles in 16 bits of older files.

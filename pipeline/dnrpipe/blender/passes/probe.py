@@ -16,8 +16,7 @@ import bpy
 import numpy as np
 
 from ..tasks import RasterTrial
-from .raster import configure_raster
-from .rendering import render_to
+from .raster import configure_raster, render_to
 from .scratch import read_channels
 
 SIZE = 256  # pixels per side

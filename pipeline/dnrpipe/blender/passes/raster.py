@@ -1,13 +1,15 @@
-"""The original scene as a fast rasterised (or direct-light) picture: linear, transparent, nothing else."""
+"""The original scene as a fast rasterised (or direct-light) picture, and the EXR files that scenes are rendered to."""
 
 from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
 
 import bpy
 
 from dnrpipe.core.errors import UserError
 
 from ..geometry.freeze import render_layer
-from .rendering import output_exr
 
 WORKBENCH_AA = ((1, "OFF"), (5, "5"), (8, "8"), (11, "11"), (16, "16"), (32, "32"))
 
@@ -34,7 +36,10 @@ def configure_raster(scene: bpy.types.Scene, engine: str, samples: int) -> None:
     render.use_single_layer = False
     output_exr(scene, "image")
     if engine == "eevee":
-        _eevee(scene, samples)
+        scene.render.engine = "BLENDER_EEVEE"
+        scene.eevee.taa_render_samples = samples
+        scene.eevee.use_overscan = False
+        scene.render.filter_size = 1.0  # sharper than the default 1.5; the ray tracer's filter is a 1-pixel box
     elif engine == "workbench":
         _workbench(scene, samples)
     elif engine in ("cycles", "cycles-direct"):
@@ -43,13 +48,6 @@ def configure_raster(scene: bpy.types.Scene, engine: str, samples: int) -> None:
             scene.cycles.max_bounces = 0
     else:
         raise UserError(f"unknown raster engine '{engine}'; choose eevee, workbench or cycles-direct")
-
-
-def _eevee(scene: bpy.types.Scene, samples: int) -> None:
-    scene.render.engine = "BLENDER_EEVEE"
-    scene.eevee.taa_render_samples = samples
-    scene.eevee.use_overscan = False
-    scene.render.filter_size = 1.0  # sharper than the default 1.5; the ray tracer's filter is a 1-pixel box
 
 
 def _workbench(scene: bpy.types.Scene, samples: int) -> None:
@@ -91,3 +89,35 @@ def _viewport_colour(material: bpy.types.Material) -> None:
         if node.type.startswith("BSDF_") and socket is not None and not socket.is_linked:
             material.diffuse_color = socket.default_value
             return
+
+
+def output_exr(scene: bpy.types.Scene, kind: Literal["layers", "image"]) -> None:
+    """Let the scene write uncompressed float32 EXR: all passes, or the picture as linear Rec.709 RGBA."""
+    settings = scene.render.image_settings
+    if kind == "layers":
+        settings.media_type = "MULTI_LAYER_IMAGE"
+        settings.file_format = "OPEN_EXR_MULTILAYER"
+        settings.use_exr_interleave = True  # one part: 5.0 writes a part per pass otherwise
+    else:
+        settings.media_type = "IMAGE"
+        settings.file_format = "OPEN_EXR"
+        settings.color_mode = "RGBA"
+        # Files may work in another space (Rec.2020, ACEScg); the contract is Rec.709.
+        settings.color_management = "OVERRIDE"
+        settings.linear_colorspace_settings.name = "Linear Rec.709"
+    settings.color_depth = "32"
+    settings.exr_codec = "NONE"
+    scene.render.use_file_extension = True
+    scene.render.use_overwrite = True
+    scene.render.use_placeholder = False
+
+
+def render_to(scene: bpy.types.Scene, path: Path) -> None:
+    """Render ``scene`` to ``path`` (.exr, see `output_exr`). Raises RuntimeError without a picture."""
+    path.unlink(missing_ok=True)
+    scene.render.filepath = str(path)
+    layers = scene.view_layers
+    single = {"layer": layers[0].name} if len(layers) == 1 else {}
+    bpy.ops.render.render(write_still=True, scene=scene.name, **single)
+    if not path.is_file():
+        raise RuntimeError(f"Blender rendered scene '{scene.name}' without writing a picture")

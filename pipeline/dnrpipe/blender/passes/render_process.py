@@ -29,12 +29,7 @@ Kind = Literal["gbuffer", "coverage", "raster"]
 
 
 class RenderProcess:
-    """The parent's end. ``process(view, path)`` renders one view to an EXR file.
-
-    Args:
-        kind: which scene the process renders.
-        common: of the passes worker.
-    """
+    """The parent's end. ``process(view, path)`` renders one view to an EXR file."""
 
     def __init__(self, kind: Kind, common: PassesCommon) -> None:
         self.kind = kind
@@ -48,24 +43,23 @@ class RenderProcess:
         Raises UserError for unusable input, RuntimeError when rendering fails or the process dies; the
         next call starts a new process.
         """
-        if self.connection is None:
-            self._start()
-        assert self.connection is not None
+        connection = self.connection or self._start()
         try:
-            self.connection.send((view, path))
-            answer = self.connection.recv()
+            connection.send((view, path))
+            answer = connection.recv()
         except (EOFError, OSError):
             raise RuntimeError(f"the {self.kind} renderer {self._exit_reason()}") from None
         if "error" in answer:
             raise (UserError if answer["input"] else RuntimeError)(answer["error"])
         return answer
 
-    def _start(self) -> None:
+    def _start(self) -> Connection:
         context = multiprocessing.get_context("spawn")  # bpy does not survive a fork
         self.connection, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(theirs, self.kind, self.common, os.getpid()), daemon=True)
         self.process.start()
         theirs.close()  # so that its end is seen here
+        return self.connection
 
     def _exit_reason(self) -> str:
         self.process.join(10)

@@ -21,19 +21,13 @@ def scratch_folder(pixels: int) -> Iterator[Path]:
     """A temporary folder for render outputs: on the RAM disk when four such files fit there, else on disk."""
     need = 4 * pixels * BYTES_PER_PIXEL
     fits = RAM_DISK.is_dir() and os.access(RAM_DISK, os.W_OK) and shutil.disk_usage(RAM_DISK).free > need
-    if fits:
-        _sweep(RAM_DISK)
-    prefix = f"{PREFIX}{os.getpid()}-"
-    with tempfile.TemporaryDirectory(prefix=prefix, dir=RAM_DISK if fits else None) as folder:
-        yield Path(folder)
-
-
-def _sweep(parent: Path) -> None:
-    """Remove temporary folders whose process was killed: nothing else frees the memory that they hold."""
-    for folder in parent.glob(f"{PREFIX}*-*"):
+    # Temporary folders whose process was killed: nothing else frees the memory that they hold.
+    for folder in RAM_DISK.glob(f"{PREFIX}*-*") if fits else ():
         owner = folder.name.removeprefix(PREFIX).partition("-")[0]
         if owner.isdigit() and not Path("/proc", owner).exists():
             shutil.rmtree(folder, ignore_errors=True)
+    with tempfile.TemporaryDirectory(prefix=f"{PREFIX}{os.getpid()}-", dir=RAM_DISK if fits else None) as made:
+        yield Path(made)
 
 
 def read_channels(path: Path, prefix: str = "") -> dict[str, np.ndarray]:

@@ -28,12 +28,10 @@ class Worker:
         self.raster = RenderProcess("raster", self.common)
 
     def __call__(self, task: dict[str, Any]) -> PassesAnswer:
-        return self._render(PassesTask.model_validate(task))
-
-    def _render(self, task: PassesTask) -> PassesAnswer:
         """Write the view's EXR. One frame at a time: processes side by side would spoil each other's seconds."""
         started, cpu = time.perf_counter(), time.process_time()
-        view = task.view
+        wanted = PassesTask.model_validate(task)
+        view = wanted.view
         with scratch_folder(view.width * view.height) as folder:
             frames = [self.gbuffer(view, folder / "gbuffer.exr")]
             channels, repaired = read_gbuffer(read_channels(folder / "gbuffer.exr", LAYER_PREFIX))
@@ -41,7 +39,7 @@ class Worker:
             frames.append(self.coverage(view, folder / "coverage.exr"))
             channels["coverage"] = np.clip(read_channels(folder / "coverage.exr")["A"], 0, 1)
             geometry_seconds = time.perf_counter() - started
-            if task.raster:
+            if wanted.raster:
                 frames.append(self.raster(view, folder / "raster.exr"))
                 picture = read_channels(folder / "raster.exr")
                 colour, bad = finite({name: picture[name] for name in RASTER_CHANNELS})
@@ -49,17 +47,17 @@ class Worker:
                 repaired += bad
         seconds = time.perf_counter() - started
         header: PassesHeader = {
-            "fingerprint": task.fingerprint,
+            "fingerprint": wanted.fingerprint,
             "view": view.name,
-            "raster_engine": self.common.raster_engine if task.raster else None,
-            "raster_samples": self.common.raster_samples if task.raster else 0,
+            "raster_engine": self.common.raster_engine if wanted.raster else None,
+            "raster_samples": self.common.raster_samples if wanted.raster else 0,
             "repaired": repaired,
             "seconds": seconds,
             "gbuffer_seconds": gbuffer_seconds,
             "coverage_seconds": geometry_seconds - gbuffer_seconds,
-            "raster_seconds": seconds - geometry_seconds if task.raster else 0.0,
+            "raster_seconds": seconds - geometry_seconds if wanted.raster else 0.0,
         }
-        write_exr(task.output, channels, dict(header))
+        write_exr(wanted.output, channels, dict(header))
         return {
             **header,
             "seconds": time.perf_counter() - started,

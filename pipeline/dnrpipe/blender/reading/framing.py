@@ -10,6 +10,8 @@ import bpy
 import mathutils
 import numpy as np
 
+from ..geometry.instances import invertible
+
 CAMERA = "dnrpipe.framing"
 LENS, SENSOR = 50.0, 36.0  # mm: Blender's default camera
 AZIMUTH, ELEVATION = math.radians(-60), math.radians(25)
@@ -45,13 +47,8 @@ def ensure_camera(scene: bpy.types.Scene, center: np.ndarray, points: Iterable[n
 
 def framing_pose(center: np.ndarray, distance: float) -> np.ndarray:
     """Camera-to-world (looks along -Z, Y up), float64 [4, 4], ``distance`` from ``center``, 25 degrees above."""
-    back = np.array(
-        [
-            math.cos(ELEVATION) * math.cos(AZIMUTH),
-            math.cos(ELEVATION) * math.sin(AZIMUTH),
-            math.sin(ELEVATION),
-        ]
-    )
+    flat = math.cos(ELEVATION)
+    back = np.array([flat * math.cos(AZIMUTH), flat * math.sin(AZIMUTH), math.sin(ELEVATION)])
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)
     pose = np.eye(4)
@@ -64,11 +61,7 @@ def usable(obj: Any) -> bool:
     """Whether an object is a camera with a finite, invertible matrix."""
     if obj is None or obj.type != "CAMERA" or obj.data is None:
         return False
-    matrix = np.array(obj.matrix_world, np.float64)
-    if not np.isfinite(matrix).all():
-        return False
-    lengths = np.linalg.norm(matrix[:3, :3], axis=0)
-    return bool(lengths.min() > 0 and abs(np.linalg.det(matrix[:3, :3] / lengths)) > 1e-6)
+    return invertible(np.array(obj.matrix_world, np.float64), least=1e-6)
 
 
 def _framing_distance(scene: bpy.types.Scene, center: np.ndarray, points: Iterable[np.ndarray]) -> tuple[float, float]:

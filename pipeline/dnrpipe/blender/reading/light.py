@@ -17,6 +17,7 @@ from .names import find_material
 STUDIO = "dnrpipe.studio"
 STUDIO_SIZE = (128, 64)
 DEFAULT_WORLD = 0.0509  # linear grey of the world in Blender's startup file
+EMITTING = {"EMISSION": ("Color", "Strength"), "BSDF_PRINCIPLED": ("Emission Color", "Emission Strength")}
 DARK = "no lamp, no world that shines, no emissive surface"
 
 
@@ -37,7 +38,8 @@ def has_light(scene: bpy.types.Scene, meshes: Sequence[FrozenMesh]) -> bool:
     puts into every new scene (a grey of 0.05).
     """
     world = _world(scene.world) and not _is_default_world(scene.world)
-    return world or any(_shines(obj.data) for obj, _ in visible_lights(scene)) or _surfaces(meshes)
+    lamps = [obj.data for obj, _ in visible_lights(scene)]
+    return world or any(lamp.energy > 0 and max(lamp.color) > 0 for lamp in lamps) or _surfaces(meshes)
 
 
 def studio_world() -> bpy.types.World:
@@ -89,18 +91,14 @@ def _lobe(direction: np.ndarray, azimuth: float, elevation: float, width: float)
     return np.exp(-0.5 * (angle / math.radians(width)) ** 2)
 
 
-def _shines(light: Any) -> bool:
-    return light.energy > 0 and max(light.color) > 0
-
-
 def _world(world: bpy.types.World | None) -> bool:
     if world is None:
         return False
     if world.node_tree is None:
         return max(world.color) > 0
-    if surface_source(world.node_tree) is None:
-        return False
-    return any(_emits(node, "Color", "Strength") for node in walk(world.node_tree) if node.type == "BACKGROUND")
+    return surface_source(world.node_tree) is not None and any(
+        _emits(node, "Color", "Strength") for node in walk(world.node_tree) if node.type == "BACKGROUND"
+    )
 
 
 def _is_default_world(world: Any) -> bool:
@@ -121,22 +119,10 @@ def _is_default_world(world: Any) -> bool:
 
 def _surfaces(meshes: Sequence[FrozenMesh]) -> bool:
     names = {mesh.materials[i] for mesh in meshes for i in set(mesh.material_index.tolist())}
-    found = [find_material(name) for name in names if name is not None]
-    trees = [material.node_tree for material in found if material is not None]
-    return any(_tree_emits(tree) for tree in trees if tree is not None)
-
-
-def _tree_emits(tree: bpy.types.NodeTree) -> bool:
-    if surface_source(tree) is None:
-        return False
-    for node in walk(tree):
-        if node.mute:
-            continue
-        if node.type == "EMISSION" and _emits(node, "Color", "Strength"):
-            return True
-        if node.type == "BSDF_PRINCIPLED" and _emits(node, "Emission Color", "Emission Strength"):
-            return True
-    return False
+    materials = [find_material(name) for name in names if name is not None]
+    trees = [material.node_tree for material in materials if material and surface_source(material.node_tree)]
+    nodes = [node for tree in trees for node in walk(tree) if not node.mute and node.type in EMITTING]
+    return any(_emits(node, *EMITTING[node.type]) for node in nodes)
 
 
 def _emits(node: bpy.types.Node, colour: str, strength: str) -> bool:

@@ -10,7 +10,7 @@ from typing import Any
 
 import bpy
 
-from ..findings import Findings, printable
+from ..findings import Findings, first_of, printable
 from .names import data_collections
 
 SHAPELESS_IMAGES = {"GENERATED", "VIEWER"}  # sources without a file
@@ -36,11 +36,8 @@ class Reference:
 
     @property
     def present(self) -> bool:
-        """Whether the file is there. Names that the file system cannot hold are not."""
-        try:
-            return self.path.is_file() or (self.kind == "cache" and self.path.exists())
-        except (OSError, ValueError):
-            return False
+        """Whether the file is there; a cache may be a folder."""
+        return is_file(self.path, or_folder=self.kind == "cache")
 
 
 def references() -> list[Reference]:
@@ -59,9 +56,9 @@ def missing_warnings(missing: list[Reference]) -> list[str]:
     for kind, stand_in in STAND_INS.items():
         gone = [f"'{printable(r.name)}' ({printable(str(r.path))})" for r in missing if r.kind == kind]
         if gone:
-            more = f" and {len(gone) - SHOWN} more (all in census.json)" if len(gone) > SHOWN else ""
             what = f"{kind} {gone[0]} is" if len(gone) == 1 else f"{len(gone)} files of kind {kind} are"
-            names = "" if len(gone) == 1 else f": {', '.join(gone[:SHOWN])}{more}"
+            names = "" if len(gone) == 1 else f": {first_of(gone, SHOWN)}"
+            names += " (all in census.json)" if len(gone) > SHOWN else ""
             lines.append(f"{what} missing ({stand_in}){names}")
     return lines
 
@@ -114,7 +111,7 @@ def _images() -> Iterator[Reference]:
 
 def image_files(image: Any) -> list[Path]:
     """The files of an image: one, or one per UDIM tile. Of a movie or sequence, the one it names."""
-    path = _absolute(image.filepath, image.library)
+    path = bpy.path.abspath(image.filepath, library=image.library)
     if image.source != "TILED":
         return [Path(path)]
     numbers = [tile.number for tile in image.tiles] or [1001]
@@ -128,17 +125,18 @@ def image_files(image: Any) -> list[Path]:
 def _others() -> Iterator[Reference]:
     for library in bpy.data.libraries:
         if not library.packed_file:
-            yield Reference("linked library", library.name, Path(_absolute(library.filepath, None)))
-    for font in bpy.data.fonts:
-        if font.filepath not in ("", "<builtin>") and not font.packed_file and font.users:
-            yield Reference("font", font.name_full, Path(_absolute(font.filepath, font.library)))
-    for volume in bpy.data.volumes:
-        if volume.filepath and not volume.packed_file:
-            yield Reference("volume", volume.name_full, Path(_absolute(volume.filepath, volume.library)))
-    for cache in bpy.data.cache_files:
-        if cache.filepath:
-            yield Reference("cache", cache.name_full, Path(_absolute(cache.filepath, cache.library)))
+            yield Reference("linked library", library.name, Path(bpy.path.abspath(library.filepath)))
+    used_fonts = [font for font in bpy.data.fonts if font.users]
+    for kind, blocks in (("font", used_fonts), ("volume", bpy.data.volumes), ("cache", bpy.data.cache_files)):
+        for block in blocks:
+            if block.filepath not in ("", "<builtin>") and not getattr(block, "packed_file", None):
+                path = Path(bpy.path.abspath(block.filepath, library=block.library))
+                yield Reference(kind, block.name_full, path)
 
 
-def _absolute(path: str, library: Any) -> str:
-    return bpy.path.abspath(path, library=library)
+def is_file(path: Path, or_folder: bool = False) -> bool:
+    """Whether the file is there. Names that the file system cannot hold are not."""
+    try:
+        return path.is_file() or (or_folder and path.exists())
+    except (OSError, ValueError):
+        return False

@@ -44,11 +44,7 @@ def _named() -> Iterator[Any]:
 
 def data_collections() -> list[Any]:
     """All collections of data-blocks of the open file (``bpy.data.objects`` and so on)."""
-    found = []
-    for prop in bpy.data.bl_rna.properties:
-        if prop.type == "COLLECTION":
-            found.append(getattr(bpy.data, prop.identifier))
-    return found
+    return [getattr(bpy.data, prop.identifier) for prop in bpy.data.bl_rna.properties if prop.type == "COLLECTION"]
 
 
 def node_trees() -> Iterator[tuple[Any, Any]]:

@@ -60,7 +60,7 @@ def open_scene(path: str | Path, *, strict: bool = False) -> list[str]:
     if suffix in IMPORTERS:
         _import(path, suffix)
         warnings = []
-    elif BLEND_SUFFIX.fullmatch(suffix) or _looks_like_blend(path):
+    elif BLEND_SUFFIX.fullmatch(suffix) or _head(path) == BLEND_MAGIC[0]:  # an uncompressed .blend of any suffix
         warnings = open_blend(path)
     else:
         known = ", ".join([".blend", *IMPORTERS])
@@ -76,29 +76,25 @@ def open_scene(path: str | Path, *, strict: bool = False) -> list[str]:
 
 def open_blend(path: Path) -> list[str]:
     """Open a .blend file of any Blender; warnings on versions. Raises UserError when it is not one, or damaged."""
-    with path.open("rb") as file:
-        head = file.read(7)
+    head = _head(path)
     if not head:
         raise UserError(f"{path}: is empty (0 bytes)")
     if not head.startswith(BLEND_MAGIC):
-        raise UserError(f"{path}: is not a Blender file (starts with {head[:7]!r}); save it from Blender again")
+        raise UserError(f"{path}: is not a Blender file (starts with {head!r}); save it from Blender again")
     try:
         bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False, use_scripts=False)
     except RuntimeError as error:
         reason = " ".join(str(error).removeprefix("Error: ").split())
         if "Big Endian" in reason:
-            raise UserError(
-                f"{path}: saved on a big-endian machine, which Blender {_version(bpy.app.version)} no longer reads;"
-                " save it from Blender 4.5 or older"
-            ) from None
+            unread = f"which Blender {_version(bpy.app.version)} no longer reads; save it from Blender 4.5 or older"
+            raise UserError(f"{path}: saved on a big-endian machine, {unread}") from None
         raise UserError(f"{path}: damaged or truncated .blend; save it from Blender again ({reason})") from None
     return _version_warnings()
 
 
-def _looks_like_blend(path: Path) -> bool:
-    """Whether a file of another suffix is an uncompressed .blend."""
+def _head(path: Path) -> bytes:
     with path.open("rb") as file:
-        return file.read(7) == BLEND_MAGIC[0]
+        return file.read(7)
 
 
 def _version(numbers: tuple[int, ...]) -> str:
@@ -106,26 +102,20 @@ def _version(numbers: tuple[int, ...]) -> str:
 
 
 def _version_warnings() -> list[str]:
-    saved, here = tuple(bpy.data.version), bpy.app.version
-    if saved[:2] > here[:2]:
-        return [
-            f"saved by Blender {_version(saved)}, read by {_version(here)}: some data may be lost; compare the picture"
-        ]
+    saved, here = tuple(bpy.data.version), _version(bpy.app.version)
+    by = f"saved by Blender {_version(saved)}"
+    if saved[:2] > bpy.app.version[:2]:
+        return [f"{by}, read by {here}: some data may be lost; compare the picture"]
     warnings = []
     if saved < (2, 50):
-        warnings.append(f"saved by Blender {_version(saved)}: Blender {_version(here)} reads no animation of it")
+        warnings.append(f"{by}: Blender {here} reads no animation of it")
     if saved < (2, 80):
-        plain = [m for m in bpy.data.materials if m.users and m.node_tree and _unnoded(m.node_tree)]
+        trees = [m.node_tree for m in bpy.data.materials if m.users and m.node_tree]
+        plain = sum(any(node.type == "FRAME" and node.label == UNNODED for node in tree.nodes) for tree in trees)
         if plain:
-            warnings.append(
-                f"saved by Blender {_version(saved)}: of {len(plain)} material(s) of Blender Internal only the colour"
-                " remains, as in Blender itself"
-            )
+            only = "only the colour remains, as in Blender itself"
+            warnings.append(f"{by}: of {plain} material(s) of Blender Internal {only}")
     return warnings
-
-
-def _unnoded(tree: bpy.types.NodeTree) -> bool:
-    return any(node.type == "FRAME" and node.label == UNNODED for node in tree.nodes)
 
 
 def _import(path: Path, suffix: str) -> None:
@@ -148,9 +138,11 @@ def _choose_scene(path: Path) -> list[str]:
     active = bpy.context.scene
     filled = [scene for scene in scenes if _may_show(scene)]
     if not filled:
+        where = f"scene '{scenes[0].name}' has" if len(scenes) == 1 else f"none of its {len(scenes)} scenes has"
+        count = sum(obj.type == "MESH" and not obj.users_scene for obj in bpy.data.objects)
+        loose = f" ({count} mesh objects lie in no scene)" if count else ""  # a file of assets
         raise NothingVisible(
-            f"{path}: {_scene_list(scenes)} no object with a surface{_loose_objects()};"
-            " open a file with at least one visible object"
+            f"{path}: {where} no object with a surface{loose}; open a file with at least one visible object"
         )
     if active not in filled:
         bpy.context.window.scene = filled[0]
@@ -159,16 +151,6 @@ def _choose_scene(path: Path) -> list[str]:
         names = ", ".join(f"'{scene.name}'" for scene in scenes[:5])
         return [f"the file has {len(scenes)} scenes ({names}): the active one, '{active.name}', is converted"]
     return []
-
-
-def _scene_list(scenes: list[bpy.types.Scene]) -> str:
-    return f"scene '{scenes[0].name}' has" if len(scenes) == 1 else f"none of its {len(scenes)} scenes has"
-
-
-def _loose_objects() -> str:
-    """A hint for files of assets: objects that lie in no scene."""
-    count = sum(obj.type == "MESH" and not obj.users_scene for obj in bpy.data.objects)
-    return f" ({count} mesh objects lie in no scene)" if count else ""
 
 
 def _may_show(scene: bpy.types.Scene) -> bool:

@@ -10,7 +10,7 @@ import bpy
 from dnrtrain.atomic import atomic_path
 
 from ..findings import printable
-from .missing import SHAPELESS_IMAGES, image_files
+from .missing import SHAPELESS_IMAGES, image_files, is_file
 
 
 def pack_everything() -> list[str]:
@@ -24,34 +24,36 @@ def pack_everything() -> list[str]:
         if image.packed_file or image.packed_files or (generated and not image.is_dirty):
             continue
         label = printable(image.name_full)
-        if not generated and not any(_is_file(path) for path in image_files(image)):
+        if not generated and not any(map(is_file, image_files(image))):
             continue
         if image.source in ("MOVIE", "SEQUENCE"):
             warnings.append(f"image '{label}' is a {image.source.lower()} and stays outside the workspace")
             continue
         if image.source == "TILED":
             _drop_missing_tiles(image)
-        try:
-            image.pack()
-        except RuntimeError as error:
-            warnings.append(f"image '{label}' could not be packed: {' '.join(str(error).split())}")
+        warnings += _pack(image, f"image '{label}'")
     for block, kind in [(f, "font") for f in bpy.data.fonts] + [(v, "volume") for v in bpy.data.volumes]:
         path = block.filepath
         if path in ("", "<builtin>") or block.packed_file:
             continue
-        if not _is_file(Path(bpy.path.abspath(path, library=block.library))):
+        if not is_file(Path(bpy.path.abspath(path, library=block.library))):
             continue
-        try:
-            block.pack()
-        except RuntimeError as error:
-            warnings.append(f"{kind} '{block.name_full}' could not be packed: {' '.join(str(error).split())}")
+        warnings += _pack(block, f"{kind} '{block.name_full}'")
     return warnings + _pack_libraries()
+
+
+def _pack(block: Any, label: str) -> list[str]:
+    try:
+        block.pack()
+    except RuntimeError as error:
+        return [f"{label} could not be packed: {' '.join(str(error).split())}"]
+    return []
 
 
 def _drop_missing_tiles(image: Any) -> None:
     """Blender packs all tiles or none; a tile that is not there and one that is gone both render magenta."""
     for path, tile in list(zip(image_files(image), list(image.tiles), strict=False)):
-        if not _is_file(path) and len(image.tiles) > 1:
+        if not is_file(path) and len(image.tiles) > 1:
             image.tiles.remove(tile)
 
 
@@ -78,10 +80,3 @@ def save_blend(path: Path) -> None:
     """Save the open file compressed, atomically, without changing which file is open."""
     with atomic_path(path) as temporary:
         bpy.ops.wm.save_as_mainfile(filepath=str(temporary), compress=True, copy=True, relative_remap=True)
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False

@@ -7,6 +7,7 @@ from typing import Any
 
 import bpy
 
+from ..findings import first_of
 from .names import node_trees
 
 SHOWN = 4
@@ -41,19 +42,15 @@ def repair_shaders() -> list[str]:
         if not all(_usable(value) for value in light.color):
             light.color = (0, 0, 0)
             numbers.append(f"{light.name_full}: color")
-    return [
-        *_line("shader link(s) run in a circle and are cut", cut),
-        *_line("number(s) are not finite (NaN, infinite) and are replaced", numbers),
-    ]
+    found = {
+        "shader link(s) run in a circle and are cut": cut,
+        "number(s) are not finite (NaN, infinite) and are replaced": numbers,
+    }
+    return [f"{len(where)} {what}: {first_of(where, SHOWN, '; ')}" for what, where in found.items() if where]
 
 
 def _usable(number: float) -> bool:
     return abs(number) < LARGEST  # False for NaN
-
-
-def _line(what: str, where: list[str]) -> list[str]:
-    more = f" and {len(where) - SHOWN} more" if len(where) > SHOWN else ""
-    return [f"{len(where)} {what}: {'; '.join(where[:SHOWN])}{more}"] if where else []
 
 
 def _closing_links(tree: bpy.types.NodeTree) -> Iterator[Any]:
@@ -89,10 +86,7 @@ def _bad_sockets(tree: bpy.types.NodeTree) -> Iterator[tuple[Any, Any]]:
             if socket.type not in {"VALUE", "RGBA", "VECTOR"}:
                 continue
             value = socket.default_value
-            if isinstance(value, float):
-                if not _usable(value):
-                    yield node, socket
-            elif not all(_usable(number) for number in value):
+            if not all(_usable(number) for number in ([value] if isinstance(value, float) else value)):
                 yield node, socket
 
 

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
-
 import bpy
 
-from ..findings import Findings
+from ..findings import Findings, first_of
 from .names import data_collections, node_trees
 
 SHOWN = 4
@@ -18,8 +15,7 @@ def script_warnings() -> list[str]:
     lines = []
     drivers = [f"{owner}.{path}" for owner, path in refused_drivers()]
     if drivers:
-        more = f" and {len(drivers) - SHOWN} more" if len(drivers) > SHOWN else ""
-        names = ", ".join(drivers[:SHOWN]) + more
+        names = first_of(drivers, SHOWN)
         lines.append(f"{len(drivers)} Python driver(s) not executed, their values stay as saved: {names}")
     scripts = [text.name for text in bpy.data.texts if text.use_module]
     if scripts:
@@ -40,20 +36,13 @@ def refused_drivers() -> list[tuple[str, str]]:
     refused is marked invalid once it was evaluated.
     """
     found = []
-    for owner, block in _animated():
-        for curve in block.animation_data.drivers:
+    blocks = [(block, block) for collection in data_collections() for block in collection]
+    # Trees inside materials, worlds and lights are no data-blocks of their own.
+    blocks += [(owner, tree) for owner, tree in node_trees() if owner != tree]
+    for owner, block in blocks:
+        animation = getattr(block, "animation_data", None)
+        for curve in [] if animation is None else animation.drivers:
             driver = curve.driver
             if driver.type == "SCRIPTED" and not driver.is_simple_expression and not driver.is_valid:
                 found.append((owner.name_full, curve.data_path))
     return sorted(found)
-
-
-def _animated() -> Iterator[tuple[Any, Any]]:
-    """(owner, data-block with animation data): trees inside materials, worlds and lights are no data of their own."""
-    for collection in data_collections():
-        for block in collection:
-            if getattr(block, "animation_data", None) is not None:
-                yield block, block
-    for owner, tree in node_trees():
-        if owner != tree and tree.animation_data is not None:
-            yield owner, tree

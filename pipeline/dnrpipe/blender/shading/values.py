@@ -15,8 +15,9 @@ import bpy
 import numpy as np
 
 from ..baking.cache import BakeCache
+from ..baking.trees import ACTIVE_COLOUR
 from ..findings import Findings
-from ..geometry.corner_colours import ACTIVE_COLOUR, colour_corners, is_uv_layer
+from ..geometry.corner_colours import colour_corners, is_uv_layer
 from ..tasks import ValueKind
 from .color_nodes import OPERATIONS
 from .filtering import finer
