@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from ..cells.markdown import NONE, made_line, spread, table
+from ..cells.provenance import read_made
 from ..cells.scenes import HARD_LIGHT
-from .ablation_results import known_rows, read_results
 from .rows import ROWS
 
+SCHEMA = 1
 # Wu, Li, Wei: DNRSelect, table I (25 views, NeRF-Synthetic, 800²): PSNR, SSIM, LPIPS.
 PUBLISHED = {
     "full": (28.12, 0.8506, 0.0479),
@@ -39,11 +40,17 @@ PER_SCENE = (("psnr", "PSNR, dB", 2), ("psnr_mask", "PSNR inside the mask, dB", 
 BASELINES = ("vanilla", "paper")
 
 
+def read_results(path: Path) -> dict[str, Any]:
+    """``results.json`` of an ablation. Raises UserError: missing, damaged or of another schema."""
+    return read_made(path, "ablate", SCHEMA, "cells")
+
+
 class Figures:
     """Cells by (scene, row, seed), and their means."""
 
     def __init__(self, results: Mapping[str, Any]) -> None:
-        self.rows = known_rows(results)
+        present = {cell["row"] for cell in results["cells"]}
+        self.rows = [name for name in ROWS if name in present]
         self.cells = {(cell["scene"], cell["row"], cell["seed"]): cell for cell in results["cells"]}
         self.scenes = [name for name in results["scenes"] if any(key[0] == name for key in self.cells)]
         self.seeds = sorted({key[2] for key in self.cells})

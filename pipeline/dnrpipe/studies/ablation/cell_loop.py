@@ -27,6 +27,7 @@ from ...stages.stage import Run
 from ...stages.trainer import perceptual_weights
 from ..cells.cell import CELL_VERSION, STEP1_SHARE
 from ..cells.provenance import code_state
+from ..cells.request import StudyRequest
 from ..cells.scenes import (
     Scene,
     make_bases,
@@ -41,18 +42,12 @@ from ..cells.worker_pool import WorkerPool, make_pool
 from .rows import Row, needs_base, needs_coarse, settings_of, step1_policy
 
 
-@dataclass(frozen=True)
-class Request:
-    """What to run. ``base``: the preset's settings; ``overrides``: the user's, which hold for all rows."""
+@dataclass(frozen=True, kw_only=True)
+class Request(StudyRequest):
+    """``base``: the preset's settings; ``overrides``: the user's, which hold for all rows."""
 
-    scenes: list[Path]
     rows: list[Row]
-    seeds: int
-    base: Settings
     overrides: dict[str, Any]
-    seconds: float | None
-    out: Path
-    jobs: int = 0
 
 
 @dataclass(frozen=True)

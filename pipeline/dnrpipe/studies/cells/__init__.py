@@ -1,6 +1,7 @@
 """What studies share: train and measure one (scene, variant, seed).
 
 cell          the worker: one cell
+request       what a command line asks for
 worker_pool   how many workers, on how many threads
 tasks         what workers are asked, and what their files hold
 scenes        a study's workspaces: passes, ray-traced views, references, base images

@@ -12,6 +12,8 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict
 
+from dnrtrain.atomic import write_json
+
 from ...core.settings import Settings
 
 
@@ -29,6 +31,36 @@ class StudyTask(PoolTask):
 
     fingerprint: str
     workspace: Path
+
+
+class FileWorker:
+    """A worker that writes each answer to its task's ``output``. common["threads"]: of torch, 0 = its own choice."""
+
+    def __init__(self, common: dict[str, Any]) -> None:
+        import torch
+
+        if common["threads"]:
+            torch.set_num_threads(common["threads"])
+        self.threads = torch.get_num_threads()
+
+    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
+        made = self.answer(task).model_dump(mode="json", by_alias=True, exclude_unset=True)
+        write_json(Path(task["output"]), made)
+        return made
+
+    def answer(self, task: dict[str, Any]) -> BaseModel:
+        """What the file will hold; fields that were not given are left out."""
+        raise NotImplementedError
+
+
+def weights_or_none() -> Any:
+    """Weights of the perceptual metrics, None where there are none, which the parent process has said."""
+    from dnrtrain.weights import WeightsMissing, load_weights
+
+    try:
+        return load_weights()
+    except WeightsMissing:
+        return None
 
 
 Fingerprinted = TypeVar("Fingerprinted", bound=StudyTask)

@@ -19,7 +19,6 @@ from ...core.workspace import digest
 from ...stages.stage import Run
 from ...workers.view_tasks import worker_count
 from ..cells.provenance import made_by
-from ..cells.worker_pool import check_amounts
 from .frontier_plots import plot
 from .frontier_report import markdown
 from .point_costs import break_evens, pareto, point_of, settle_frames
@@ -86,7 +85,6 @@ def run_frontier(
         UserError: unknown names, numbers that do not fit. TasksFailed: some cells failed; the others are written.
     """
     workspace, settings = run.workspace, run.settings
-    check_amounts(None, seeds, jobs)
     candidates = len(split_views(workspace)["train"])
     counts = numbers(frames, "--frames", (200, 2000))
     others = _others(also)

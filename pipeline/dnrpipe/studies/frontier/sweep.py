@@ -93,5 +93,14 @@ def make_frontier(run: Run, rows: Sequence[Row], out: Path, jobs: int, seeds: in
     base = run.settings.model_copy(deep=True)
     base.select.budget = largest
     source = Path(f"{run.workspace.root.name.removesuffix('.dnr')}.blend")
-    request = Request([source], list(rows), seeds, base, {}, None, out, jobs)
+    request = Request(
+        scenes=[source],
+        rows=list(rows),
+        seeds=seeds,
+        base=base,
+        overrides={},
+        seconds=None,
+        out=out,
+        jobs=jobs,
+    )
     return Frontier(request, run.console, workspace=run.workspace)

@@ -20,6 +20,7 @@ from dnrtrain.contract import View
 from ...core.scene_files import read_frame
 from ...core.settings import Settings
 from ...core.workspace import Workspace
+from ..cells.tasks import weights_or_none
 from .records import Record
 
 if TYPE_CHECKING:
@@ -97,12 +98,7 @@ class Worker:
         return self._frames(FramesTask.model_validate(task))
 
     def _train(self, task: TrainTask) -> dict[str, Any]:
-        from dnrtrain.weights import WeightsMissing, load_weights
-
-        try:
-            weights: Any = load_weights()
-        except WeightsMissing:  # training will do without, too
-            weights = None
+        weights = weights_or_none()  # training will do without, too
         found = [
             self._train_one(task, weights, folder, epochs)
             for folder, epochs in zip(task.folders, task.epochs, strict=True)

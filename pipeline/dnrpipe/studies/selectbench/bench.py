@@ -28,6 +28,7 @@ from ...stages.trainer import perceptual_weights
 from ..cells.cell import CELL_VERSION
 from ..cells.measure import written_seconds
 from ..cells.provenance import code_state
+from ..cells.request import StudyRequest
 from ..cells.scenes import base_file, make_bases, trace_references, trace_train
 from ..cells.tasks import CellTask, Step1Result, Step1Task, StudyTask, once
 from ..cells.worker_pool import WorkerPool
@@ -41,19 +42,13 @@ SHARED_COARSE = "farthest"
 """Step 1 without a selector trains the same for every policy, so that all share one coarse model."""
 
 
-@dataclass(frozen=True)
-class Request:
-    """What to run. ``base``: settings of all cells; its budget is the largest of ``budgets``."""
+@dataclass(frozen=True, kw_only=True)
+class Request(StudyRequest):
+    """The budget of ``base`` is the largest of ``budgets``."""
 
-    scenes: list[Path]
     pools: list[str]
     budgets: list[int]
     policies: list[Contender]
-    seeds: int
-    base: Settings
-    seconds: float | None
-    out: Path
-    jobs: int = 0
 
 
 @dataclass(frozen=True)
