@@ -37,7 +37,7 @@ from ..cells.scenes import (
     trace_train,
     traced_split,
 )
-from ..cells.tasks import CellTask, Step1Result, Step1Task, once
+from ..cells.tasks import CellTask, Step1Result, Step1Task, files_of, once
 from ..cells.worker_pool import WorkerPool, make_pool
 from .rows import Row, needs_base, needs_coarse, settings_of, step1_policy
 
@@ -123,17 +123,14 @@ class Ablation:
                 *(policy, budget, seed, limit, self.device, self.threads),
             ]
         )
-        folder = self.request.out / "step1" / scene.name / fingerprint
         return Step1Task(
-            fingerprint=fingerprint,
+            **files_of(self.request.out / "step1" / scene.name, fingerprint),
             workspace=scene.workspace.root,
             settings=settings,
             policy=policy,
             seed=seed,
             seconds=limit,
             pace=self._pace_file(scene, "step1", model, step1, policy, budget),
-            folder=folder,
-            output=folder.with_name(f"{fingerprint}.json"),
             label=f"{scene.name} step 1",
         )
 
@@ -199,7 +196,7 @@ class Ablation:
         )
         folder = self.request.out / "cells" / scene.name
         return CellTask(
-            fingerprint=fingerprint,
+            **files_of(folder, fingerprint),
             scene=scene.name,
             seed=seed,
             workspace=scene.workspace.root,
@@ -212,8 +209,6 @@ class Ablation:
             seconds=seconds if row.network else None,
             full_step1=row.full_step1,
             pace=self._pace_file(scene, "step2", settings.model, settings.finetune.step2, str(len(views))),
-            folder=folder / fingerprint,
-            output=folder / f"{fingerprint}.json",
             picture=folder / f"{fingerprint}.png" if seed == 0 else None,
             code=code_state(),
             label=f"{scene.name} {row.name}",

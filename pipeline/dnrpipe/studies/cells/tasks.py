@@ -74,6 +74,12 @@ def once(tasks: Iterable[Fingerprinted]) -> list[Fingerprinted]:
     return list(found.values())
 
 
+def files_of(folder: Path, fingerprint: str) -> dict[str, Any]:
+    """A task's fingerprint, the folder of its trainings and its output beside that."""
+    made = {"folder": folder / fingerprint, "output": folder / f"{fingerprint}.json"}
+    return {"fingerprint": fingerprint, **made}
+
+
 class Step1Task(StudyTask):
     """Train step 1 into ``folder`` -> `Step1Result`.
 

@@ -72,13 +72,10 @@ class Piloting:
         for task, result in answers:
             if Path(task["output"]).name.startswith("warm"):
                 continue
-            pixels = task["view"]["width"] * task["view"]["height"]
             points.append(
                 Traced(
-                    spp=result["spp"],
-                    pixels=pixels,
-                    seconds=result["seconds"],
-                    cpu_seconds=result["cpu_seconds"],
+                    pixels=task["view"]["width"] * task["view"]["height"],
+                    **{name: result[name] for name in ("spp", "seconds", "cpu_seconds")},
                     noise_rmse=result.get("noise_rmse"),
                     raw_rmse=_raw_rmse(result),
                 )
@@ -135,13 +132,13 @@ class Piloting:
 
     def training(self) -> TrainingPart:
         """Short step 2s."""
-        view = self.train[0]
+        view, per_epoch = self.train[0], math.ceil(len(self.train) / self.settings.finetune.step2.batch)
         task = TrainTask(
             views=self.train,
             base_files=[self._base_file("train", view) for view in self.train],
             images=[self._image(f"train-{view.name}") for view in self.train],
             folders=self._models(),
-            epochs=[max(2, round(steps / self._steps_per_epoch())) for steps in STEPS],
+            epochs=[max(2, round(steps / per_epoch)) for steps in STEPS],
             fingerprint=self.run.id,
         )
         result = self._ask("pilot: training", task, {})
@@ -222,9 +219,6 @@ class Piloting:
             fingerprint=self.run.id,
         )
         return task.model_dump(mode="json")
-
-    def _steps_per_epoch(self) -> int:
-        return math.ceil(len(self.train) / self.settings.finetune.step2.batch)
 
     def _models(self) -> list[Path]:
         return [self.folder / f"model-{steps}" for steps in STEPS]

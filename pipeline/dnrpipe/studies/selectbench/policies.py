@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ...core.settings import Settings, merge
-from ..cells.names import choose_names
+from ..cells.request import choose_names
 
 LEARNED = "rl-paper"
 """The policy that the trainer's step 1 trains."""
