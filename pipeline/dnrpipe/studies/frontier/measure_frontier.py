@@ -140,9 +140,9 @@ def run_frontier(
 
 def _others(text: str) -> tuple[str, ...]:
     """Names of other ways to train, and Cycles."""
-    names = tuple(filter(None, (part.strip() for part in text.split(","))))
     if text.strip() == "none":
         return ()
+    names = tuple(filter(None, (part.strip() for part in text.split(","))))
     if unknown := set(names) - {*OTHERS, CYCLES}:
         raise UserError(f"--also {', '.join(sorted(unknown))}: choose of {', '.join((*OTHERS, CYCLES))}, or none")
     return names

@@ -62,11 +62,8 @@ def run_pilot(run: Run) -> Pilot:
     first = piloting.train[0]
     if found is None or found.fingerprint != fingerprint:
         shutil.rmtree(piloting.folder, ignore_errors=True)
-        found = Pilot(
-            fingerprint=fingerprint,
-            size=(first.width, first.height),
-            load=os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
-        )
+        load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+        found = Pilot(fingerprint=fingerprint, size=(first.width, first.height), load=load)
     bake = found.light is None and not base_renderer(workspace, settings, plan).light_is_baked  # removed, perhaps
     if found.frames is not None and not bake:
         return found
