@@ -65,7 +65,6 @@ def run_ablation(
         jobs=jobs,
     )
     ablation = Ablation(request, console)
-    ablation.check()
     with locked(out, "ablate"):
         try:
             ablation.run()

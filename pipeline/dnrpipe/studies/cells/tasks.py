@@ -97,6 +97,10 @@ class Step1Task(StudyTask):
     pace: Path | None = None
     folder: Path
 
+    def result(self) -> Step1Result:
+        """What it gave, once it is done."""
+        return Step1Result.model_validate_json(self.output.read_bytes())
+
 
 class TrainingCost(BaseModel):
     """Sums over all epochs. steps: optimiser steps; skipped: those without an update."""

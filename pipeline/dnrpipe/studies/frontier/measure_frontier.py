@@ -18,6 +18,7 @@ from ...core.settings import Settings
 from ...core.workspace import digest
 from ...stages.stage import Run
 from ...workers.view_tasks import worker_count
+from ..ablation.cell_loop import Request
 from ..cells.provenance import made_by
 from .frontier_plots import plot
 from .frontier_report import markdown
@@ -31,7 +32,7 @@ from .records import (
     FrontierResults,
     PathTracingTask,
 )
-from .sweep import OTHERS, Frontier, Sweep, make_frontier
+from .sweep import OTHERS, Frontier, Sweep
 
 BASELINE_VERSION, CYCLES_VERSION = 1, 1
 CYCLES = "cycles"
@@ -97,8 +98,19 @@ def run_frontier(
     samples = numbers(ladder, "--ladder", SAMPLE_COUNTS)
     rows = sweep.rows(settings)
     out = workspace.root / "frontier"
-    swept = make_frontier(run, rows, out, jobs, seeds)
-    swept.check()
+    name, base = workspace.root.name.removesuffix(".dnr"), settings.model_copy(deep=True)
+    base.select.budget = max((row.budget or 1 for row in rows), default=1)
+    request = Request(
+        scenes=[Path(f"{name}.blend")],
+        rows=rows,
+        seeds=seeds,
+        base=base,
+        overrides={},
+        seconds=None,
+        out=out,
+        jobs=jobs,
+    )
+    swept = Frontier(request, run.console, workspace=workspace)
     swept.run()
     cores = worker_count(0)
     traced = _trace_baselines(swept, settings, samples, cores)
@@ -120,7 +132,7 @@ def run_frontier(
     results = FrontierResults(
         schema_version=SCHEMA,
         **made_by(),
-        scene=workspace.root.name.removesuffix(".dnr"),
+        scene=name,
         preset=settings.preset,
         resolution=f"{settings.cameras.width}x{settings.cameras.height}",
         sweep=asdict(sweep),

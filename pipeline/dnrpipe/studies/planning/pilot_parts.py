@@ -24,6 +24,7 @@ from ...stages.raytrace import view_seed
 from ...stages.stage import Run
 from ...workers.answers import answers, warn_of_retries
 from ...workers.view_tasks import worker_count
+from ..cells.scenes import choose_by_pose
 from .pilot_worker import FramesTask, PilotCommon, TrainTask
 from .records import FOLDER, BasePart, FramePart, LightPart, LightPoint, Traced, TracePart, TrainingPart
 
@@ -247,14 +248,9 @@ def _views(workspace: Workspace) -> tuple[list[View], list[View]]:
     Others: test views, for their PSNR is what is predicted (by poses alone; nothing is trained on them or chosen among
     them), else validation views, else candidates that were not taken.
     """
-    from dnrtrain.selector.policies import untrained
-    from dnrtrain.selector.protocol import Candidates
-
     splits = split_views(workspace)
     views = splits["train"]
-    rule = untrained("farthest")
-    assert rule is not None
-    chosen = rule.choose(Candidates.of_views(views), min(VIEWS, len(views)), 0).views
+    chosen = choose_by_pose(views, "farthest", min(VIEWS, len(views)), 0)
     others = [view for i, view in enumerate(views) if i not in set(chosen)]
     left = splits.get("test") or splits.get("val") or others or views
     step = max(1, len(left) // HELD_OUT)

@@ -30,7 +30,7 @@ from ..cells.measure import written_seconds
 from ..cells.provenance import code_state
 from ..cells.request import StudyRequest
 from ..cells.scenes import base_file, make_bases, trace_references, trace_train
-from ..cells.tasks import CellTask, Step1Result, Step1Task, StudyTask, files_of, once
+from ..cells.tasks import CellTask, Step1Task, StudyTask, files_of, once
 from ..cells.worker_pool import WorkerPool
 from .active.settings import ActiveSettings, ActiveTask
 from .policies import Contender, rules_fingerprint, settings_of
@@ -235,7 +235,7 @@ class Bench:
             network=True,
             views=views,
             coarse=coarse and coarse.folder,
-            coarse_cost=coarse and Step1Result.model_validate_json(coarse.output.read_bytes()),
+            coarse_cost=coarse and coarse.result(),
             seconds=self.request.seconds,
             # Where step 2 starts from a coarse model, all policies give step 1 the same share of their time.
             full_step1=coarse is not None,
