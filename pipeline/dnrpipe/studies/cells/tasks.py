@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 
 from dnrtrain.atomic import write_json
 
@@ -200,14 +200,20 @@ def read_cell(path: Path) -> CellResult:
     return CellResult.model_validate_json(path.read_bytes())
 
 
-class SelectionResult(BaseModel):
-    """A selection's file, by a rule or by active learning. views: names in order. peak_mb: of the process."""
+class ChoiceFile(BaseModel):
+    """What a rule's selection, an active one and a step 1 have in common. views: in order. key: its fingerprint.
+    peak_mb: of the process."""
 
     key: str
-    views: list[str]
-    gains: list[float]
-    why: list[str]
-    details: dict[str, Any]
+    views: list[str] = Field(validation_alias=AliasChoices("views", "selected"))
     seconds: float
     cpu_seconds: float
     peak_mb: float | None = None
+
+
+class SelectionResult(ChoiceFile):
+    """A selection's file, by a rule or by active learning."""
+
+    gains: list[float]
+    why: list[str]
+    details: dict[str, Any]

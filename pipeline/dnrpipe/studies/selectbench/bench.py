@@ -17,8 +17,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import AliasChoices, BaseModel, Field
-
 from ... import __version__
 from ...core.console import Console
 from ...core.settings import Settings
@@ -30,7 +28,7 @@ from ..cells.measure import written_seconds
 from ..cells.provenance import code_state
 from ..cells.request import StudyRequest
 from ..cells.scenes import base_file, make_bases, trace_references, trace_train
-from ..cells.tasks import CellTask, Step1Task, StudyTask, files_of, once
+from ..cells.tasks import CellTask, ChoiceFile, Step1Task, StudyTask, files_of, once
 from ..cells.worker_pool import WorkerPool
 from .active.settings import ActiveSettings, ActiveTask
 from .policies import Contender, rules_fingerprint, settings_of
@@ -265,16 +263,6 @@ class Bench:
         if kind not in ("none", "raster"):
             files += [base_file(workspace, kind, "train", name) for name in names]
         return sum(self.written_seconds(file, self.clock) for file in files)
-
-
-class ChoiceFile(BaseModel):
-    """What a rule's selection, an active one and a step 1 have in common. views: in order. key: its fingerprint."""
-
-    key: str
-    views: list[str] = Field(validation_alias=AliasChoices("views", "selected"))
-    seconds: float
-    cpu_seconds: float
-    peak_mb: float | None = None
 
 
 def read_choice(path: Path) -> ChoiceFile:
