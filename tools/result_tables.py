@@ -20,13 +20,12 @@ from tools.bench_noise.document import markdown as noise_markdown
 from tools.plan_check import markdown as check_markdown
 from tools.plan_equal import markdown as equal_markdown
 
-from dnrpipe.studies.ablation.ablation_results import read_results
-from dnrpipe.studies.ablation.ablation_tables import markdown
+from dnrpipe.studies.ablation.ablation_tables import markdown, read_results
 from dnrpipe.studies.ablation.rows import GROUPS, ROWS
 from dnrpipe.studies.frontier.frontier_report import markdown as frontier_markdown
 from dnrpipe.studies.frontier.records import read_frontier
-from dnrpipe.studies.selectbench.bench_results import read_results as selection_results
 from dnrpipe.studies.selectbench.bench_tables import markdown as selection_markdown
+from dnrpipe.studies.selectbench.bench_tables import read_results as selection_results
 from dnrpipe.studies.selectbench.bench_tables import together as selections_markdown
 
 KINDS = "rows|results|frames|noise|frontier|plan-check|plan-equal|selections?"

@@ -14,13 +14,12 @@ import click
 
 from .. import __version__
 from . import information, pictures, scene, stages
-from .ablate import ablate
-from .bench_select import bench_select
 from .export import export_gltf, export_nerf, export_onnx, export_web
 from .frontier import frontier
 from .jobs import cancel, jobs, logs, retry, submit
 from .plan import plan
 from .serve import bench_live, serve
+from .studies import ablate, bench_select
 
 
 class _Group(click.Group):

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from .options import CAMERA_OPTIONS, STRICT, camera_overrides, common, open_session, options, strict_override
+from .options import CAMERA_OPTIONS, STRICT, common, open_prepared, options
 
 
 @click.command()
@@ -29,19 +29,7 @@ from .options import CAMERA_OPTIONS, STRICT, camera_overrides, common, open_sess
 @STRICT
 @options(CAMERA_OPTIONS)
 @common
-def frontier(
-    scene: Path | None,
-    budgets: str | None,
-    spp: str | None,
-    iterations: str | None,
-    frames: str | None,
-    also: str,
-    ladder: str | None,
-    seeds: int,
-    jobs: int,
-    strict: bool,
-    **options: Any,
-) -> None:
+def frontier(scene: Path | None, strict: bool, **options: Any) -> None:
     """Sweep views, samples and steps, and draw quality against total seconds, rivals included.
 
     SCENE is a scene file or a workspace. Rivals on the same test views: path tracing at 1 to 64 samples, with and
@@ -58,25 +46,12 @@ def frontier(
     from ..core.errors import UserError
     from ..studies.frontier.measure_frontier import run_frontier
 
-    if options.pop("force"):
+    if options["force"]:
         raise UserError("--force: remove the workspace's folder frontier/ to measure everything anew")
-    options["force"] = False
-    if scene is not None and (scene / "manifest.json").exists():
-        options["workspace"], scene = str(scene), None
-    overrides = {**camera_overrides(options), **strict_override(strict)}
-    with open_session("frontier", options, scene=scene, overrides=overrides) as session:
-        session.stages("prepare")
-        results = run_frontier(
-            session.run,
-            budgets=budgets,
-            spp=spp,
-            iterations=iterations,
-            frames=frames,
-            also=also,
-            ladder=ladder,
-            seeds=seeds,
-            jobs=jobs,
-        )
+    names = ("budgets", "spp", "iterations", "frames", "also", "ladder", "seeds", "jobs")
+    wanted = {name: options.pop(name) for name in names}
+    with open_prepared("frontier", scene, options, strict) as session:
+        results = run_frontier(session.run, **wanted)
         folder = session.workspace.root / "frontier"
         session.console.say(f"{len(results.points)} points: {folder / 'report.md'}, {folder / 'frontier-*.png'}")
         session.console.result(results.data())

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -91,6 +92,17 @@ def open_session(
     from ..stages.session import Session
 
     return Session(command, options, scene, overrides or {}, late)
+
+
+@contextmanager
+def open_prepared(command: str, scene: Path | None, options: dict[str, Any], strict: bool) -> Iterator[Session]:
+    """The session of a command that takes a scene file or a workspace, once stage prepare is done."""
+    if scene is not None and (scene / "manifest.json").exists():
+        options["workspace"], scene = str(scene), None
+    overrides = {**camera_overrides(options), **strict_override(strict)}
+    with open_session(command, options, scene=scene, overrides=overrides) as session:
+        session.stages("prepare")
+        yield session
 
 
 def camera_overrides(options: dict[str, Any]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from ..core.errors import UserError
-from .options import CAMERA_OPTIONS, STRICT, amount, camera_overrides, common, open_session, options, strict_override
+from .options import CAMERA_OPTIONS, STRICT, amount, common, open_prepared, options
 
 
 @click.command()
@@ -56,12 +56,8 @@ def plan(
     from ..workers.view_tasks import worker_count
 
     wanted = Wanted(seconds=amount("--time", duration, parse_seconds), psnr=target_psnr, frames=frames)
-    if scene is not None and (scene / "manifest.json").exists():
-        options["workspace"], scene = str(scene), None
-    overrides = {**camera_overrides(options), **strict_override(strict)}
     force, options["force"] = options["force"], False
-    with open_session("plan", options, scene=scene, overrides=overrides) as session:
-        session.stages("prepare")
+    with open_prepared("plan", scene, options, strict) as session:
         if force:
             pilot_path(session.workspace).unlink(missing_ok=True)
         made = make_plan(session.run, wanted)

@@ -50,9 +50,13 @@ def override_settings(
 
 def show_effects(session: Session, *, measure: bool) -> None:
     """Print the plan; with ``measure``, fill its columns first."""
+    from ..stages.pipeline import STAGES, state
+
     run = session.run
     workspace, settings, console = run.workspace, run.settings, run.console
-    _require_scene(run)
+    if (found := state(STAGES["prepare"], workspace, settings)) in ("missing", "stale"):
+        why = {"missing": "has not run", "stale": "is out of date"}[found]
+        raise UserError(f"effects: prepare {why} for {workspace.root}; run `dnrpipe prepare` first")
     plan = plan_of(workspace, settings)
     for name in settings.effects.disable:
         if plan.on(name):
@@ -68,15 +72,6 @@ def show_effects(session: Session, *, measure: bool) -> None:
     if not console.json_mode:
         console.say(table(plan))
     console.result({"workspace": str(workspace.root), **plan.model_dump(mode="json")})
-
-
-def _require_scene(run: Run) -> None:
-    from ..stages.pipeline import STAGES, state
-
-    found = state(STAGES["prepare"], run.workspace, run.settings)
-    if found in ("missing", "stale"):
-        why = {"missing": "has not run", "stale": "is out of date"}[found]
-        raise UserError(f"effects: prepare {why} for {run.workspace.root}; run `dnrpipe prepare` first")
 
 
 def measure_plan(run: Run, plan: EffectPlan) -> EffectPlan:
@@ -95,18 +90,12 @@ def measure_plan(run: Run, plan: EffectPlan) -> EffectPlan:
         config = trace_config(workspace, other, choice.variant)
         if config == base:
             continue
-        pair = (base, config) if effect.on else (config, base)
+        on, off = (base, config) if effect.on else (config, base)
         views = pilot_views(workspace, settings, plan if plan.on("depth-of-field") else other)
-        task = {
-            "kind": "compare",
-            "with_effect": pair[0],
-            "without_effect": pair[1],
-            "views": views,
-            "spp": MEASURE_SPP,
-        }
+        task = {"kind": "compare", "with_effect": on, "without_effect": off, "views": views, "spp": MEASURE_SPP}
         rows.append((effect.name, task))
-    log = workspace.log("effects")
-    results = run_pilots([task for _, task in rows], choice, run.console, "measuring effects", log)
+    tasks = [task for _, task in rows]
+    results = run_pilots(tasks, choice, run.console, "measuring effects", workspace.log("effects"))
     measured = {}
     for (name, _), result in zip(rows, results, strict=True):
         measured[name] = {key: Measured.model_validate(result[key]) for key in ("cost", "error")}

@@ -9,16 +9,14 @@ from typing import Any
 from dnrtrain.atomic import write_json, write_text
 
 from ...core.console import Console
-from ...core.errors import UserError
-from ...core.settings import merge, parse_assignment, resolve
+from ...core.settings import resolve
 from ...core.workspace import locked
-from ..cells.measure import pictured
+from ..cells.measure import METRICS, mean_of, pictured
+from ..cells.request import merged
 from ..cells.scenes import find_scenes
 from ..cells.tasks import read_cell
-from ..cells.worker_pool import check_amounts
 from .ablation_plots import contact_sheet, plot
-from .ablation_results import gather
-from .ablation_tables import markdown
+from .ablation_tables import SCHEMA, markdown
 from .cell_loop import Ablation, Request
 from .rows import choose_rows
 
@@ -54,60 +52,80 @@ def run_ablation(
     Raises:
         UserError: unknown names, settings that do not fit. TasksFailed: some cells failed; the others are written.
     """
-    overrides: dict[str, Any] = merge({}, SMOKE) if smoke else {}
-    if budget is not None:
-        overrides = merge(overrides, {"select": {"budget": budget}})
-    for text in assignments:
-        overrides = merge(overrides, parse_assignment(text))
-    base = resolve(preset, overrides, environment={})
-    check_amounts(seconds, seeds, jobs)
+    budgeted = {} if budget is None else {"select": {"budget": budget}}
+    overrides = merged([SMOKE if smoke else {}, budgeted], assignments)
     request = Request(
         scenes=find_scenes(scenes or (SMOKE_SCENE if smoke else None)),
         rows=choose_rows(rows or (SMOKE_ROWS if smoke else "core")),
         seeds=seeds,
-        base=base,
+        base=resolve(preset, overrides, environment={}),
         overrides=overrides,
         seconds=seconds,
         out=out,
         jobs=jobs,
     )
-    if out.exists() and not out.is_dir():
-        raise UserError(f"--out {out}: is a file; name a folder")
-    facts = {
-        "preset": base.preset,
-        "resolution": f"{base.cameras.width}x{base.cameras.height}",
-        "budget": base.select.budget,
-        "seconds": seconds,
-        "seeds": seeds,
-        "scenes": [path.stem for path in request.scenes],
-        "spp": {"training": base.raytrace.spp, "test": base.raytrace.evaluation_spp},
-    }
     ablation = Ablation(request, console)
-    ablation.check()
     with locked(out, "ablate"):
         try:
             ablation.run()
         finally:
-            results = _write(ablation, facts)
+            results = _write(ablation)
     return results
 
 
-def _write(ablation: Ablation, facts: dict[str, Any]) -> dict[str, Any]:
-    """Results, tables, plot and pictures of the cells that are there."""
+def _gather(ablation: Ablation) -> dict[str, Any]:
+    """Everything that tables and plots need; cells whose file is missing are left out."""
     request = ablation.request
-    results = gather(ablation.cells, request.rows, {**facts, "device": ablation.device, "threads": ablation.threads})
+    found = []
+    for (scene, row, seed), path in ablation.cells.items():
+        if not path.exists():
+            continue
+        cell = read_cell(path)
+        training = cell.training
+        step1 = training and training.step1
+        found.append(
+            {
+                "scene": scene,
+                "row": row,
+                "seed": seed,
+                "key": cell.key,
+                **{name: mean_of(cell.tests, name) for name in METRICS},
+                "views": len(cell.views),
+                "epochs": training and training.epochs,
+                "steps": training and training.step2.steps,
+                "train_seconds": training and round(training.seconds, 2),
+                "train_cpu_seconds": training and round(training.cpu_seconds, 2),
+                "step1_cpu_seconds": step1 and round(step1.cpu_seconds, 2),
+                "frame_ms": cell.frame_ms and round(cell.frame_ms, 2),
+                "base_ms": cell.base_ms and round(cell.base_ms, 2),
+                "commit": cell.code["commit"],
+            }
+        )
+    return {
+        **request.facts(SCHEMA),
+        "budget": request.base.select.budget,
+        "device": ablation.device,
+        "threads": ablation.threads,
+        "rows": {row.name: row.what for row in request.rows},
+        "cells": found,
+    }
+
+
+def _write(ablation: Ablation) -> dict[str, Any]:
+    """Results, tables, plot and pictures of the cells that are there."""
+    out, results = ablation.request.out, _gather(ablation)
     if not results["cells"]:
         return results
-    write_json(request.out / "results.json", results)
-    write_text(request.out / "tables.md", markdown(results))
-    plot(results, request.out / "plot.png")
-    for scene in facts["scenes"]:
-        folder = request.out / "cells" / scene
+    write_json(out / "results.json", results)
+    write_text(out / "tables.md", markdown(results))
+    plot(results, out / "plot.png")
+    for scene in results["scenes"]:
+        folder = out / "cells" / scene
         pictures = [("reference", folder / "truth.png")]
         for cell in results["cells"]:
             if cell["scene"] == scene and cell["seed"] == 0:
                 psnr = pictured(read_cell(folder / f"{cell['key']}.json").tests)["psnr"]
                 pictures.append((f"{cell['row']} {psnr:.1f} dB", folder / f"{cell['key']}.png"))
         if len(pictures) > 1 and all(path.exists() for _, path in pictures):
-            contact_sheet(pictures, request.out / "pictures" / f"{scene}.png")
+            contact_sheet(pictures, out / "pictures" / f"{scene}.png")
     return results

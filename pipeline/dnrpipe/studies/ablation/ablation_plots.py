@@ -17,13 +17,11 @@ SIDE, GAP, HEAD, COLUMNS = 256, 6, 22, 5
 
 def plot(results: Mapping[str, Any], path: Path) -> None:
     """Write a PNG: per row the mean over scenes with the standard deviation over seeds, and every scene as a dot."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figures = Figures(results)
     rows = figures.rows[::-1]
     figure = Figure(figsize=(11, 1.2 + 0.34 * len(rows)), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(1, len(PANELS), sharey=True)
     for axis, (metric, title) in zip(axes, PANELS, strict=True):
         for place, row in enumerate(rows):

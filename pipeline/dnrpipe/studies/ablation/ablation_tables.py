@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from ..cells.markdown import NONE, made_line, spread, table
+from ..cells.provenance import read_made
 from ..cells.scenes import HARD_LIGHT
-from .ablation_results import known_rows, read_results
 from .rows import ROWS
 
+SCHEMA = 1
 # Wu, Li, Wei: DNRSelect, table I (25 views, NeRF-Synthetic, 800²): PSNR, SSIM, LPIPS.
 PUBLISHED = {
     "full": (28.12, 0.8506, 0.0479),
@@ -39,27 +40,33 @@ PER_SCENE = (("psnr", "PSNR, dB", 2), ("psnr_mask", "PSNR inside the mask, dB", 
 BASELINES = ("vanilla", "paper")
 
 
+def read_results(path: Path) -> dict[str, Any]:
+    """``results.json`` of an ablation. Raises UserError: missing, damaged or of another schema."""
+    return read_made(path, "ablate", SCHEMA, "cells")
+
+
 class Figures:
     """Cells by (scene, row, seed), and their means."""
 
     def __init__(self, results: Mapping[str, Any]) -> None:
-        self.rows = known_rows(results)
+        present = {cell["row"] for cell in results["cells"]}
+        self.rows = [name for name in ROWS if name in present]
         self.cells = {(cell["scene"], cell["row"], cell["seed"]): cell for cell in results["cells"]}
         self.scenes = [name for name in results["scenes"] if any(key[0] == name for key in self.cells)]
         self.seeds = sorted({key[2] for key in self.cells})
 
     def scene(self, row: str, metric: str, scene: str) -> list[float]:
         """Values of a row on one scene, one per seed that is there."""
-        values = [self.cells[scene, row, seed][metric] for seed in self.seeds if (scene, row, seed) in self.cells]
+        values = [self._value(scene, row, seed, metric) for seed in self.seeds]
         return [value for value in values if value is not None]
 
     def mean(self, row: str, metric: str, scenes: Sequence[str]) -> list[float]:
         """Means of a row over ``scenes``, one per seed; seeds that lack a scene are left out."""
         means = []
         for seed in self.seeds:
-            found = [self.cells.get((scene, row, seed), {}).get(metric) for scene in scenes]
-            if found and all(value is not None for value in found):
-                means.append(statistics.fmean(found))  # pyright: ignore[reportArgumentType]
+            found = [self._value(scene, row, seed, metric) for scene in scenes]
+            if found and None not in found:
+                means.append(statistics.fmean(found))
         return means
 
     def same(self, row: str, other: str) -> bool:
@@ -80,29 +87,27 @@ class Figures:
     ) -> list[float]:
         found = []
         for seed in self.seeds:
-            pairs = [
-                (self.cells.get((s, row, seed), {}).get(metric), self.cells.get((s, other, seed), {}).get(metric))
-                for s in scenes
-            ]
-            if pairs and all(a is not None and b is not None for a, b in pairs):
-                found.append(statistics.fmean(compare(a, b) for a, b in pairs))  # pyright: ignore[reportArgumentType]
+            pairs = [[self._value(scene, name, seed, metric) for name in (row, other)] for scene in scenes]
+            if pairs and all(None not in pair for pair in pairs):
+                found.append(statistics.fmean(compare(*pair) for pair in pairs))
         return found
+
+    def _value(self, scene: str, row: str, seed: int, metric: str) -> Any:
+        """None where there is no such cell, or it was not measured."""
+        return self.cells.get((scene, row, seed), {}).get(metric)
 
 
 def markdown(results: Mapping[str, Any]) -> str:
     """All tables that the results can fill."""
     figures = Figures(results)
-    parts = [_provenance(results, figures), _means(figures, figures.scenes, _mean_title(figures.scenes))]
+    title = f"Mean over {len(figures.scenes)} scenes" if len(figures.scenes) > 1 else figures.scenes[0]
+    parts = [_provenance(results, figures), _means(figures, figures.scenes, title)]
     easy = [scene for scene in figures.scenes if scene not in HARD_LIGHT]
     if 1 < len(easy) < len(figures.scenes):
         parts.append(_means(figures, easy, f"Mean over the {len(easy)} scenes without hard light"))
     parts += [_per_scene(figures, *column) for column in PER_SCENE]
     parts += [_gains(figures), _paper(figures), _figure7(figures), _ingredients(figures)]
     return "\n\n".join(part for part in parts if part) + "\n"
-
-
-def _mean_title(scenes: Sequence[str]) -> str:
-    return f"Mean over {len(scenes)} scenes" if len(scenes) > 1 else scenes[0]
 
 
 def _provenance(results: Mapping[str, Any], figures: Figures) -> str:
@@ -162,20 +167,18 @@ def _paper(figures: Figures) -> str:
             continue
         theirs = published[0] - PUBLISHED["full"][0]
         ours = figures.difference(row, other, "psnr", figures.scenes)
-        rows.append(
-            [
-                ROWS[row].what,
-                f"{theirs:+.2f}",
-                spread(ours, 2, signed=True),
-                spread(figures.difference(row, other, "ssim", figures.scenes), 4, signed=True),
-                spread(figures.difference(row, other, "lpips_vgg", figures.scenes), 4, signed=True),
-                _verdict(theirs, ours),
-            ]
-        )
+        rows.append([ROWS[row].what, f"{theirs:+.2f}", *_differences(figures, row, other), _verdict(theirs, ours)])
     if not rows:
         return ""
     head = ["taken away", "ΔPSNR, paper", "ΔPSNR, ours", "ΔSSIM, ours", "ΔLPIPS VGG, ours", "paper's order"]
     return f"### The paper's table: what each mechanism is worth\n\n{table(head, rows)}"
+
+
+def _differences(figures: Figures, row: str, other: str) -> list[str]:
+    return [
+        spread(figures.difference(row, other, metric, figures.scenes), digits, signed=True)
+        for metric, digits in (("psnr", 2), ("ssim", 4), ("lpips_vgg", 4))
+    ]
 
 
 def _verdict(theirs: float, ours: Sequence[float]) -> str:
@@ -213,10 +216,8 @@ def _ingredients(figures: Figures) -> str:
         if figures.same(name, "dnr"):
             rows.append([*line, "is `dnr`", *[""] * 4])
             continue
-        for metric, digits in (("psnr", 2), ("ssim", 4), ("lpips_vgg", 4)):
-            line.append(spread(figures.difference(name, "dnr", metric, figures.scenes), digits, signed=True))
         milliseconds = [spread(figures.mean(name, part, figures.scenes), 1) for part in ("frame_ms", "base_ms")]
-        rows.append([*line, *milliseconds])
+        rows.append([*line, *_differences(figures, name, "dnr"), *milliseconds])
     head = ["row", "what differs from `dnr`", "ΔPSNR", "ΔSSIM", "ΔLPIPS VGG", "network, ms", "base, ms"]
     return f"### Ingredients of `dnr`, one changed at a time\n\n{table(head, rows)}"
 

@@ -10,7 +10,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,8 +26,10 @@ from ...stages.stage import Run
 from ...stages.trainer import perceptual_weights
 from ..cells.cell import CELL_VERSION, STEP1_SHARE
 from ..cells.provenance import code_state
+from ..cells.request import StudyRequest
 from ..cells.scenes import (
     Scene,
+    choose_by_pose,
     make_bases,
     prepared,
     scene_workspace,
@@ -36,31 +37,19 @@ from ..cells.scenes import (
     trace_train,
     traced_split,
 )
-from ..cells.tasks import CellTask, Step1Result, Step1Task, once
-from ..cells.worker_pool import WorkerPool, make_pool
+from ..cells.tasks import CellTask, Step1Task, files_of, once
+from ..cells.worker_pool import make_pool
 from .rows import Row, needs_base, needs_coarse, settings_of, step1_policy
 
+CELL_WORKER = "dnrpipe.studies.cells.cell"
 
-@dataclass(frozen=True)
-class Request:
-    """What to run. ``base``: the preset's settings; ``overrides``: the user's, which hold for all rows."""
 
-    scenes: list[Path]
+@dataclass(frozen=True, kw_only=True)
+class Request(StudyRequest):
+    """``base``: the preset's settings; ``overrides``: the user's, which hold for all rows."""
+
     rows: list[Row]
-    seeds: int
-    base: Settings
     overrides: dict[str, Any]
-    seconds: float | None
-    out: Path
-    jobs: int = 0
-
-
-@dataclass(frozen=True)
-class Coarse:
-    """A coarse model of a row: its task, and what that gave."""
-
-    task: Step1Task
-    result: Step1Result
 
 
 @dataclass
@@ -69,25 +58,23 @@ class Ablation:
 
     request: Request
     console: Console
-    device: str = ""
-    threads: int = 0
-    worker_pool: WorkerPool = field(init=False)
     perceptual: bool = False
     scenes: list[Scene] = field(default_factory=list)
     references: dict[str, dict[str, str]] = field(default_factory=dict)
     cells: dict[tuple[str, str, int], Path] = field(default_factory=dict)
     """(scene, row, seed) -> the cell's file; rows that come to the same share one"""
 
-    def check(self) -> None:
+    def __post_init__(self) -> None:
         """Refuse rows whose settings cannot be, before any work is done. Raises UserError."""
-        for row in self.request.rows:
+        request = self.request
+        for row in request.rows:
             self.settings_of(row)
+        self.worker_pool = make_pool(request.base, request.jobs, request.out / "logs" / "cells.log", self.console)
+        self.device, self.threads = self.worker_pool.device, self.worker_pool.threads
 
     def run(self) -> None:
         """Prepare all scenes, then go seed by seed, so that a whole table of the first seed exists early."""
         request = self.request
-        self.worker_pool = make_pool(request.base, request.jobs, request.out / "logs" / "cells.log", self.console)
-        self.device, self.threads = self.worker_pool.device, self.worker_pool.threads
         self.perceptual = perceptual_weights(self.console) is not None
         with self.console.bar("scenes", len(request.scenes)) as bar:
             for source in request.scenes:
@@ -104,7 +91,7 @@ class Ablation:
 
     # -- step 1 ----------------------------------------------------------------------------------------
 
-    def _step1(self, seed: int) -> dict[tuple[str, str], Coarse]:
+    def _step1(self, seed: int) -> dict[tuple[str, str], Step1Task]:
         """Coarse models and RL selections of the seed, by scene and row."""
         tasks: dict[tuple[str, str], Step1Task] = {}
         for scene in self.scenes:
@@ -112,11 +99,8 @@ class Ablation:
                 settings = self.settings_of(row, scene)
                 if needs_coarse(row, settings):
                     tasks[scene.name, row.name] = self._step1_task(scene, row, settings, seed)
-        self._work(f"step 1, seed {seed}", once(tasks.values()))
-        return {
-            place: Coarse(task, Step1Result.model_validate_json(task.output.read_bytes()))
-            for place, task in tasks.items()
-        }
+        self.worker_pool.work(f"step 1, seed {seed}", CELL_WORKER, once(tasks.values()))
+        return tasks
 
     def _step1_task(self, scene: Scene, row: Row, settings: Settings, seed: int) -> Step1Task:
         policy, budget, step1 = step1_policy(row), settings.select.budget, settings.select.step1
@@ -128,23 +112,20 @@ class Ablation:
                 *(policy, budget, seed, limit, self.device, self.threads),
             ]
         )
-        folder = self.request.out / "step1" / scene.name / fingerprint
         return Step1Task(
-            fingerprint=fingerprint,
+            **files_of(self.request.out / "step1" / scene.name, fingerprint),
             workspace=scene.workspace.root,
             settings=settings,
             policy=policy,
             seed=seed,
             seconds=limit,
             pace=self._pace_file(scene, "step1", model, step1, policy, budget),
-            folder=folder,
-            output=folder.with_name(f"{fingerprint}.json"),
             label=f"{scene.name} step 1",
         )
 
     # -- cells -----------------------------------------------------------------------------------------
 
-    def _cells(self, seed: int, step1: dict[tuple[str, str], Coarse]) -> None:
+    def _cells(self, seed: int, step1: dict[tuple[str, str], Step1Task]) -> None:
         base, tasks = self.request.base, []
         for scene in self.scenes:
             chosen = {row.name: self._views(scene, row, seed, step1) for row in self.request.rows}
@@ -170,7 +151,7 @@ class Ablation:
                 )
                 self.cells[scene.name, row.name, seed] = task.output
                 tasks.append(task)
-        self._work(f"cells, seed {seed}", once(tasks))
+        self.worker_pool.work(f"cells, seed {seed}", CELL_WORKER, once(tasks))
 
     def _cell_task(
         self,
@@ -179,7 +160,7 @@ class Ablation:
         seed: int,
         settings: Settings,
         traced: dict[str, str],
-        coarse: Coarse | None,
+        coarse: Step1Task | None,
         bases: dict[str, str],
     ) -> CellTask:
         """Train and measure a row.
@@ -196,7 +177,7 @@ class Ablation:
         used = [f"train/{name}" for name in views if row.network] + [f"test/{name}" for name in scene.test]
         base = [bases[name] for name in used] if bases else None
         time = [seconds, row.full_step1] if seconds else None
-        train = [seed, list(traced.values()), step2, coarse and coarse.task.fingerprint, time]
+        train = [seed, list(traced.values()), step2, coarse and coarse.fingerprint, time]
         fingerprint = digest(
             [CELL_VERSION, __version__, scene.inputs, sorted(self.references[scene.name].values()), model, base]
             + ([train, self.device, self.threads] if row.network else [])
@@ -204,7 +185,7 @@ class Ablation:
         )
         folder = self.request.out / "cells" / scene.name
         return CellTask(
-            fingerprint=fingerprint,
+            **files_of(folder, fingerprint),
             scene=scene.name,
             seed=seed,
             workspace=scene.workspace.root,
@@ -212,13 +193,11 @@ class Ablation:
             network=row.network,
             views=views if row.network else [],
             targets=traced_split(self.request.base, row.spp),
-            coarse=coarse and coarse.task.folder,
-            coarse_cost=coarse and coarse.result,
+            coarse=coarse and coarse.folder,
+            coarse_cost=coarse and coarse.result(),
             seconds=seconds if row.network else None,
             full_step1=row.full_step1,
             pace=self._pace_file(scene, "step2", settings.model, settings.finetune.step2, str(len(views))),
-            folder=folder / fingerprint,
-            output=folder / f"{fingerprint}.json",
             picture=folder / f"{fingerprint}.png" if seed == 0 else None,
             code=code_state(),
             label=f"{scene.name} {row.name}",
@@ -229,13 +208,15 @@ class Ablation:
         parts = [CELL_VERSION, scene.inputs, step, model.model_dump(), schedule.model_dump(mode="json"), *more]
         return self.request.out / "pace" / scene.name / f"{digest([*parts, self.device, self.threads])}.json"
 
-    def _views(self, scene: Scene, row: Row, seed: int, step1: dict[tuple[str, str], Coarse]) -> list[str]:
-        budget = row.budget or self.request.base.select.budget
+    def _views(self, scene: Scene, row: Row, seed: int, step1: dict[tuple[str, str], Step1Task]) -> list[str]:
         if row.views == "rl":
-            return step1[scene.name, row.name].result.selected
+            return step1[scene.name, row.name].result().selected
         if row.views == "all":
             return list(scene.train)
-        return scene.random(budget, seed) if row.views == "random" else scene.farthest(budget)
+        names, budget = list(scene.train), row.budget or self.request.base.select.budget
+        # Farthest points are the same views for every seed.
+        chosen = choose_by_pose(list(scene.train.values()), row.views, budget, seed if row.views == "random" else 0)
+        return [names[place] for place in chosen]
 
     def settings_of(self, row: Row, scene: Scene | None = None) -> Settings:
         """The row's settings; with a scene, without what its effect plan leaves off."""
@@ -246,6 +227,3 @@ class Ablation:
             return settings
         model = plan_of(scene.workspace, settings).model(settings.model)
         return settings.model_copy(update={"model": model})
-
-    def _work(self, label: str, tasks: Sequence[Step1Task | CellTask]) -> None:
-        self.worker_pool.work(label, "dnrpipe.studies.cells.cell", tasks)

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from ...core.errors import UserError
 from ...core.settings import Settings, merge
-from ..cells.names import choose_names
+from ..cells.request import choose_names
 
 Family = Literal["classic", "dnr"]
 ViewChoice = Literal["farthest", "random", "rl", "all"]

@@ -24,7 +24,16 @@ from ...core.settings import Settings
 from ...core.workspace import Workspace
 from .measure import base_pictures, measure, network_pictures, rendered_ms
 from .scenes import base_file, raster_file
-from .tasks import CellResult, CellTask, Step1Result, Step1Task, Training, TrainingCost
+from .tasks import (
+    CellResult,
+    CellTask,
+    FileWorker,
+    Step1Result,
+    Step1Task,
+    Training,
+    TrainingCost,
+    weights_or_none,
+)
 
 if TYPE_CHECKING:
     from dnrtrain.dataset import ViewSet
@@ -37,32 +46,19 @@ KEPT_SETS = 8
 """Sets of views in memory; a cell needs two."""
 
 
-class Worker:
-    """Answers a `Step1Task` or a `CellTask`; the answer is what the task's ``output`` file holds."""
+class Worker(FileWorker):
+    """Answers a `Step1Task` or a `CellTask`."""
 
     def __init__(self, common: dict[str, Any]) -> None:
-        import torch
-
-        from dnrtrain.weights import WeightsMissing, load_weights
-
-        if common["threads"]:
-            torch.set_num_threads(common["threads"])
-        self.device, self.threads = common["device"], torch.get_num_threads()
+        super().__init__(common)
+        self.device = common["device"]
         self.views = functools.lru_cache(maxsize=KEPT_SETS)(load_cell_views)
-        try:
-            self.weights: Any = load_weights()
-        except WeightsMissing:  # the parent has said so, and fingerprints of cells hold it
-            self.weights = None
+        self.weights = weights_or_none()  # fingerprints of cells hold whether there are any
 
-    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
-        made: Step1Result | CellResult
+    def answer(self, task: dict[str, Any]) -> Step1Result | CellResult:
         if task["kind"] == "step1":
-            made = self._step1(Step1Task.model_validate(task))
-        else:
-            made = self._cell(CellTask.model_validate(task))
-        answer = made.model_dump(mode="json")
-        write_json(Path(task["output"]), answer)
-        return answer
+            return self._step1(Step1Task.model_validate(task))
+        return self._cell(CellTask.model_validate(task))
 
     # -- the two kinds of tasks ------------------------------------------------------------------------
 
@@ -71,10 +67,10 @@ class Worker:
         settings = task.settings
         if task.seconds is not None:
             assert task.pace is not None
-            short = _with_step1_epochs(settings, 2)
+            short = _with_epochs(settings, step1=2)
             pace = self._pace(task.pace, task.folder, lambda folder: self._train_step1(task, short, folder))
             limit = max(1, int(task.seconds / pace))
-            settings = _with_step1_epochs(settings, min(limit, settings.select.step1.epochs))
+            settings = _with_epochs(settings, step1=min(limit, settings.select.step1.epochs))
         events = self._train_step1(task, settings, task.folder)
         selected = next(event for event in events if isinstance(event, Selected))
         return Step1Result(
@@ -105,9 +101,8 @@ class Worker:
         settings, base = task.settings, task.settings.model.base
         workspace = Workspace.open(task.workspace)
         test = self.views(task.workspace, "test", raytraced=True, base=base)
-        training: Training | None = None
+        training = self._train(task) if task.network else None
         if task.network:
-            training = self._train(task)
             pictures, frame_ms = network_pictures(task.folder, test, self.device)
             shutil.rmtree(task.folder)
         else:
@@ -141,7 +136,7 @@ class Worker:
         settings, coarse = task.settings, task.coarse_cost
         pace = None
         if task.seconds is not None:
-            short = _with_step2_epochs(settings, 2)
+            short = _with_epochs(settings, step2=2)
             pace = self._pace(task.pace, task.folder, lambda folder: self._train_step2(task, short, folder))
             spent = STEP1_SHARE * task.seconds if task.full_step1 else self._clock(coarse) if coarse else 0.0
             left = task.seconds - spent
@@ -150,7 +145,7 @@ class Worker:
                     f"--seconds {task.seconds:g}: step 1 leaves {max(left, 0.0):.1f} s, and an epoch of step 2"
                     f" takes {pace:.1f} s; give more"
                 )
-            settings = _with_step2_epochs(settings, int(left / pace))
+            settings = _with_epochs(settings, step2=int(left / pace))
         for _ in self._train_step2(task, settings, task.folder):
             pass
         cost = training_cost(task.folder)
@@ -242,15 +237,10 @@ def load_cell_views(
     return load_views(passes, images, frame, cameras=chosen, folder=workspace.scene, **extra)
 
 
-def _with_step1_epochs(settings: Settings, epochs: int) -> Settings:
+def _with_epochs(settings: Settings, step1: int | None = None, step2: int | None = None) -> Settings:
     changed = settings.model_copy(deep=True)
-    changed.select.step1.epochs = epochs
-    return changed
-
-
-def _with_step2_epochs(settings: Settings, epochs: int) -> Settings:
-    changed = settings.model_copy(deep=True)
-    changed.finetune.step2.epochs = epochs
+    changed.select.step1.epochs = step1 or changed.select.step1.epochs
+    changed.finetune.step2.epochs = step2 or changed.finetune.step2.epochs
     return changed
 
 

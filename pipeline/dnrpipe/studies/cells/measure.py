@@ -80,7 +80,6 @@ def measure(
 
     ``ceiling``: the PSNR that a perfect renderer would measure against the view's noisy reference, dB.
     """
-    from dnrtrain.metrics import image_metrics
     from dnrtrain.perceptual import build_lpips
 
     target = views.tensors.target
@@ -89,11 +88,8 @@ def measure(
     rows = []
     for index, name in enumerate(views.names):
         one = slice(index, index + 1)
-        row: dict[str, Any] = dict(
-            image_metrics(pictures[one], target[one].cpu(), views.tensors.mask[one].cpu(), lpips)
-        )
+        row = view_metrics(pictures[one], target[one].cpu(), views.tensors.mask[one].cpu(), lpips)
         noise = (read_metadata(workspace.raytraced("test", name)) or {}).get("noise_rmse")
-        row["flip"] = flip_error(_image(target[index]), _image(pictures[index]))[0]
         row["ceiling"] = -20 * math.log10(noise) if noise else None
         rows.append({"name": name, **row})
     if keep is not None:
@@ -101,6 +97,14 @@ def measure(
         write_png(keep, _image(pictures[middle]))
         write_png(keep.parent / "truth.png", _image(target[middle]))
     return rows
+
+
+def view_metrics(picture: Tensor, target: Tensor, mask: Tensor, lpips: Any) -> dict[str, Any]:
+    """Metrics of one view by name. picture, target: display RGB [1, 3, H, W]; mask: [1, 1, H, W]; lpips: or None."""
+    from dnrtrain.metrics import image_metrics
+
+    metrics = image_metrics(picture, target, mask, lpips)
+    return {**metrics, "flip": flip_error(_image(target[0]), _image(picture[0]))[0]}
 
 
 def pictured(tests: list[dict[str, Any]]) -> dict[str, Any]:

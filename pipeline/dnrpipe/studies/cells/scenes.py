@@ -53,23 +53,15 @@ class Scene:
         """Work on the scene, booked under the stage."""
         return Run(self.workspace, settings, self.console, stage, self.run_id)
 
-    def farthest(self, budget: int) -> list[str]:
-        """Farthest-point selection: the same views for every seed."""
-        return self._baseline("farthest", budget, 0)
 
-    def random(self, budget: int, seed: int) -> list[str]:
-        """A random selection of the seed."""
-        return self._baseline("random", budget, seed)
+def choose_by_pose(views: Sequence[View], policy: str, budget: int, seed: int) -> list[int]:
+    """Places of the views that a rule of poses alone chooses: ``farthest`` or ``random``."""
+    from dnrtrain.selector.policies import untrained
+    from dnrtrain.selector.protocol import Candidates
 
-    def _baseline(self, policy: str, budget: int, seed: int) -> list[str]:
-        from dnrtrain.selector.policies import untrained
-        from dnrtrain.selector.protocol import Candidates
-
-        names = list(self.train)
-        candidates = Candidates.of_views([self.train[name] for name in names])
-        rule = untrained(policy)
-        assert rule is not None  # both names above are rules
-        return [names[i] for i in rule.choose(candidates, budget, seed).views]
+    rule = untrained(policy)
+    assert rule is not None  # both names above are rules
+    return rule.choose(Candidates.of_views(views), budget, seed).views
 
 
 def scene_workspace(source: Path, root: Path) -> Workspace:
@@ -107,8 +99,8 @@ def prepared(name: str, run: Run, command: str) -> Scene:
 
     Raises UserError: no test views, too few candidates.
     """
-    workspace, settings, console = run.workspace, run.settings, run.console
-    run_stage("prepare", replace(run, console=Console(json_mode=console.json_mode, quiet=True)))
+    workspace, settings = run.workspace, run.settings
+    run_stage("prepare", replace(run, console=Console(json_mode=run.console.json_mode, quiet=True)))
     views = split_views(workspace)
     if not views.get("test"):
         raise UserError(f"{name}: has no test views to measure on; set cameras.test > 0")
@@ -118,7 +110,7 @@ def prepared(name: str, run: Run, command: str) -> Scene:
     return Scene(
         name=name,
         workspace=workspace,
-        console=console,
+        console=run.console,
         train=train,
         test={view.name: view for view in views["test"]},
         inputs=workspace.manifest.stages["prepare"].output,

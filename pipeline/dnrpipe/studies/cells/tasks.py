@@ -10,7 +10,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field
+
+from dnrtrain.atomic import write_json
 
 from ...core.settings import Settings
 
@@ -31,6 +33,36 @@ class StudyTask(PoolTask):
     workspace: Path
 
 
+class FileWorker:
+    """A worker that writes each answer to its task's ``output``. common["threads"]: of torch, 0 = its own choice."""
+
+    def __init__(self, common: dict[str, Any]) -> None:
+        import torch
+
+        if common["threads"]:
+            torch.set_num_threads(common["threads"])
+        self.threads = torch.get_num_threads()
+
+    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
+        made = self.answer(task).model_dump(mode="json", by_alias=True, exclude_unset=True)
+        write_json(Path(task["output"]), made)
+        return made
+
+    def answer(self, task: dict[str, Any]) -> BaseModel:
+        """What the file will hold; fields that were not given are left out."""
+        raise NotImplementedError
+
+
+def weights_or_none() -> Any:
+    """Weights of the perceptual metrics, None where there are none, which the parent process has said."""
+    from dnrtrain.weights import WeightsMissing, load_weights
+
+    try:
+        return load_weights()
+    except WeightsMissing:
+        return None
+
+
 Fingerprinted = TypeVar("Fingerprinted", bound=StudyTask)
 
 
@@ -40,6 +72,12 @@ def once(tasks: Iterable[Fingerprinted]) -> list[Fingerprinted]:
     for task in tasks:
         found.setdefault(task.fingerprint, task)
     return list(found.values())
+
+
+def files_of(folder: Path, fingerprint: str) -> dict[str, Any]:
+    """A task's fingerprint, the folder of its trainings and its output beside that."""
+    made = {"folder": folder / fingerprint, "output": folder / f"{fingerprint}.json"}
+    return {"fingerprint": fingerprint, **made}
 
 
 class Step1Task(StudyTask):
@@ -58,6 +96,10 @@ class Step1Task(StudyTask):
     seconds: float | None
     pace: Path | None = None
     folder: Path
+
+    def result(self) -> Step1Result:
+        """What it gave, once it is done."""
+        return Step1Result.model_validate_json(self.output.read_bytes())
 
 
 class TrainingCost(BaseModel):
@@ -158,14 +200,20 @@ def read_cell(path: Path) -> CellResult:
     return CellResult.model_validate_json(path.read_bytes())
 
 
-class SelectionResult(BaseModel):
-    """A selection's file, by a rule or by active learning. views: names in order. peak_mb: of the process."""
+class ChoiceFile(BaseModel):
+    """What a rule's selection, an active one and a step 1 have in common. views: in order. key: its fingerprint.
+    peak_mb: of the process."""
 
     key: str
-    views: list[str]
-    gains: list[float]
-    why: list[str]
-    details: dict[str, Any]
+    views: list[str] = Field(validation_alias=AliasChoices("views", "selected"))
     seconds: float
     cpu_seconds: float
     peak_mb: float | None = None
+
+
+class SelectionResult(ChoiceFile):
+    """A selection's file, by a rule or by active learning."""
+
+    gains: list[float]
+    why: list[str]
+    details: dict[str, Any]

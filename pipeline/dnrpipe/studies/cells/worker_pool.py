@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ...core.console import Console
-from ...core.errors import UserError
 from ...core.settings import Settings
 from ...stages.trainer import torch_device
 from ...workers.answers import answers, warn_of_retries
@@ -56,14 +55,6 @@ class WorkerPool:
                 f"{label}: {len(failed)} of {len(due)} failed ({', '.join(failed[:5])}); the others are done."
                 f" See {self.log}; run the same command to try again"
             )
-
-
-def check_amounts(seconds: float | None, seeds: int, jobs: int) -> None:
-    """Raises UserError: an amount of work that is none."""
-    if seconds is not None and not seconds > 0:
-        raise UserError(f"--seconds {seconds:g}: must be more than 0")
-    if seeds < 1 or jobs < 0:
-        raise UserError(f"--seeds {seeds} --jobs {jobs}: at least 1 seed; jobs from 0 (one per core)")
 
 
 def make_pool(settings: Settings, jobs: int, log: Path, console: Console, *, single: bool = False) -> WorkerPool:

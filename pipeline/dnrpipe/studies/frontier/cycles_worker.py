@@ -6,17 +6,16 @@ picture: Cycles by a reference with as many samples as ours, raw, with another s
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dnrtrain.atomic import write_json
 from dnrtrain.display import DisplayTransform
 
 from ...blender.tasks import CyclesAnswer
 from ...core.scene_files import read_frame, read_record
 from ...core.workspace import Workspace
+from ..cells.tasks import FileWorker
 from ..frames.scene import shown
 from .path_tracing_worker import load_lpips, masks_of, quality_of, read_rgba
 from .records import CYCLES_PREFIX, BaselineFile, BaselinePoint, CyclesMeasureTask
@@ -24,19 +23,11 @@ from .records import CYCLES_PREFIX, BaselineFile, BaselinePoint, CyclesMeasureTa
 REFERENCE = "reference"
 
 
-class Worker:
+class Worker(FileWorker):
     """Answers a `CyclesMeasureTask`; names begin with ``Cycles``."""
 
-    def __init__(self, common: dict[str, Any]) -> None:
-        import torch
-
-        if common["threads"]:
-            torch.set_num_threads(int(common["threads"]))
-
-    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
-        made = self._measure(CyclesMeasureTask.model_validate(task)).data()
-        write_json(Path(task["output"]), made)
-        return made
+    def answer(self, task: dict[str, Any]) -> BaselineFile:
+        return self._measure(CyclesMeasureTask.model_validate(task))
 
     def _measure(self, task: CyclesMeasureTask) -> BaselineFile:
         workspace = Workspace.open(task.workspace)

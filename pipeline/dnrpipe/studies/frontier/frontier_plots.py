@@ -36,13 +36,11 @@ TITLES: dict[Metric, str] = {
 
 def plot(results: FrontierResults, frames: int, path: Path) -> None:
     """Write a PNG: a panel per metric; x: seconds until ``frames`` frames are there. The front is a grey line."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     everything = results.everything.values()
     metrics: list[Metric] = [name for name in TITLES if any(getattr(one, name) is not None for one in everything)]
     figure = Figure(figsize=(11, 8), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(2, 2).ravel()
     for axis, metric in zip(axes, metrics, strict=False):
         _panel(axis, results, frames, metric)

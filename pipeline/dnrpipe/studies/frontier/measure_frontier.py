@@ -18,8 +18,8 @@ from ...core.settings import Settings
 from ...core.workspace import digest
 from ...stages.stage import Run
 from ...workers.view_tasks import worker_count
+from ..ablation.cell_loop import Request
 from ..cells.provenance import made_by
-from ..cells.worker_pool import check_amounts
 from .frontier_plots import plot
 from .frontier_report import markdown
 from .point_costs import break_evens, pareto, point_of, settle_frames
@@ -32,7 +32,7 @@ from .records import (
     FrontierResults,
     PathTracingTask,
 )
-from .sweep import OTHERS, Frontier, Sweep, make_frontier
+from .sweep import OTHERS, Frontier, Sweep
 
 BASELINE_VERSION, CYCLES_VERSION = 1, 1
 CYCLES = "cycles"
@@ -86,7 +86,6 @@ def run_frontier(
         UserError: unknown names, numbers that do not fit. TasksFailed: some cells failed; the others are written.
     """
     workspace, settings = run.workspace, run.settings
-    check_amounts(None, seeds, jobs)
     candidates = len(split_views(workspace)["train"])
     counts = numbers(frames, "--frames", (200, 2000))
     others = _others(also)
@@ -99,8 +98,19 @@ def run_frontier(
     samples = numbers(ladder, "--ladder", SAMPLE_COUNTS)
     rows = sweep.rows(settings)
     out = workspace.root / "frontier"
-    swept = make_frontier(run, rows, out, jobs, seeds)
-    swept.check()
+    name, base = workspace.root.name.removesuffix(".dnr"), settings.model_copy(deep=True)
+    base.select.budget = max((row.budget or 1 for row in rows), default=1)
+    request = Request(
+        scenes=[Path(f"{name}.blend")],
+        rows=rows,
+        seeds=seeds,
+        base=base,
+        overrides={},
+        seconds=None,
+        out=out,
+        jobs=jobs,
+    )
+    swept = Frontier(request, run.console, workspace=workspace)
     swept.run()
     cores = worker_count(0)
     traced = _trace_baselines(swept, settings, samples, cores)
@@ -122,7 +132,7 @@ def run_frontier(
     results = FrontierResults(
         schema_version=SCHEMA,
         **made_by(),
-        scene=workspace.root.name.removesuffix(".dnr"),
+        scene=name,
         preset=settings.preset,
         resolution=f"{settings.cameras.width}x{settings.cameras.height}",
         sweep=asdict(sweep),
@@ -142,9 +152,9 @@ def run_frontier(
 
 def _others(text: str) -> tuple[str, ...]:
     """Names of other ways to train, and Cycles."""
-    names = tuple(filter(None, (part.strip() for part in text.split(","))))
     if text.strip() == "none":
         return ()
+    names = tuple(filter(None, (part.strip() for part in text.split(","))))
     if unknown := set(names) - {*OTHERS, CYCLES}:
         raise UserError(f"--also {', '.join(sorted(unknown))}: choose of {', '.join((*OTHERS, CYCLES))}, or none")
     return names

@@ -11,30 +11,22 @@ from typing import Any
 
 import numpy as np
 
-from dnrtrain.atomic import write_json
 from dnrtrain.exr import read_exr
 
 from ...core.workspace import Workspace
+from ..cells.measure import view_metrics
+from ..cells.tasks import FileWorker, weights_or_none
 from .records import BaselineFile, BaselinePoint, PathTracingTask
 
 METHODS = ("raw", "colour-fast", "clean16-fast", "clean16")
 WARM = 2
 
 
-class Worker:
+class Worker(FileWorker):
     """Answers a `PathTracingTask`; milliseconds are medians of processor time over the threads."""
 
-    def __init__(self, common: dict[str, Any]) -> None:
-        import torch
-
-        if common["threads"]:
-            torch.set_num_threads(int(common["threads"]))
-        self.threads = torch.get_num_threads()
-
-    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
-        made = self._measure(PathTracingTask.model_validate(task)).data()
-        write_json(Path(task["output"]), made)
-        return made
+    def answer(self, task: dict[str, Any]) -> BaselineFile:
+        return self._measure(PathTracingTask.model_validate(task))
 
     def _measure(self, task: PathTracingTask) -> BaselineFile:
         from ...core.scene_files import split_views
@@ -95,30 +87,15 @@ def masks_of(workspace: Workspace, names: list[str]) -> list[Any]:
 def load_lpips() -> Any:
     """LPIPS networks by name, None where there are no weights."""
     from dnrtrain.perceptual import build_lpips
-    from dnrtrain.weights import WeightsMissing, load_weights
 
-    try:
-        return build_lpips(load_weights())
-    except WeightsMissing:  # the parent has said so
-        return None
+    weights = weights_or_none()
+    return None if weights is None else build_lpips(weights)
 
 
 def quality_of(pictures: list[Any], truth: list[Any], masks: list[Any], lpips: Any) -> dict[str, Any]:
     """Means over the views of the metrics that cells have."""
-    from dnrtrain.metrics import image_metrics
-
-    from ...core.images import flip_error
-
-    rows = []
-    for picture, target, mask in zip(pictures, truth, masks, strict=True):
-        row: dict[str, Any] = dict(image_metrics(picture, target, mask, lpips))
-        row["flip"] = flip_error(_image(target), _image(picture))[0]
-        rows.append(row)
+    rows = [view_metrics(*one, lpips) for one in zip(pictures, truth, masks, strict=True)]
     return {
         key: float(np.mean(values)) if (values := [row[key] for row in rows if row[key] is not None]) else None
         for key in rows[0]
     }
-
-
-def _image(tensor: Any) -> np.ndarray:
-    return tensor[0].float().clamp(0, 1).permute(1, 2, 0).cpu().numpy()

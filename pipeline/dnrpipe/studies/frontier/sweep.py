@@ -5,7 +5,6 @@ Views, references and base images are traced once, into the workspace itself.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from ...core.errors import UserError
 from ...core.settings import Settings
 from ...core.workspace import Workspace
 from ...stages.stage import Run
-from ..ablation.cell_loop import Ablation, Request
+from ..ablation.cell_loop import Ablation
 from ..ablation.rows import CLASSIC, ROWS, Row, ViewChoice
 from ..cells.scenes import Scene, prepared
 
@@ -67,31 +66,12 @@ class Sweep:
 class Frontier(Ablation):
     """An ablation of one scene: the workspace that is open."""
 
-    workspace: Workspace | None = field(default=None)
+    workspace: Workspace = field(kw_only=True)
 
     def _open(self, source: Path) -> Scene:
-        assert self.workspace is not None
         return prepared(source.stem, Run(self.workspace, self.request.base, self.console), "frontier")
 
     @property
     def scene(self) -> Scene:
         """The scene, once `run` has prepared it."""
         return self.scenes[0]
-
-
-def make_frontier(run: Run, rows: Sequence[Row], out: Path, jobs: int, seeds: int) -> Frontier:
-    """The sweep over ``rows``.
-
-    Args:
-        run: workspace, settings and console.
-        rows: all points.
-        out: cells go there.
-        jobs: cells side by side; 0: one per core.
-        seeds: trainings of every point.
-    """
-    largest = max((row.budget or 1 for row in rows), default=1)
-    base = run.settings.model_copy(deep=True)
-    base.select.budget = largest
-    source = Path(f"{run.workspace.root.name.removesuffix('.dnr')}.blend")
-    request = Request([source], list(rows), seeds, base, {}, None, out, jobs)
-    return Frontier(request, run.console, workspace=run.workspace)

@@ -50,10 +50,8 @@ class Predictor:
         """What the choice is expected to cost and give."""
         assert self.pilot.trace is not None
         select = self.wall.work.policy_seconds
-        raytrace, finetune = (
-            self.wall.raytrace(choice.views, choice.spp),
-            self.wall.finetune(choice.steps, choice.epochs),
-        )
+        raytrace = self.wall.raytrace(choice.views, choice.spp)
+        finetune = self.wall.finetune(choice.steps, choice.epochs)
         total = select + raytrace + finetune
         seconds = Seconds(
             select=select,

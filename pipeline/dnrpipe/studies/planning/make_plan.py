@@ -78,13 +78,12 @@ def make_predictor(workspace: Workspace, settings: Settings, pilot: Pilot, prior
         tests=len(split_views(workspace).get("test", [])),
         evaluation_spp=settings.raytrace.evaluation_spp,
     )
-    base = frames.base.psnr
     return Predictor(
         pilot=pilot,
         wall=Costs(pilot, work, "seconds"),
         processor=Costs(pilot, work, "cpu_seconds"),
         prior=prior,
-        base=base,
+        base=frames.base.psnr,
         gain=_gain(pilot, prior),
         judged=views_error(frames.deviation, frames.views, work.tests),
         reference=_reference_noise(settings, pilot),

@@ -14,7 +14,6 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -31,7 +30,7 @@ from ...stages.base_images import RENDERED, base_renderer
 from ...stages.effect_plan import resolve_plan
 from ...stages.stage import Run
 from .pilot_parts import HELD_OUT, REFERENCE_SPP, RESOLUTION, SPP, STEPS, VIEWS, Piloting
-from .records import FOLDER, LightPart, Pilot, Record
+from .records import FOLDER, LightPart, Pilot
 
 VERSION = 6
 FILE = "pilot.json"
@@ -63,19 +62,14 @@ def run_pilot(run: Run) -> Pilot:
     first = piloting.train[0]
     if found is None or found.fingerprint != fingerprint:
         shutil.rmtree(piloting.folder, ignore_errors=True)
-        found = Pilot(fingerprint=fingerprint, size=(first.width, first.height), load=_load())
+        load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
+        found = Pilot(fingerprint=fingerprint, size=(first.width, first.height), load=load)
     bake = found.light is None and not base_renderer(workspace, settings, plan).light_is_baked  # removed, perhaps
     if found.frames is not None and not bake:
         return found
     piloting.folder.mkdir(parents=True, exist_ok=True)
-    parts: list[tuple[str, Callable[[], Record | None]]] = [
-        ("trace", piloting.trace),
-        ("light", piloting.light),
-        ("base", piloting.base),
-        ("training", piloting.training),
-        ("frames", piloting.frames),
-    ]
-    for name, part in parts:
+    for part in (piloting.trace, piloting.light, piloting.base, piloting.training, piloting.frames):
+        name = part.__name__  # of the field that holds it, too
         if getattr(found, name) is not None:
             continue
         started = time.monotonic()
@@ -108,7 +102,3 @@ def _fingerprint(workspace: Workspace, settings: Settings, plan: EffectPlan) -> 
             *(settings.base.model_dump(), step2, settings.raytrace.denoise, settings.device, os.cpu_count()),
         ]
     )
-
-
-def _load() -> float | None:
-    return os.getloadavg()[0] if hasattr(os, "getloadavg") else None

@@ -24,6 +24,7 @@ from ...stages.raytrace import view_seed
 from ...stages.stage import Run
 from ...workers.answers import answers, warn_of_retries
 from ...workers.view_tasks import worker_count
+from ..cells.scenes import choose_by_pose
 from .pilot_worker import FramesTask, PilotCommon, TrainTask
 from .records import FOLDER, BasePart, FramePart, LightPart, LightPoint, Traced, TracePart, TrainingPart
 
@@ -72,13 +73,10 @@ class Piloting:
         for task, result in answers:
             if Path(task["output"]).name.startswith("warm"):
                 continue
-            pixels = task["view"]["width"] * task["view"]["height"]
             points.append(
                 Traced(
-                    spp=result["spp"],
-                    pixels=pixels,
-                    seconds=result["seconds"],
-                    cpu_seconds=result["cpu_seconds"],
+                    pixels=task["view"]["width"] * task["view"]["height"],
+                    **{name: result[name] for name in ("spp", "seconds", "cpu_seconds")},
                     noise_rmse=result.get("noise_rmse"),
                     raw_rmse=_raw_rmse(result),
                 )
@@ -135,13 +133,13 @@ class Piloting:
 
     def training(self) -> TrainingPart:
         """Short step 2s."""
-        view = self.train[0]
+        view, per_epoch = self.train[0], math.ceil(len(self.train) / self.settings.finetune.step2.batch)
         task = TrainTask(
             views=self.train,
             base_files=[self._base_file("train", view) for view in self.train],
             images=[self._image(f"train-{view.name}") for view in self.train],
             folders=self._models(),
-            epochs=[max(2, round(steps / self._steps_per_epoch())) for steps in STEPS],
+            epochs=[max(2, round(steps / per_epoch)) for steps in STEPS],
             fingerprint=self.run.id,
         )
         result = self._ask("pilot: training", task, {})
@@ -223,9 +221,6 @@ class Piloting:
         )
         return task.model_dump(mode="json")
 
-    def _steps_per_epoch(self) -> int:
-        return math.ceil(len(self.train) / self.settings.finetune.step2.batch)
-
     def _models(self) -> list[Path]:
         return [self.folder / f"model-{steps}" for steps in STEPS]
 
@@ -253,14 +248,9 @@ def _views(workspace: Workspace) -> tuple[list[View], list[View]]:
     Others: test views, for their PSNR is what is predicted (by poses alone; nothing is trained on them or chosen among
     them), else validation views, else candidates that were not taken.
     """
-    from dnrtrain.selector.policies import untrained
-    from dnrtrain.selector.protocol import Candidates
-
     splits = split_views(workspace)
     views = splits["train"]
-    rule = untrained("farthest")
-    assert rule is not None
-    chosen = rule.choose(Candidates.of_views(views), min(VIEWS, len(views)), 0).views
+    chosen = choose_by_pose(views, "farthest", min(VIEWS, len(views)), 0)
     others = [view for i, view in enumerate(views) if i not in set(chosen)]
     left = splits.get("test") or splits.get("val") or others or views
     step = max(1, len(left) // HELD_OUT)

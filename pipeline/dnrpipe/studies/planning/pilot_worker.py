@@ -20,11 +20,10 @@ from dnrtrain.contract import View
 from ...core.scene_files import read_frame
 from ...core.settings import Settings
 from ...core.workspace import Workspace
+from ..cells.tasks import weights_or_none
 from .records import Record
 
 if TYPE_CHECKING:
-    from dnrtrain.dataset import ViewSet
-
     from ..frames.scene import BenchScene
 
 WARM = 2
@@ -36,11 +35,10 @@ LEAST_MSE = 1e-6
 
 
 class PilotCommon(Record):
-    """What all tasks share. threads: of torch, 0 = its own choice."""
+    """What all tasks share."""
 
     workspace: Path
     settings: Settings
-    threads: int = 0
 
 
 class TrainTask(Record):
@@ -86,8 +84,6 @@ class Worker:
         import torch
 
         shared = PilotCommon.model_validate(common)
-        if shared.threads:
-            torch.set_num_threads(shared.threads)
         self.threads = torch.get_num_threads()
         self.workspace, self.settings = Workspace.open(shared.workspace), shared.settings
 
@@ -97,12 +93,7 @@ class Worker:
         return self._frames(FramesTask.model_validate(task))
 
     def _train(self, task: TrainTask) -> dict[str, Any]:
-        from dnrtrain.weights import WeightsMissing, load_weights
-
-        try:
-            weights: Any = load_weights()
-        except WeightsMissing:  # training will do without, too
-            weights = None
+        weights = weights_or_none()  # training will do without, too
         found = [
             self._train_one(task, weights, folder, epochs)
             for folder, epochs in zip(task.folders, task.epochs, strict=True)
@@ -111,6 +102,7 @@ class Worker:
 
     def _train_one(self, task: TrainTask, weights: Any, folder: Path, epochs: int) -> dict[str, Any]:
         from dnrtrain.checkpoint import read_record
+        from dnrtrain.dataset import load_views
         from dnrtrain.events import EpochEnd
         from dnrtrain.step2 import run_step2
 
@@ -120,8 +112,17 @@ class Worker:
         step2 = self.settings.finetune.step2.model_copy(
             update={"epochs": epochs, "start": "fresh", "validation_views": 0}
         )
+        views = load_views(
+            task.base_files,  # base images bring their G-buffer along
+            task.images,
+            read_frame(self.workspace),
+            cameras=task.views,
+            folder=self.workspace.scene,
+            base=self.settings.model.base,
+            base_files=task.base_files,
+        )
         events = run_step2(
-            self._load(task),
+            views,
             None,
             folder,
             self.settings.model,
@@ -146,29 +147,15 @@ class Worker:
         history = record.history
         later = history[1:] or history  # the first epoch warms up
         steps = sum(entry.steps for entry in later)
-        seconds = sum(entry.seconds for entry in later) / steps
         booked = sum(entry.seconds for entry in history)
         return {
-            "seconds": seconds,
+            "seconds": sum(entry.seconds for entry in later) / steps,
             "cpu_seconds": sum(entry.cpu_seconds for entry in later) / steps,
             "between": between,
             "cpu_between": cpu_between,
             "startup": max(0.0, took - booked - between * len(history)),
             "steps": sum(entry.steps for entry in history),
         }
-
-    def _load(self, task: TrainTask) -> ViewSet:
-        from dnrtrain.dataset import load_views
-
-        return load_views(
-            task.base_files,  # base images bring their G-buffer along
-            task.images,
-            read_frame(self.workspace),
-            cameras=task.views,
-            folder=self.workspace.scene,
-            base=self.settings.model.base,
-            base_files=task.base_files,
-        )
 
     def _frames(self, task: FramesTask) -> dict[str, Any]:
         from dnrtrain.checkpoint import load_model

@@ -22,7 +22,6 @@ well each point explains the gains that the pilot measured after fewer and after
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -95,7 +94,7 @@ class Gain:
 def load_prior() -> Prior:
     """The prior that comes with the package."""
     text = (resources.files("dnrpipe.studies.planning") / "prior.json").read_text(encoding="utf-8")
-    return Prior.model_validate(json.loads(text))
+    return Prior.model_validate_json(text)
 
 
 def share(prior: Prior, missing: np.ndarray | float, views: float, steps: float) -> np.ndarray:

@@ -15,9 +15,7 @@ import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal
-
-from pydantic import AliasChoices, BaseModel, Field
+from typing import Any, Literal
 
 from ... import __version__
 from ...core.console import Console
@@ -28,12 +26,13 @@ from ...stages.trainer import perceptual_weights
 from ..cells.cell import CELL_VERSION
 from ..cells.measure import written_seconds
 from ..cells.provenance import code_state
+from ..cells.request import StudyRequest
 from ..cells.scenes import base_file, make_bases, trace_references, trace_train
-from ..cells.tasks import CellTask, Step1Result, Step1Task, StudyTask, once
+from ..cells.tasks import CellTask, ChoiceFile, Step1Task, StudyTask, files_of, once
 from ..cells.worker_pool import WorkerPool
 from .active.settings import ActiveSettings, ActiveTask
 from .policies import Contender, rules_fingerprint, settings_of
-from .pools import Placed, Pool, place_pool, share_light
+from .pools import Pool, place_pool, share_light
 from .rule_worker import RuleTask
 
 CHOICE_VERSION = 1  # raise when what a selection's file holds changes
@@ -41,19 +40,13 @@ SHARED_COARSE = "farthest"
 """Step 1 without a selector trains the same for every policy, so that all share one coarse model."""
 
 
-@dataclass(frozen=True)
-class Request:
-    """What to run. ``base``: settings of all cells; its budget is the largest of ``budgets``."""
+@dataclass(frozen=True, kw_only=True)
+class Request(StudyRequest):
+    """The budget of ``base`` is the largest of ``budgets``."""
 
-    scenes: list[Path]
     pools: list[str]
     budgets: list[int]
     policies: list[Contender]
-    seeds: int
-    base: Settings
-    seconds: float | None
-    out: Path
-    jobs: int = 0
 
 
 @dataclass(frozen=True)
@@ -97,17 +90,14 @@ class Bench:
         request = self.request
         self.perceptual = perceptual_weights(self.console) is not None
         places = [(source, name) for source in request.scenes for name in request.pools]
-        placed: list[Placed] = []
         with self.console.bar("scenes and cameras", len(places)) as bar:  # all, before anything takes long
             for source, name in places:
-                placed.append(place_pool(source, name, request.out, request.base, self.console))
+                self.pools.append(place_pool(source, name, request.out, request.base, self.console))
                 bar.advance(note=f"{source.stem}-{name}")
-        with self.console.bar("pools", len(placed)) as bar:
-            for one in placed:
-                pool = one.prepare(self.console)
+        with self.console.bar("pools", len(self.pools)) as bar:
+            for pool in self.pools:
                 traced = trace_references(pool.data, self._settings(pool))
                 self.references[pool.folder] = sorted(traced.values())
-                self.pools.append(pool)
                 bar.advance(note=pool.folder)
         for seed in range(request.seeds):
             self._seed(seed)
@@ -121,17 +111,10 @@ class Bench:
                 for contender in self.request.policies:
                     place = Place(pool.scene, pool.name, budget, contender.name, seed)
                     settings = settings_of(contender, self._settings(pool), budget)
-                    if contender.kind == "rule":
-                        task = self._rule_task(pool, contender, budget, seed)
-                    elif contender.kind == "active":
-                        task = self._active_task(pool, settings, contender.policy, seed)
-                    else:
-                        task = self._step1_task(pool, settings, contender.policy, seed)
-                    chosen[place] = task
+                    chosen[place] = task = self._choice_task(pool, contender, settings, seed)
                     if settings.starts_coarse:
-                        if not isinstance(task, Step1Task):
-                            task = self._step1_task(pool, settings, SHARED_COARSE, seed)
-                        starts[place] = task
+                        coarse = isinstance(task, Step1Task)
+                        starts[place] = task if coarse else self._step1_task(pool, settings, SHARED_COARSE, seed)
         tasks = [*chosen.values(), *starts.values()]
         self._work(f"selections, seed {seed}", "selectbench.rule_worker", tasks, RuleTask)
         self._work(f"active selections, seed {seed}", "selectbench.active.active_worker", tasks, ActiveTask)
@@ -149,70 +132,45 @@ class Bench:
 
     # -- selections ------------------------------------------------------------------------------------
 
-    def _rule_task(self, pool: Pool, contender: Contender, budget: int, seed: int) -> RuleTask:
-        """A rule's selection."""
-        fingerprint = digest([CHOICE_VERSION, rules_fingerprint(), pool.data.inputs, contender.policy, budget, seed])
-        return RuleTask(
-            fingerprint=fingerprint,
-            workspace=pool.data.workspace.root,
-            policy=contender.policy,
-            budget=budget,
-            seed=seed,
-            output=self.request.out / "selections" / pool.folder / f"{fingerprint}.json",
-            label=f"{pool.folder} {contender.name} {budget}",
-        )
-
-    def _active_task(self, pool: Pool, settings: Settings, policy: str, seed: int) -> ActiveTask:
-        """A selection by active learning."""
-        model, step1, budget = settings.model.coarse(), settings.select.step1, settings.select.budget
-        fingerprint = digest(
-            [
-                *(CHOICE_VERSION, CELL_VERSION, __version__, pool.data.inputs, model.model_dump(), step1.model_dump()),
-                *(asdict(ActiveSettings()), policy, budget, seed, self.worker_pool.device, self.worker_pool.threads),
-            ]
-        )
+    def _choice_task(self, pool: Pool, contender: Contender, settings: Settings, seed: int) -> ChoiceTask:
+        """A selection by the contender's policy."""
+        policy, budget, inputs = contender.policy, settings.select.budget, pool.data.inputs
+        if contender.kind == "step1":
+            return self._step1_task(pool, settings, policy, seed)
+        common: dict[str, Any] = {"workspace": pool.data.workspace.root, "policy": policy, "seed": seed}
         folder = self.request.out / "selections" / pool.folder
-        return ActiveTask(
-            fingerprint=fingerprint,
-            workspace=pool.data.workspace.root,
-            settings=settings,
-            policy=policy,
-            seed=seed,
-            folder=folder / fingerprint,
-            output=folder / f"{fingerprint}.json",
-            label=f"{pool.folder} {policy} {budget}",
-        )
-
-    def _step1_task(self, pool: Pool, settings: Settings, policy: str, seed: int) -> Step1Task:
-        """Step 1: a trained policy's selection, or the coarse model that all others share."""
-        model, step1, budget = settings.model.coarse(), settings.select.step1, settings.select.budget
+        if contender.kind == "rule":
+            fingerprint = digest([CHOICE_VERSION, rules_fingerprint(), inputs, policy, budget, seed])
+            label, output = f"{pool.folder} {contender.name} {budget}", folder / f"{fingerprint}.json"
+            return RuleTask(**common, fingerprint=fingerprint, output=output, budget=budget, label=label)
+        model, step1 = settings.model.coarse().model_dump(), settings.select.step1.model_dump()
         fingerprint = digest(
             [
-                *(CELL_VERSION, __version__, pool.data.inputs, model.model_dump(), step1.model_dump()),
+                *(CHOICE_VERSION, CELL_VERSION, __version__, inputs, model, step1, asdict(ActiveSettings())),
                 *(policy, budget, seed, self.worker_pool.device, self.worker_pool.threads),
             ]
         )
-        folder = self.request.out / "step1" / pool.folder
+        label = f"{pool.folder} {policy} {budget}"
+        return ActiveTask(**common, **files_of(folder, fingerprint), settings=settings, label=label)
+
+    def _step1_task(self, pool: Pool, settings: Settings, policy: str, seed: int) -> Step1Task:
+        """Step 1: a trained policy's selection, or the coarse model that all others share."""
+        model, step1 = settings.model.coarse().model_dump(), settings.select.step1.model_dump()
+        fingerprint = digest(
+            [
+                *(CELL_VERSION, __version__, pool.data.inputs, model, step1, policy, settings.select.budget, seed),
+                *(self.worker_pool.device, self.worker_pool.threads),
+            ]
+        )
         return Step1Task(
-            fingerprint=fingerprint,
+            **files_of(self.request.out / "step1" / pool.folder, fingerprint),
             workspace=pool.data.workspace.root,
             settings=settings,
             policy=policy,
             seconds=None,  # the preset's epochs: what step 1 takes is part of what its policy costs
             seed=seed,
-            folder=folder / fingerprint,
-            output=folder / f"{fingerprint}.json",
             label=f"{pool.folder} step 1",
         )
-
-    def _trace(self, pool: Pool, names: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
-        """Ray-trace candidates and render base images; -> fingerprints, see ``trace_train`` and ``make_bases``."""
-        settings = self._settings(pool)
-        traced = trace_train(pool.data, settings, names)
-        if settings.model.base == "none":
-            return traced, {}
-        share_light([other for other in self.pools if other.scene == pool.scene])
-        return traced, make_bases(pool.data, settings, names)
 
     # -- cells -----------------------------------------------------------------------------------------
 
@@ -228,16 +186,13 @@ class Bench:
         # In the pool's order: two policies that choose the same views in another order are the same cell.
         views = {place: sorted(read_choice(task.output).views, key=order.__getitem__) for place, task in chosen.items()}
         everything = sorted({name for names in views.values() for name in names})
-        traced, bases = self._trace(pool, everything)
+        traced, bases = trace_train(pool.data, settings, everything), {}
+        if settings.model.base != "none":
+            share_light([other for other in self.pools if other.scene == pool.scene])
+            bases = make_bases(pool.data, settings, everything)
         for place, names in views.items():
-            task = self._cell_task(
-                pool,
-                settings,
-                place,
-                {name: traced[name] for name in names},
-                starts.get(place),
-                bases,
-            )
+            fingerprints = {name: traced[name] for name in names}
+            task = self._cell_task(pool, settings, place, fingerprints, starts.get(place), bases)
             self.cells[place] = PlannedCell(task, chosen[place].output)
 
     def _cell_task(
@@ -269,9 +224,8 @@ class Bench:
         train = [place.seed, list(traced.values()), step2, start, self.request.seconds]
         fingerprint = digest([*shown, train, worker_pool.device, worker_pool.threads, self.perceptual])
         pace = [*shown[:5], len(views), step2, worker_pool.device, worker_pool.threads]
-        folder = self.request.out / "cells" / pool.folder
         return CellTask(
-            fingerprint=fingerprint,
+            **files_of(self.request.out / "cells" / pool.folder, fingerprint),
             scene=pool.scene,
             seed=place.seed,
             workspace=data.workspace.root,
@@ -279,13 +233,11 @@ class Bench:
             network=True,
             views=views,
             coarse=coarse and coarse.folder,
-            coarse_cost=coarse and Step1Result.model_validate_json(coarse.output.read_bytes()),
+            coarse_cost=coarse and coarse.result(),
             seconds=self.request.seconds,
             # Where step 2 starts from a coarse model, all policies give step 1 the same share of their time.
             full_step1=coarse is not None,
             pace=self.request.out / "pace" / pool.folder / f"{digest(pace)}.json",
-            folder=folder / fingerprint,
-            output=folder / f"{fingerprint}.json",
             picture=None,
             code=code_state(),
             label=f"{pool.folder} {place.policy} {place.budget}",
@@ -311,16 +263,6 @@ class Bench:
         if kind not in ("none", "raster"):
             files += [base_file(workspace, kind, "train", name) for name in names]
         return sum(self.written_seconds(file, self.clock) for file in files)
-
-
-class ChoiceFile(BaseModel):
-    """What a rule's selection, an active one and a step 1 have in common. views: in order. key: its fingerprint."""
-
-    key: str
-    views: list[str] = Field(validation_alias=AliasChoices("views", "selected"))
-    seconds: float
-    cpu_seconds: float
-    peak_mb: float | None = None
 
 
 def read_choice(path: Path) -> ChoiceFile:

@@ -35,7 +35,6 @@ def plot(results: Mapping[str, Any], path: Path, across: str) -> None:
 
     Lines are means over scenes and seeds; whiskers the standard deviation over seeds of the mean over scenes.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figures = Figures(results)
@@ -45,7 +44,6 @@ def plot(results: Mapping[str, Any], path: Path, across: str) -> None:
         if any(cell[metric] is not None for cells in figures.cells.values() for cell in cells.values())
     ]
     figure = Figure(figsize=(4 * len(metrics) + 1.8, 3 * len(figures.pools) + 0.6), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(len(figures.pools), len(metrics), squeeze=False)
     for row, pool in zip(axes, figures.pools, strict=True):
         for axis, (metric, title) in zip(row, metrics, strict=True):

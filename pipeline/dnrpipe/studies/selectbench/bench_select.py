@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +11,18 @@ from dnrtrain.atomic import write_json, write_text
 
 from ...core.console import Console
 from ...core.errors import UserError
-from ...core.settings import merge, parse_assignment, resolve
+from ...core.settings import merge, resolve
 from ...core.workspace import locked
+from ..cells.measure import METRICS, mean_of
+from ..cells.request import merged
 from ..cells.scenes import find_scenes
-from ..cells.worker_pool import check_amounts, make_pool
-from .bench import Bench, Request
+from ..cells.tasks import read_cell
+from ..cells.worker_pool import make_pool
+from .bench import Bench, Place, PlannedCell, Request, read_choice
 from .bench_plots import plot
-from .bench_results import gather
-from .bench_tables import markdown
+from .bench_tables import SCHEMA, markdown
 from .policies import choose_policies
-from .pools import choose_pools
+from .pools import Pool, choose_pools
 
 SMOKE: dict[str, Any] = {
     "cameras": {"train": 10, "test": 2, "width": 32, "height": 32},
@@ -60,16 +63,13 @@ def run_bench(
         UserError: unknown names, settings that do not fit. TasksFailed: some cells failed; the others are written.
     """
     # Step 2 trains all cells; validation views would cost passes and decide nothing.
-    overrides: dict[str, Any] = merge({"cameras": {"train": CANDIDATES, "val": 0}}, SMOKE if smoke else {})
-    if views is not None:
-        overrides = merge(overrides, {"cameras": {"train": views}})
-    for text in assignments:
-        overrides = merge(overrides, parse_assignment(text))
+    cameras = {"train": CANDIDATES, "val": 0}
+    given = {} if views is None else {"cameras": {"train": views}}
+    overrides = merged([{"cameras": cameras}, SMOKE if smoke else {}, given], assignments)
     count = resolve(preset, overrides, environment={}).cameras.train
     defaults = SMOKE_REQUEST if smoke else CORE
     wanted = choose_budgets(budgets or defaults["budgets"], count)
     base = resolve(preset, merge(overrides, {"select": {"budget": max(wanted)}}), environment={})
-    check_amounts(seconds, seeds, jobs)
     if base.cameras.source != "auto":
         raise UserError(f"cameras.source={base.cameras.source}: the pools decide where cameras stand; use --pools")
     request = Request(
@@ -83,26 +83,13 @@ def run_bench(
         out=out,
         jobs=jobs,
     )
-    if out.exists() and not out.is_dir():
-        raise UserError(f"--out {out}: is a file; name a folder")
-    facts = {
-        "preset": base.preset,
-        "resolution": f"{base.cameras.width}x{base.cameras.height}",
-        "candidates": base.cameras.train,
-        "seconds": seconds,
-        "seeds": seeds,
-        "scenes": [path.stem for path in request.scenes],
-        "pools": request.pools,
-        "budgets": request.budgets,
-        "spp": {"training": base.raytrace.spp, "test": base.raytrace.evaluation_spp},
-    }
     bench = Bench(request, console, make_pool(base, jobs, out / "logs" / "cells.log", console, single=True))
     with locked(out, "bench-select"):
         try:
             for _ in bench.run():
-                _write(bench, facts)
+                _write(bench)
         finally:
-            results = _write(bench, facts)
+            results = _write(bench)
     return results
 
 
@@ -124,10 +111,60 @@ def choose_budgets(text: str, candidates: int) -> list[int]:
     return sorted(found)
 
 
-def _write(bench: Bench, facts: dict[str, Any]) -> dict[str, Any]:
+def _gather(bench: Bench) -> dict[str, Any]:
+    """Everything that tables and plots need; cells whose file is missing are left out."""
+    pools = {(pool.scene, pool.name): pool for pool in bench.pools}
+    request = bench.request
+    return {
+        **request.facts(SCHEMA),
+        "candidates": request.base.cameras.train,
+        "pools": request.pools,
+        "budgets": request.budgets,
+        "device": bench.worker_pool.device,
+        "threads": bench.worker_pool.threads,
+        "policies": {contender.name: contender.what for contender in request.policies},
+        "cells": [
+            _line(bench, pools[place.scene, place.pool], place, cell)
+            for place, cell in bench.cells.items()
+            if cell.task.output.exists()
+        ],
+    }
+
+
+def _line(bench: Bench, pool: Pool, place: Place, planned: PlannedCell) -> dict[str, Any]:
+    """One cell: metrics as means over the test views, and the seconds of each part.
+
+    select_seconds: choosing, step 1 included where it chooses; view_seconds: tracing the views and their base images;
+    train_seconds: step 2, and step 1 where it only gives the start; total_seconds: all of them.
+    """
+    cell, choice = read_cell(planned.task.output), read_choice(planned.choice)
+    training, clock = cell.training, bench.clock
+    assert training is not None  # every cell has a network
+    step1 = training.step1
+    chooses = step1 is not None and step1.key == choice.key
+    train = getattr(training.step2, clock) + (getattr(step1, clock) if step1 and not chooses else 0.0)
+    seconds = {
+        "select_seconds": getattr(choice, clock),
+        "view_seconds": bench.view_seconds(pool, cell.views),
+        "train_seconds": train,
+    }
+    return {
+        **asdict(place),
+        "key": cell.key,
+        **{name: mean_of(cell.tests, name) for name in METRICS},
+        "views": choice.views,
+        **{name: round(value, 3) for name, value in seconds.items()},
+        "total_seconds": round(sum(seconds.values()), 3),
+        "select_peak_mb": choice.peak_mb and round(choice.peak_mb),
+        "epochs": training.epochs,
+        "steps": training.step2.steps,
+        "commit": cell.code["commit"],
+    }
+
+
+def _write(bench: Bench) -> dict[str, Any]:
     """Results, report and curves of the cells that are there."""
-    out = bench.request.out
-    results = gather(bench, {**facts, "device": bench.worker_pool.device, "threads": bench.worker_pool.threads})
+    out, results = bench.request.out, _gather(bench)
     if results["cells"]:
         write_json(out / "results.json", results)
         write_text(out / "report.md", markdown(results))

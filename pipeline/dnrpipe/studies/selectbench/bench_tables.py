@@ -12,13 +12,19 @@ from pathlib import Path
 from typing import Any
 
 from ..cells.markdown import NONE, made_line, spread, table
-from .bench_results import read_results
+from ..cells.provenance import read_made
 from .figures import SPHERICAL, Figures
 from .intervals import LEVEL, Difference
 from .pools import POOLS
 
+SCHEMA = 1
 METRICS = (("psnr", "PSNR", 2), ("psnr_mask", "PSNR in mask", 2), ("ssim", "SSIM", 4), ("lpips_vgg", "LPIPS VGG", 4))
 TIMES = (("select_seconds", "selection, s", 2), ("total_seconds", "total, s", 0))
+
+
+def read_results(path: Path) -> dict[str, Any]:
+    """``results.json`` of a benchmark. Raises UserError: missing, damaged or of another schema."""
+    return read_made(path, "bench-select", SCHEMA, "pools")
 
 
 def markdown(results: Mapping[str, Any], *, pictures: bool = True) -> str:

@@ -49,17 +49,13 @@ class Figures:
             return None
         return max(found, key=lambda name: statistics.fmean(found[name][place] for place in shared))
 
-    def baseline(self, kind: str, pool: str, budget: int) -> str | None:
-        """``random``, or the name of the best simple rule here for ``simple``."""
-        return self.best_simple(pool, budget) if kind == "simple" else kind
-
     def against(self, policy: str, kind: str, pools: Sequence[str], budget: int, metric: str) -> Difference | None:
-        """policy - baseline, each pool with its own baseline.
+        """policy - baseline, each pool with its own: ``random``, or its best simple rule for kind ``simple``.
 
         Over several pools it is the mean of each (scene, seed) over them. None where they share nothing, or where the
         policy is the baseline everywhere; where it is the baseline in some pools, these count as 0.
         """
-        baselines = {pool: self.baseline(kind, pool, budget) for pool in pools}
+        baselines = {pool: self.best_simple(pool, budget) if kind == "simple" else kind for pool in pools}
         baselines = {pool: baseline for pool, baseline in baselines.items() if baseline is not None}
         if all(baseline == policy for baseline in baselines.values()):
             return None

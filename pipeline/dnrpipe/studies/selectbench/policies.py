@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ...core.settings import Settings, merge
-from ..cells.names import choose_names
+from ..cells.request import choose_names
 
 LEARNED = "rl-paper"
 """The policy that the trainer's step 1 trains."""
@@ -35,11 +35,7 @@ class Contender:
 
 def _paper(name: str, what: str, reward: str) -> Contender:
     what = f"the paper's RL selector, reward: {what}"
-    return Contender(name, what, LEARNED, "step1", changes=_reward(reward))
-
-
-def _reward(name: str) -> dict[str, Any]:
-    return {"select": {"step1": {"reward": name}}}
+    return Contender(name, what, LEARNED, "step1", changes={"select": {"step1": {"reward": reward}}})
 
 
 _CONTENDERS = (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from dnrtrain.atomic import atomic_path, write_json
@@ -32,11 +33,16 @@ POOLS: dict[str, str] = {
 
 @dataclass
 class Pool:
-    """One scene with one set of candidates. ``data``: its workspace, views and hash of inputs."""
+    """One scene with one set of candidates, whose cameras stand. run: in its workspace, settings with its cameras."""
 
     scene: str
     name: str
-    data: Scene
+    run: Run
+
+    @cached_property
+    def data(self) -> Scene:
+        """Its views, passes rendered where they are missing. Raises UserError: fewer than the largest budget."""
+        return prepared(self.folder, self.run, "bench-select")
 
     @property
     def folder(self) -> str:
@@ -56,22 +62,7 @@ def choose_pools(text: str) -> list[str]:
     return [name for name in POOLS if name in names]
 
 
-@dataclass(frozen=True)
-class Placed:
-    """A pool whose cameras stand and whose passes are still to come. ``settings``: with the pool's cameras."""
-
-    scene: str
-    name: str
-    workspace: Workspace
-    settings: Settings
-
-    def prepare(self, console: Console) -> Pool:
-        """Render the passes that are missing. Raises UserError: fewer candidates than the largest budget."""
-        run = Run(self.workspace, self.settings, console)
-        return Pool(self.scene, self.name, prepared(f"{self.scene}-{self.name}", run, "bench-select"))
-
-
-def place_pool(source: Path, pool: str, out: Path, settings: Settings, console: Console) -> Placed:
+def place_pool(source: Path, pool: str, out: Path, settings: Settings, console: Console) -> Pool:
     """Make or find the pool's workspace ``<out>/scenes/<scene>-<pool>.dnr`` and say where its cameras stand.
 
     What does not depend on the cameras (conversion, baked textures) is made once per scene and copied. Raises
@@ -95,7 +86,7 @@ def place_pool(source: Path, pool: str, out: Path, settings: Settings, console: 
             views = inside(summary, settings.cameras, meshes, source.stem)
         write_rig(file, views)
         settings.cameras.source, settings.cameras.source_sha256 = str(file.resolve()), file_sha256(file)
-    return Placed(source.stem, pool, workspace, settings)
+    return Pool(source.stem, pool, Run(workspace, settings, console))
 
 
 def write_rig(path: Path, views: dict[str, list[View]]) -> None:

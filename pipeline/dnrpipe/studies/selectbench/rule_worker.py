@@ -7,11 +7,9 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dnrtrain.atomic import write_json
-
 from ...core.scene_files import split_views
 from ...core.workspace import Workspace
-from ..cells.tasks import SelectionResult, StudyTask
+from ..cells.tasks import FileWorker, SelectionResult, StudyTask
 
 if TYPE_CHECKING:
     from dnrtrain.selector.visibility import SurfaceVisibility
@@ -25,21 +23,19 @@ class RuleTask(StudyTask):
     seed: int
 
 
-class Worker:
+class Worker(FileWorker):
     """Answers a `RuleTask`.
 
     A pool's visibility is made once per process; what that took is part of every selection that looks at it, as if
     it had made it itself.
     """
 
-    def __init__(self, common: dict[str, Any]) -> None:
+    def __init__(self, common: dict[str, Any]) -> None:  # without torch
         self.place: Path | None = None
         self.visibility, self.spent = None, (0.0, 0.0)
 
-    def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
-        made = self._choose(RuleTask.model_validate(task)).model_dump(mode="json")
-        write_json(Path(task["output"]), made)
-        return made
+    def answer(self, task: dict[str, Any]) -> SelectionResult:
+        return self._choose(RuleTask.model_validate(task))
 
     def _choose(self, task: RuleTask) -> SelectionResult:
         from dnrtrain.selector.policies import untrained

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from dnrtrain.atomic import write_json
 from dnrtrain.checkpoint import load_model
 from dnrtrain.dataset import ViewSet
 from dnrtrain.events import Diverged, EpochEnd
@@ -19,28 +18,27 @@ from dnrtrain.settings import ModelSettings, Step1Settings
 from dnrtrain.step1 import run_step1
 
 from ...cells.cell import load_cell_views, training_cost
-from ...cells.tasks import SelectionResult
+from ...cells.tasks import FileWorker, SelectionResult
 from .batches import choose_actively
 from .settings import ActiveSettings, ActiveTask
 
 CLOCKS = ("seconds", "cpu_seconds")
 
 
-class Worker:
+class Worker(FileWorker):
     """Answers an `ActiveTask`."""
 
     def __init__(self, common: dict[str, Any]) -> None:
-        import torch
-
-        if common["threads"]:
-            torch.set_num_threads(common["threads"])
+        super().__init__(common)
         self.device = common["device"]
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
-        made = self._choose(ActiveTask.model_validate(task)).model_dump(mode="json", exclude_none=True)
-        write_json(Path(task["output"]), made)
+        made = super().__call__(task)
         shutil.rmtree(Path(task["folder"]), ignore_errors=True)
         return made
+
+    def answer(self, task: dict[str, Any]) -> SelectionResult:
+        return self._choose(ActiveTask.model_validate(task))
 
     def _choose(self, task: ActiveTask) -> SelectionResult:
         settings = task.settings
