@@ -190,9 +190,8 @@ def _points(workspace: Workspace, views: Sequence[View], frame: SceneFrame) -> t
         image, _ = read_exr(workspace.raytraced("train", view.name))
         inside = (surface["mask"] > 0.5) & (image["A"] > 0.5)
         points.append(np.stack([surface[f"position.{c}"][inside] for c in "XYZ"], axis=1))
-        colour = torch.from_numpy(np.stack([image[c] for c in "RGB"])) / torch.from_numpy(image["A"]).clamp_min(
-            ALPHA_FLOOR
-        )
+        alpha = torch.from_numpy(image["A"]).clamp_min(ALPHA_FLOOR)
+        colour = torch.from_numpy(np.stack([image[c] for c in "RGB"])) / alpha
         colours.append((display(colour).permute(1, 2, 0).numpy()[inside] * 255 + 0.5).astype(np.uint8))
     place, colour = np.concatenate(points), np.concatenate(colours)
     if len(place) > POINTS:

@@ -84,34 +84,19 @@ def _rows(plan: Plan) -> list[PlannedRow]:
     chosen, actual = plan.chosen, plan.actual
     if chosen is None or actual is None:
         return []
-    rows = [
-        PlannedRow(
-            what=name,
-            predicted=duration(getattr(chosen.seconds, name)),
-            actual=duration(actual.seconds[name]) if actual.ran[name] else "was done before",
-        )
-        for name in RENDERER_STAGES
-    ]
+    rows = []
+    for name in RENDERER_STAGES:
+        spent = duration(actual.seconds[name]) if actual.ran[name] else "was done before"
+        rows.append((name, duration(getattr(chosen.seconds, name)), spent))
     total, psnr = chosen.seconds.total, chosen.psnr
-    rows.append(
-        PlannedRow(
-            what="all three",
-            predicted=f"{duration(total.expected)} ({duration(total.low)} to {duration(total.high)})",
-            actual=duration(actual.seconds["total"]),
-        )
-    )
+    predicted = f"{duration(total.expected)} ({duration(total.low)} to {duration(total.high)})"
+    rows.append(("all three", predicted, duration(actual.seconds["total"])))
     if plan.carried_out is not None:
-        steps = [str(one.choice.steps) for one in (chosen, plan.carried_out)]
-        rows.append(PlannedRow(what="steps, by the time left", predicted=steps[0], actual=steps[1]))
+        rows.append(("steps, by the time left", str(chosen.choice.steps), str(plan.carried_out.choice.steps)))
     if actual.psnr is not None:
-        rows.append(
-            PlannedRow(
-                what="PSNR, held-out",
-                predicted=f"{psnr.expected:.1f} dB ({psnr.low:.1f} to {psnr.high:.1f})",
-                actual=f"{actual.psnr:.1f} dB",
-            )
-        )
-    return rows
+        predicted = f"{psnr.expected:.1f} dB ({psnr.low:.1f} to {psnr.high:.1f})"
+        rows.append(("PSNR, held-out", predicted, f"{actual.psnr:.1f} dB"))
+    return [PlannedRow(what=what, predicted=predicted, actual=spent) for what, predicted, spent in rows]
 
 
 def _frontier_pictures(root: Path) -> list[tuple[str, str]] | None:

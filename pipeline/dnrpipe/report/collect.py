@@ -86,14 +86,9 @@ def collect(root: Path, *, made_at: datetime | None = None) -> ReportData:
     chosen = _read_model(root / "selection.json", SelectionRecord, "select")
     ledger = Ledger(root / "costs.jsonl")
     records = ledger.read()
-
     selected = {f"train/{name}" for name in chosen.views} if chosen else None
-    summary = summarise(
-        records,
-        n_candidates=len(cameras["train"]) or None,
-        only=selected,
-        truncated_records=ledger.truncated_records(),
-    )
+    candidates, truncated = len(cameras["train"]) or None, ledger.truncated_records()
+    summary = summarise(records, n_candidates=candidates, only=selected, truncated_records=truncated)
     quality = build_quality(root, metrics, records) if metrics else None
     selection = _selection(root, chosen, records, cameras["train"]) if chosen else None
     training = [t for t in (_training(root, step) for step in (1, 2)) if t]

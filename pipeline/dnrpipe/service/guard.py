@@ -112,18 +112,14 @@ class Guard:
             else:
                 await self.app(scope, self._bounded(scope, receive), sending)
         finally:
-            ACCESS.info(
-                "request",
-                extra={
-                    "facts": {
-                        "client": _client(scope),
-                        "method": scope.get("method", "WEBSOCKET"),
-                        "path": scope["path"],
-                        "status": status,
-                        "ms": round(1000 * (time.monotonic() - started), 1),
-                    }
-                },
-            )
+            facts = {
+                "client": _client(scope),
+                "method": scope.get("method", "WEBSOCKET"),
+                "path": scope["path"],
+                "status": status,
+                "ms": round(1000 * (time.monotonic() - started), 1),
+            }
+            ACCESS.info("request", extra={"facts": facts})
 
     def _refusal(self, scope: Scope, headers: dict[str, str]) -> tuple[int, str, dict[str, str]] | None:
         """(status, one line, headers) if the guard refuses the request, else None."""
@@ -139,11 +135,8 @@ class Guard:
                 return 429, "too many wrong tokens; wait a minute", {"retry-after": "60"}
             if not hmac.compare_digest(_given_token(scope, headers), self.token):
                 self.refusals.take(client)
-                return (
-                    401,
-                    "wrong or missing token; send it as Authorization: Bearer TOKEN",
-                    {"www-authenticate": "Bearer"},
-                )
+                reason = "wrong or missing token; send it as Authorization: Bearer TOKEN"
+                return 401, reason, {"www-authenticate": "Bearer"}
         wait = self.rates.take(client)
         if wait > 0:
             return 429, "too many requests; slow down", {"retry-after": str(max(1, math.ceil(wait)))}

@@ -59,9 +59,8 @@ class Supervisor:
                     LOG.error("worker died", extra={"facts": {"device": device, "code": process.returncode}})
                     del self.processes[device]
                     self.queue.recover(device)
-                    pause[device] = (
-                        1.0 if now - started[device] > STEADY_SECONDS else min(2 * pause[device], LONGEST_PAUSE)
-                    )
+                    steady = now - started[device] > STEADY_SECONDS
+                    pause[device] = 1.0 if steady else min(2 * pause[device], LONGEST_PAUSE)
                     due[device] = now + pause[device]
                 elif process is None and now >= due[device]:
                     self.processes[device] = self._spawn(device)
