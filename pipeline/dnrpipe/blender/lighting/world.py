@@ -66,7 +66,6 @@ def export_world(
 
 
 def _constant(root: ET.Element, radiance: np.ndarray) -> bool:
-    """Background colour x strength -> ``constant``."""
     if not np.any(radiance > 0):
         return False
     element = xmltree.plugin("emitter", "constant", id="world")
