@@ -86,7 +86,6 @@ class Worker:
         return self.silhouettes[size]
 
     def _traced(self, common: SampledCommon, view: View, channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """A few path-traced samples, denoised, as the colour."""
         integrator, _ = self.engine.integrator(self.bundle, common.integrator, common.max_depth)
         sensor = self.engine.sensor(view)
         picture, _ = self.engine.frame(self.bundle, integrator, sensor, view, common.spp, common.seed)

@@ -232,7 +232,6 @@ class LightBaker:
         return [*dr.select(fine, b, 0), *dr.select(fine, rho, 0), self._one(wanted & ~fine)]
 
     def _one(self, where: Any) -> Any:
-        """1 there, else 0."""
         import drjit as dr
 
         return dr.select(where, self.mi.Float(1), 0)

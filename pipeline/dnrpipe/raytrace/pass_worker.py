@@ -34,7 +34,6 @@ class Worker:
         return self._add(PassTask.model_validate(task)) if task["add"] else self._write(WriteTask.model_validate(task))
 
     def _add(self, task: PassTask) -> PassAnswer:
-        """One pass. Returns the view's figures."""
         first, self.started = not self.started, True
         samples = _samples(task)
         started, cpu = time.monotonic(), time.process_time()
@@ -72,7 +71,6 @@ class Worker:
         return answer
 
     def _write(self, task: WriteTask) -> WriteAnswer:
-        """The view's EXR."""
         samples = _samples(task)
         facts = samples.facts
         if not facts.spp:

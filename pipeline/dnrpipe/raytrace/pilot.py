@@ -84,8 +84,7 @@ class Worker:
         noisy = failed is not None and failed.mean <= task.tolerance < failed.mean + failed.mean_error
         if high == len(DEPTHS):
             found[REFERENCE_DEPTH] = DepthStep(depth=REFERENCE_DEPTH, mean=0.0, mean_error=0.0, pixel=0.0)
-            return REFERENCE_DEPTH, list(found.values()), noisy
-        return DEPTHS[high], list(found.values()), noisy
+        return (*DEPTHS, REFERENCE_DEPTH)[high], list(found.values()), noisy
 
     def compare(self, task: CompareTask) -> CompareAnswer:
         """What the first configuration costs over the second, and by how much their pictures differ.

@@ -54,24 +54,16 @@ def sensor_dict(mi: Any, view: View, lens: dict[str, float] | None = None) -> di
         }
     width, left = _centred(view.width, view.cx)
     height, top = _centred(view.height, view.cy)
-    crop = {
-        "width": width,
-        "height": height,
-        "crop_width": view.width,
-        "crop_height": view.height,
-        "crop_offset_x": left,
-        "crop_offset_y": top,
-    }
+    film |= {"width": width, "height": height}
+    if (width, height) != (view.width, view.height):
+        film |= {"crop_width": view.width, "crop_height": view.height, "crop_offset_x": left, "crop_offset_y": top}
     return {
         **common,
         "type": "thinlens",
         "fov": _fov(width, view.fl_x),
         "aperture_radius": lens["aperture_radius"],
         "focus_distance": lens["focus_distance"],
-        "film": {
-            **film,
-            **(crop if (width, height) != (view.width, view.height) else {"width": width, "height": height}),
-        },
+        "film": film,
     }
 
 

@@ -183,7 +183,6 @@ class SpecularPaths:
         return [lost, *means, *chain_uv, chain_ended, chain_weight, *normal, *uv, depth, covered]
 
     def _random_numbers(self, steps: Any, number: Any, vertex: Any) -> list[Any]:
-        """NUMBERS numbers in [0, 1)."""
         rows = [dr.gather(mi.Float, steps, vertex * NUMBERS + dimension) for dimension in range(NUMBERS)]
         return [fraction(0.5 + number * step) for step in rows]
 

@@ -113,7 +113,6 @@ def display(rgba: np.ndarray) -> np.ndarray:
 
 
 def _half_width(values: np.ndarray) -> float:
-    """Half the 95% confidence interval of the mean (Student's t)."""
     count = len(values)
     if count < 2:
         return 0.0

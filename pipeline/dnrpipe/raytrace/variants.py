@@ -56,24 +56,14 @@ def choose_variant(requested: str = "auto") -> VariantChoice:
 def llvm_libraries() -> list[Path]:
     """LLVM shared libraries of this machine, newest first; those known to abort Mitsuba 3.9 left out."""
     found: dict[int, Path] = {}
-    for folder in _library_folders():
+    named = [Path(p) for p in ("/usr/lib", "/usr/lib64", "/usr/local/lib", "/opt/homebrew/opt/llvm/lib")]
+    usual = Path("/usr/lib")
+    for folder in (*named, *sorted(usual.glob("*-linux-gnu")), *sorted(usual.glob("llvm-*/lib"))):
         for path in sorted(folder.glob("libLLVM*.so*")):
             match = re.match(r"libLLVM(?:\.so\.|-)(\d+)", path.name)
             if match and int(match.group(1)) >= 17:
                 found.setdefault(int(match.group(1)), path)
     return [found[version] for version in sorted(found, reverse=True)]
-
-
-def _library_folders() -> list[Path]:
-    folders = [
-        Path("/usr/lib"),
-        Path("/usr/lib64"),
-        Path("/usr/local/lib"),
-        Path("/opt/homebrew/opt/llvm/lib"),
-    ]
-    folders += sorted(Path("/usr/lib").glob("*-linux-gnu"))
-    folders += sorted(Path("/usr/lib").glob("llvm-*/lib"))
-    return [folder for folder in folders if folder.is_dir()]
 
 
 def _environments(variant: str) -> list[dict[str, str]]:

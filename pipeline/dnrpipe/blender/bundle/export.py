@@ -55,16 +55,11 @@ def export_bundle(
     ]
     materials = {converted.id: converted for slots in used for _, converted in slots}
     shapes = export_shapes(meshes, used, converter, scene_dir, findings)
-    for element in converter.sheets_elements():
-        root.append(element)
+    root.extend(converter.sheets_elements())
     media = [converted.medium for converted in materials.values() if converted.medium is not None]
     root.insert(0, _integrator("volpath" if media else "path"))
-    for converted in materials.values():
-        root.append(converted.bsdf)
-    for medium in media:
-        root.append(medium)
-    for shape in shapes:
-        root.append(shape)
+    root.extend(converted.bsdf for converted in materials.values())
+    root.extend([*media, *shapes])
     report_ray_visibility((mesh.object_name for mesh in meshes), findings)
     export_lights(scene, root, store, findings, center, radius)
     export_world(scene, root, store, images, findings, center, radius)

@@ -50,7 +50,6 @@ def rescale(root: ET.Element, factor: float) -> None:
 
 
 def _multiply(parent: ET.Element, names: tuple[str, ...], factor: float) -> None:
-    """Multiply the float, rgb, point and vector parameters of these names."""
     for child in parent:
         if child.get("name") not in names:
             continue

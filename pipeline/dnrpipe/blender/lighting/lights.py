@@ -131,7 +131,6 @@ def _falloff(socket: Any, scope: Scope, name: str, findings: Findings) -> float 
 
 
 def _note_ignored(obj: Any, light: Any, findings: Findings) -> None:
-    """Lamp features without equivalent."""
     if not light.use_shadow:
         findings.add("ignored", "lamp without shadow", "casts shadows", object=obj.name)
     hidden = [ray for ray in ("diffuse", "glossy", "transmission") if not getattr(obj, f"visible_{ray}")]
@@ -142,7 +141,6 @@ def _note_ignored(obj: Any, light: Any, findings: Findings) -> None:
 
 
 def _is_linked(obj: Any) -> bool:
-    """Whether light linking says what the object lights or shades."""
     linking = getattr(obj, "light_linking", None)
     return linking is not None and bool(linking.receiver_collection or linking.blocker_collection)
 

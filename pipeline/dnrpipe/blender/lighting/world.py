@@ -30,8 +30,8 @@ def export_world(
     findings: Findings,
     center: np.ndarray,
     radius: float,
-) -> bool:
-    """Append the world's emitter to ``root``; False when there is no world or it is black.
+) -> None:
+    """Append the world's emitter to ``root``, if there is a world and it is not black.
 
     Constant Background -> ``constant``; Environment Texture with constant strength -> ``envmap``, rotated by its
     Mapping node; any other node tree is rendered once with Cycles as an equirectangular image, the sun disc of a Sky
@@ -39,15 +39,16 @@ def export_world(
     """
     world = scene.world
     if world is None:
-        return False
+        return
     tree = world.node_tree
     if tree is None:
-        return _constant(root, np.array(world.color))
+        _constant(root, np.array(world.color))
+        return
     if surface_source(tree, "Volume") is not None:
         findings.add("ignored", f"world '{world.name}' volume", "no fog or atmosphere")
     source = surface_source(tree)
     if source is None:
-        return False
+        return
     if source.node.type == "BACKGROUND":
         strength = resolve(source.node.inputs["Strength"], source.scope)
         colour = resolve(source.node.inputs["Color"], source.scope)
@@ -55,24 +56,22 @@ def export_world(
         if amount is not None:
             plain = plain_colour(colour)
             if plain is not None:
-                return _constant(root, plain * amount)
+                _constant(root, plain * amount)
+                return
             if np.allclose(amount, 0):
-                return False
+                return
             if colour.node.type == "TEX_ENVIRONMENT" and _hdri(
                 root, colour.node, colour.scope, float(amount[0]), store, images, findings, world.name
             ):
-                return True
-    return _rendered(world, root, store, findings, center, radius)
+                return
+    _rendered(world, root, store, findings, center, radius)
 
 
-def _constant(root: ET.Element, radiance: np.ndarray) -> bool:
-    """Background colour x strength -> ``constant``."""
-    if not np.any(radiance > 0):
-        return False
-    element = xmltree.plugin("emitter", "constant", id="world")
-    xmltree.rgb(element, "radiance", np.maximum(radiance, 0))
-    root.append(element)
-    return True
+def _constant(root: ET.Element, radiance: np.ndarray) -> None:
+    if np.any(radiance > 0):
+        element = xmltree.plugin("emitter", "constant", id="world")
+        xmltree.rgb(element, "radiance", np.maximum(radiance, 0))
+        root.append(element)
 
 
 def _hdri(
@@ -91,7 +90,8 @@ def _hdri(
         return False
     if node.image is None:
         findings.add("missing", f"world '{world}' image", "no image chosen; magenta light stands for it")
-        return _constant(root, np.array([1.0, 0.0, 1.0]) * strength)
+        _constant(root, np.array([1.0, 0.0, 1.0]) * strength)
+        return strength > 0
     texels, srgb = images.read(node.image, None)
     colour = texels[..., :3]
     if colour.dtype == np.uint8:
@@ -136,7 +136,7 @@ def rows_to_nodes(image: np.ndarray) -> np.ndarray:
 
 def _rendered(
     world: Any, root: ET.Element, store: TextureStore, findings: Findings, center: np.ndarray, radius: float
-) -> bool:
+) -> None:
     """Any other world -> rendered once by Cycles as an equirectangular image (sky textures, gradients, mixes)."""
     paths = [node for node in walk(world.node_tree) if node.type == "LIGHT_PATH"]
     copy = world.copy()
@@ -161,15 +161,10 @@ def _rendered(
     finally:
         bpy.data.worlds.remove(copy)
     pixels = finite_texels(pixels, f"world '{world.name}'", findings)
-    if not np.any(pixels > 0):
-        return sun is not None
-    findings.add(
-        "baked",
-        f"world '{world.name}'",
-        f"its nodes are rendered into a {SIZE[0]} x {SIZE[1]} environment image",
-    )
-    _envmap(root, pixels, 1.0, ENVMAP_TO_BLENDER, store, f"{world.name}-world")
-    return True
+    if np.any(pixels > 0):
+        note = f"its nodes are rendered into a {SIZE[0]} x {SIZE[1]} environment image"
+        findings.add("baked", f"world '{world.name}'", note)
+        _envmap(root, pixels, 1.0, ENVMAP_TO_BLENDER, store, f"{world.name}-world")
 
 
 def _unlink_camera_rays(tree: bpy.types.NodeTree) -> None:

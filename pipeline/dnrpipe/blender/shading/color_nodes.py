@@ -108,7 +108,6 @@ MATH: dict[str, Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]] = {
 
 
 def _math(node: Any, socket: Any, a: Arrays) -> np.ndarray | None:
-    """Math."""
     function = MATH.get(node.operation)
     if function is None:
         return None
@@ -117,7 +116,6 @@ def _math(node: Any, socket: Any, a: Arrays) -> np.ndarray | None:
 
 
 def _clamp(node: Any, socket: Any, a: Arrays) -> np.ndarray:
-    """Clamp (Min Max, or Range with swapped limits)."""
     low, high = _grey(a[1]), _grey(a[2])
     if node.clamp_type == "RANGE":
         low, high = np.minimum(low, high), np.maximum(low, high)
@@ -125,7 +123,6 @@ def _clamp(node: Any, socket: Any, a: Arrays) -> np.ndarray:
 
 
 def _map_range(node: Any, socket: Any, a: Arrays) -> np.ndarray | None:
-    """Map Range, float, linear."""
     if node.data_type != "FLOAT" or node.interpolation_type != "LINEAR":
         return None
     value, low, high, to_low, to_high = (_grey(x) for x in a[:5])
@@ -160,7 +157,6 @@ def _separate(node: Any, socket: Any, a: Arrays) -> np.ndarray | None:
 
 
 def _combine(node: Any, socket: Any, a: Arrays) -> np.ndarray | None:
-    """Combine Color (RGB) / Combine XYZ."""
     if getattr(node, "mode", "RGB") != "RGB":
         return None
     grey = np.broadcast_arrays(*(_grey(x)[..., 0] for x in a[:3]))

@@ -24,7 +24,6 @@ class LobeShaders(NormalShaders):
     """One method per node that reflects light."""
 
     def _diffuse(self, node: Any, scope: Scope) -> Surface:
-        """Diffuse BSDF -> ``diffuse``."""
         if self._number(node, scope, 0.0, "Roughness") > 0:
             self.note("approximated", "diffuse roughness", "Oren-Nayar is taken as Lambert")
         return self._bent(self._diffuse_element(self._colour(node, scope, "Color")), node, scope)
@@ -105,13 +104,11 @@ class LobeShaders(NormalShaders):
         return self._bent(element, node, scope)
 
     def _translucent(self, node: Any, scope: Scope) -> Surface:
-        """Translucent BSDF -> ``dnr_translucent``."""
         element = xmltree.plugin("bsdf", "dnr_translucent")
         self._put_colour(element, "color", self._colour(node, scope, "Color"))
         return self._bent(element, node, scope, both_sides=True)
 
     def _subsurface(self, node: Any, scope: Scope) -> Surface:
-        """Subsurface Scattering -> ``diffuse`` of its colour."""
         self.note("approximated", "subsurface scattering", "treated as diffuse reflection of the colour")
         return self._bent(self._diffuse_element(self._colour(node, scope, "Color")), node, scope)
 

@@ -21,7 +21,6 @@ class NormalShaders(ShaderBase):
     """Wraps BSDFs in what bends their shading normal."""
 
     def _bent(self, bsdf: ET.Element, node: Any, scope: Scope, *, both_sides: bool = False) -> Surface:
-        """``bsdf`` under the node's Normal input."""
         socket = find_input(node, "Normal")
         surface = Surface(bsdf, both_sides)
         return surface if socket is None else self._by(socket, scope, surface)

@@ -21,7 +21,6 @@ class PrincipledShader(LobeShaders, InterfaceShaders):
     """The Principled BSDF, and the material without nodes, which is one."""
 
     def _principled(self, node: Any, scope: Scope) -> Surface:
-        """Principled BSDF; radiometry in `calibration`."""
         base = self._colour(node, scope, "Base Color")
         roughness = self._scalar(node, scope, "Roughness")
         metallic = self._scalar(node, scope, "Metallic")
@@ -98,7 +97,6 @@ class PrincipledShader(LobeShaders, InterfaceShaders):
             self._put(element, name, value)
 
     def _is_layered(self, node: Any, scope: Scope) -> bool:
-        """Whether there is a coat or sheen."""
         return any(
             not equals(self._scalar(node, scope, *names), 0.0)
             for names in (("Coat Weight", "Clearcoat"), ("Sheen Weight", "Sheen"))

@@ -179,11 +179,10 @@ class ImageReader:
                 )
         elif image.source in {"MOVIE", "SEQUENCE"}:
             self.findings.add("approximated", f"animated image '{image.name}'", "one frame is used", material=material)
-        width, height = image.size
         if not image.has_data:
             # Reading pixels loads the file; without one the size stays 0.
             len(image.pixels)
-            width, height = image.size
+        width, height = image.size
         if width == 0 or height == 0 or len(image.pixels) == 0:
             return None
         channels = image.channels

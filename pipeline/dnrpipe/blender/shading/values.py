@@ -150,7 +150,6 @@ class Evaluator:
         return average
 
     def _view_dependent(self, source: Source) -> Value:
-        """Fresnel or Layer Weight node as a table over the angle of view (`view_dependent`)."""
         node = source.node
         normal = find_input(node, "Normal")
         if normal is not None and resolve(normal, source.scope).linked:
@@ -306,7 +305,6 @@ class Evaluator:
 
 
 def _is_split(image: Any) -> bool:
-    """Whether an image has several tiles or frames."""
     return image.source != "TILED" or [tile.number for tile in image.tiles] != [1001]
 
 

@@ -122,7 +122,6 @@ class VolumeShaders(ShaderBase):
         return Coefficients(absorption, density * colour, self._number(node, scope, 0.0, "Anisotropy"), emission)
 
     def _volume_coefficients(self, node: Any, scope: Scope) -> Coefficients:
-        """Volume Coefficients: a and s as they are."""
         g, rayleigh = self._phase(node, scope)
         absorption = self._mean(node, scope, "Absorption Coefficients")
         scattering = self._mean(node, scope, "Scatter Coefficients")
@@ -139,7 +138,6 @@ class VolumeShaders(ShaderBase):
         return _sum(self._parts(node, scope), (1.0, 1.0))
 
     def _mix_volumes(self, node: Any, scope: Scope) -> Coefficients:
-        """Mix Shader of volumes: weighted sum."""
         factor = min(max(self._number(node, scope, 0.5, "Fac", "Factor"), 0.0), 1.0)
         return _sum(self._parts(node, scope), (1 - factor, factor))
 

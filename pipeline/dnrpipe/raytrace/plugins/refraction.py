@@ -15,7 +15,35 @@ def register(mi: Any) -> None:
     """``dnr_refraction`` and ``dnr_interface`` for the current variant."""
     import drjit as dr
 
-    class Refraction(mi.BSDF):
+    class Scaled(mi.BSDF):
+        """A nested BSDF times `_gain`."""
+
+        def _nest(self, props: Any, name: str) -> None:
+            self.nested = only(props, mi.BSDF, name)
+            self.m_components = [self.nested.flags(i) for i in range(self.nested.component_count())]
+            self.m_flags = self.nested.flags()
+
+        def _context(self, ctx: Any) -> Any:
+            return ctx
+
+        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
+            found, weight = self.nested.sample(self._context(ctx), si, sample1, sample2, active)
+            return found, weight * self._gain(si, found.wo, active)
+
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self.nested.eval(self._context(ctx), si, wo, active) * self._gain(si, wo, active)
+
+        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self.nested.pdf(self._context(ctx), si, wo, active)
+
+        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+            value, density = self.nested.eval_pdf(self._context(ctx), si, wo, active)
+            return value * self._gain(si, wo, active), density
+
+        def traverse(self, callback: Any) -> None:
+            callback.put("nested_bsdf", self.nested, mi.ParamFlags.Differentiable)
+
+    class Refraction(Scaled):
         """Nested ``dielectric`` or ``roughdielectric`` of relative index ``eta``, its transmission divided by 1 - F.
 
         F is the dielectric Fresnel term at the microfacet that refracts wi into wo, ``m ~ wi + eta wo``
@@ -25,19 +53,19 @@ def register(mi: Any) -> None:
         def __init__(self, props: Any) -> None:
             super().__init__(props)
             self.eta = parameter(mi, float(props["eta"]))
-            self.nested = only(props, mi.BSDF, "dnr_refraction")
-            self.m_components = [self.nested.flags(i) for i in range(self.nested.component_count())]
-            self.m_flags = self.nested.flags()
+            self._nest(props, "dnr_refraction")
             lobes = enumerate(self.m_components)
             wanted = int(mi.BSDFFlags.GlossyTransmission | mi.BSDFFlags.DeltaTransmission)
             self.lobe = next(i for i, flags in lobes if int(flags) & wanted)
 
-        def _only_transmission(self) -> Any:
+        def _context(self, ctx: Any) -> Any:
+            """Only transmission."""
             ctx = mi.BSDFContext()
             ctx.component = self.lobe
             return ctx
 
-        def _gain(self, si: Any, wo: Any) -> Any:
+        def _gain(self, si: Any, wo: Any, active: Any) -> Any:
+            del active
             cosine = mi.Frame3f.cos_theta(si.wi)
             eta = dr.select(cosine >= 0, self.eta, 1 / self.eta)
             m = dr.normalize(si.wi + wo * eta)
@@ -50,29 +78,18 @@ def register(mi: Any) -> None:
 
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
             active = active & self._asked(ctx)
-            found, weight = self.nested.sample(self._only_transmission(), si, sample1, sample2, active)
-            return found, dr.select(active, weight * self._gain(si, found.wo), 0)
+            found, weight = super().sample(ctx, si, sample1, sample2, active)
+            return found, dr.select(active, weight, 0)
 
         def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            active = active & self._asked(ctx)
-            return self.nested.eval(self._only_transmission(), si, wo, active) * self._gain(si, wo)
-
-        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self.nested.pdf(self._only_transmission(), si, wo, active)
-
-        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
-            value, density = self.nested.eval_pdf(self._only_transmission(), si, wo, active)
-            return value * self._gain(si, wo), density
-
-        def traverse(self, callback: Any) -> None:
-            callback.put("nested_bsdf", self.nested, mi.ParamFlags.Differentiable)
+            return super().eval(ctx, si, wo, active & self._asked(ctx))
 
         def to_string(self) -> str:
             return "dnr_refraction[]"
 
     mi.register_bsdf("dnr_refraction", Refraction)
 
-    class Interface(mi.BSDF):
+    class Interface(Scaled):
         """Nested ``roughdielectric`` (GGX) of relative index ``eta`` and texture ``roughness``, over its albedo.
 
         Single scattering loses what hits the microfacets twice. As in Cycles, both lobes are divided by the albedo
@@ -83,35 +100,20 @@ def register(mi: Any) -> None:
             super().__init__(props)
             eta = float(props["eta"])
             self.roughness = props.get_texture("roughness")
-            self.nested = only(props, mi.BSDF, "dnr_interface")
+            self._nest(props, "dnr_interface")
             outside, inside = energy.interface_table(eta), energy.interface_table(1 / eta)
             self.table = table_of(mi, [outside, inside, inside])
-            self.m_components = [self.nested.flags(i) for i in range(self.nested.component_count())]
-            self.m_flags = self.nested.flags()
 
-        def _gain(self, si: Any, active: Any) -> Any:
+        def _gain(self, si: Any, wo: Any, active: Any) -> Any:
+            del wo
             cosine = mi.Frame3f.cos_theta(si.wi)
             row = row_of(dr.clip(self.roughness.eval_1(si, active), 0, 1))
             found = look_up(mi, self.table, si, dr.abs(cosine), row, active)
             return 1 / dr.maximum(dr.select(cosine >= 0, found[0], found[1]), 0.05)
 
-        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
-            found, weight = self.nested.sample(ctx, si, sample1, sample2, active)
-            return found, weight * self._gain(si, active)
-
-        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self.nested.eval(ctx, si, wo, active) * self._gain(si, active)
-
-        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self.nested.pdf(ctx, si, wo, active)
-
-        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
-            value, density = self.nested.eval_pdf(ctx, si, wo, active)
-            return value * self._gain(si, active), density
-
         def traverse(self, callback: Any) -> None:
             callback.put("roughness", self.roughness, mi.ParamFlags.Differentiable)
-            callback.put("nested_bsdf", self.nested, mi.ParamFlags.Differentiable)
+            super().traverse(callback)
 
         def to_string(self) -> str:
             return "dnr_interface[]"
