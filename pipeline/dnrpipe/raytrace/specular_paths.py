@@ -11,7 +11,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .base_renderer import TILE, fraction, steps
 from .lobes import (
     bsdfs_of,
     context_of,
@@ -25,6 +24,7 @@ from .lobes import (
     specular_context,
 )
 from .paths import power_heuristic
+from .sequence import TILE, fraction, steps
 from .texels import ATTRIBUTE
 from .visibility import LAMP_PREFIX, UNSEEN_PREFIX, is_one_of
 

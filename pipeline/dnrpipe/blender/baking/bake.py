@@ -17,8 +17,8 @@ from dnrtrain.atomic import atomic_path
 from ..geometry.frozen import ATLAS_LAYER, FrozenMesh, load_geometry
 from ..reading.names import find_material
 from ..reading.opening import open_scene
+from ..shading.image_files import HALF_MAX
 from ..shading.sockets import walk
-from ..shading.textures import HALF_MAX
 from ..tasks import BakeAnswer, BakeCommon, BakeTask, Tap
 from .mesh import MAX_OWN, add_object, needs_own_space
 from .regions import Atlas

@@ -8,7 +8,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from .textures import write_colour_exr
+from .image_files import write_colour_exr
 
 
 def decode(texels: np.ndarray, space: str) -> np.ndarray:

@@ -15,13 +15,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from dnrtrain.atomic import atomic_path
 from dnrtrain.srgb import decode, encode
 
 from ..bundle import xmltree
 from ..findings import Findings
+from .image_files import HALF_MAX, write_colour_exr, write_png
 
-HALF_MAX = 65504.0
 MISSING_COLOUR = (1.0, 0.0, 1.0)
 """What Blender shows for an image that cannot be read."""
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)
@@ -265,24 +264,3 @@ class TextureStore:
             write_png(path, texels) if texels.dtype == np.uint8 else write_colour_exr(path, texels)
             self._written[key] = relative
         return self._written[key]
-
-
-def write_png(path: Path, texels: np.ndarray) -> None:
-    """8-bit grey or RGB PNG from uint8 [H, W, 1 or 3]."""
-    from PIL import Image
-
-    picture = Image.fromarray(texels[..., 0] if texels.shape[2] == 1 else texels)
-    with atomic_path(path) as temporary:
-        picture.save(temporary, format="PNG", compress_level=4)
-
-
-def write_colour_exr(path: Path, texels: np.ndarray) -> None:
-    """EXR from float [H, W, 1 or 3], linear Rec.709; half precision unless a value exceeds its range."""
-    import OpenEXR
-
-    kind = np.float16 if np.abs(texels).max(initial=0.0) < HALF_MAX else np.float32
-    data = np.ascontiguousarray(texels, dtype=kind)
-    channels = {"Y": data[..., 0].copy()} if data.shape[2] == 1 else {"RGB": data}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with atomic_path(path) as temporary, OpenEXR.File(header, channels) as file:
-        file.write(str(temporary))
