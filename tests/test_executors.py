@@ -249,7 +249,7 @@ def test_a_scene_that_opened_at_the_second_try_is_said(
     from dnrpipe.workers import answers
 
     workspace = Workspace.create(tmp_path / "a.dnr", Source(path="a.blend", sha256=""))
-    for last in (TaskResult({}, {"warnings": []}), TaskResult({}, None, "worker hung for 60 s", 2, died=True)):
+    for last in (TaskResult({}, {"bakes": None}), TaskResult({}, None, "worker hung for 60 s", 2, died=True)):
         outcomes = [Retry({}, "worker hung for 60 s"), last]
         monkeypatch.setattr(answers, "run_tasks", lambda *_, found=outcomes, **__: (outcome for outcome in found))
         run = Run(workspace, Settings(), Console(quiet=True))
