@@ -76,7 +76,7 @@ def test_is_small_self_contained_and_fits_a_dome(name: str) -> None:
     scene = bpy.context.scene
     assert scene.render.engine == "CYCLES" and scene.render.film_transparent
     (camera,) = scene_cameras(scene)
-    assert camera["active"] and camera["type"] == "PERSP"
+    assert camera.active and camera.type == "PERSP"
     background = scene.world.node_tree.nodes["Background"]
     lit = bool(background.inputs["Color"].links) or max(background.inputs["Color"].default_value[:3]) > 0
     assert lit and background.inputs["Strength"].default_value > 0
@@ -125,7 +125,7 @@ def test_each_scene_has_the_effects_it_is_there_for() -> None:
     assert nodes("TEX_BRICK") == {"Brickwork"} and "Bulb" in inputs_above("Emission Strength", 10)
     assert sorted(obj.data.type for obj in bpy.data.objects if obj.type == "LIGHT") == ["AREA", "POINT", "POINT"]
     assert bpy.context.scene.view_settings.view_transform == "AgX"
-    path = np.array([frame["c2w"] for frame in camera_animation(bpy.context.scene)])
+    path = np.array([frame.c2w for frame in camera_animation(bpy.context.scene)])
     assert len(path) == 120
     # It drives through the room: inside the walls, never through one.
     steps = np.linalg.norm(np.diff(path[:, :3, 3], axis=0), axis=1)

@@ -50,7 +50,7 @@ def targets(folder: Path) -> dict[str, Target]:
     from dnrpipe.core.settings import CameraSettings
     from dnrpipe.core.workspace import Manifest, Source, Workspace
     from dnrpipe.raytrace.light_worker import read_light
-    from dnrpipe.stages.base_images import _light_fingerprint
+    from dnrpipe.stages.base_images import BaseRenderer
     from dnrpipe.stages.verify import _picture
     from dnrtrain import checkpoint
     from dnrtrain.contract import SceneFrame, View, read_cameras, write_cameras
@@ -133,7 +133,12 @@ def targets(folder: Path) -> dict[str, Target]:
 
     path = folder / "light.npz"
     np.savez(path, light=np.zeros((2, 4, 4, 3), np.float32), fingerprint=np.array("f"))
-    keep("light", path, lambda p: (_light_fingerprint(p), read_light(p)))
+
+    def read_baked(path: Path) -> None:
+        _ = BaseRenderer({}, {}, {"output": str(path), "fingerprint": "f"}, "f").light_is_baked
+        read_light(path)
+
+    keep("light", path, read_baked)
     path = folder / "geometry.npz"
     path.write_bytes(_geometry(folder))
     keep("geometry", path, load_geometry)

@@ -282,7 +282,11 @@ def _rows(image: Tensor, function: Any) -> Tensor:
     return function(flat).t().reshape(1, 2, height, width)
 
 
+def channel_count(name: str) -> int:
+    """Channels of a graph input."""
+    return 3 if name == "view_dir" else len(CHANNELS[name])
+
+
 def _example(name: str, height: int, width: int) -> Tensor:
-    channels = 3 if name == "view_dir" else len(CHANNELS[name])
-    image = torch.rand(1, channels, height, width, generator=torch.Generator().manual_seed(len(name)))
+    image = torch.rand(1, channel_count(name), height, width, generator=torch.Generator().manual_seed(len(name)))
     return (image > 0.3).float() if name == "mask" else image
