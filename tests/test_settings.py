@@ -22,6 +22,24 @@ def test_layers_win_in_order(tmp_path: Path) -> None:
     assert (settings.cameras.train, settings.cameras.val, settings.cameras.test) == (50, 8, 10)
 
 
+@pytest.mark.parametrize(
+    ("model", "advice"),
+    [
+        ({"base": "none"}, ["output = log", "base = none", "--set model.output=display", "--set model.base=baked"]),
+        ({"base": "none", "output": "display"}, ["filter = 3", "base = none", "--set model.filter=0"]),
+        ({"base": "raster", "chain": True}, ["chain = true", "base = raster", "--set model.chain=false"]),
+        ({"chain": True, "aggregator": "early"}, ["chain = true", "aggregator = early", "--set model.aggregator="]),
+    ],
+)
+def test_a_conflict_names_both_settings_and_what_to_type(model: dict[str, object], advice: list[str]) -> None:
+    with pytest.raises(UserError) as raised:
+        resolve("draft", {"model": model}, environment={})
+    message = str(raised.value)
+    assert message.startswith("setting model: ") and "{" not in message and "\n" not in message
+    for words in advice:
+        assert words in message
+
+
 def test_paper_preset_has_the_papers_numbers() -> None:
     s = resolve("paper", {}, environment={})
     assert (s.cameras.train, s.cameras.val, s.cameras.test) == (100, 100, 200)

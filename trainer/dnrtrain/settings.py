@@ -50,11 +50,25 @@ class ModelSettings(Strict):
     @model_validator(mode="after")
     def _fits(self) -> ModelSettings:
         if self.chain and self.base not in ("baked", "direct", "path"):
-            raise ValueError("chain needs base = baked, direct or path: their files hold the specular path")
+            raise ValueError(
+                f"chain = true needs the specular path, which base = {self.base} has not;"
+                " type --set model.chain=false, or --set model.base=baked"
+            )
         if self.chain and self.aggregator == "early":
-            raise ValueError("chain needs a neural texture; aggregator = early has none")
-        if self.base == "none" and (self.output == "log" or self.filter):
-            raise ValueError("output = log and filter work on a base image; base is none")
+            raise ValueError(
+                "chain = true needs a neural texture, which aggregator = early has not;"
+                " type --set model.chain=false, or --set model.aggregator=residual"
+            )
+        if self.base == "none" and self.output == "log":
+            raise ValueError(
+                "output = log works on a base image, and base = none gives none;"
+                " type --set model.output=display, or --set model.base=baked"
+            )
+        if self.base == "none" and self.filter:
+            raise ValueError(
+                f"filter = {self.filter} works on a base image, and base = none gives none;"
+                " type --set model.filter=0, or --set model.base=baked"
+            )
         return self
 
     def coarse(self) -> ModelSettings:

@@ -11,7 +11,8 @@ from typing import Any
 import bpy
 
 from ..findings import Findings, first_of, printable
-from .names import data_collections
+from ..shading.sockets import UNDEFINED, computes
+from .names import data_collections, node_trees
 
 SHAPELESS_IMAGES = {"GENERATED", "VIEWER"}  # sources without a file
 SHOWN = 5  # names per warning
@@ -87,6 +88,17 @@ def note_missing(findings: Findings) -> None:
             if block.is_missing and not isinstance(block, bpy.types.Library):
                 kind = block.bl_rna.name.lower()
                 findings.add("missing", f"linked {kind} '{block.name_full}'", "not in its library; left out")
+    for owner, tree in node_trees():
+        if tree.bl_idname == "CompositorNodeTree":
+            continue  # the pictures are taken before it
+        for node in tree.nodes:
+            if not computes(node):
+                what = "its type is unknown here (needs its add-on)" if node.bl_idname == UNDEFINED else "has no tree"
+                place = {"material": owner.name_full} if isinstance(owner, bpy.types.Material) else {}
+                named = "" if place else f" of '{owner.name_full}'"
+                findings.add(
+                    "missing", f"node '{node.name}'{named}", f"{what}: its links are dropped, as in Cycles", **place
+                )
 
 
 def external_files(path: Path) -> list[Path]:

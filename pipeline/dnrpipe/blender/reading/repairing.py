@@ -83,8 +83,8 @@ def _bad_sockets(tree: bpy.types.NodeTree) -> Iterator[tuple[Any, Any]]:
     """(node, socket) whose value is not finite."""
     for node in tree.nodes:
         for socket in (*node.inputs, *node.outputs):
-            if socket.type not in {"VALUE", "RGBA", "VECTOR"}:
-                continue
+            if socket.type not in {"VALUE", "RGBA", "VECTOR"} or not hasattr(socket, "default_value"):
+                continue  # sockets of unknown type have no value
             value = socket.default_value
             if not all(_usable(number) for number in ([value] if isinstance(value, float) else value)):
                 yield node, socket

@@ -12,6 +12,8 @@ Scope = tuple[Any, ...]
 """The group nodes entered on the way to a node, outermost first."""
 
 MAX_HOPS = 1000  # a tree that links in circles is invalid; Blender may still load one
+UNDEFINED = "NodeUndefined"
+"""``bl_idname`` of every node whose type this Blender does not know: it is of an add-on, or of a newer Blender."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +47,16 @@ def find_input(node: Any, *names: str) -> Any | None:
     return None
 
 
+def computes(node: Any) -> bool:
+    """Whether a node has values at all. Cycles drops nodes of unknown type and groups without tree, with their links."""
+    return node.bl_idname != UNDEFINED and not (node.type == "GROUP" and node.node_tree is None)
+
+
 def resolve(socket: Any, scope: Scope = ()) -> Source:
     """Follow an input socket to the node that computes its value, or to the default that stands for it."""
     for _ in range(MAX_HOPS):
         link = next((link for link in socket.links if link.is_valid and not link.is_muted), None)
-        if link is None:
+        if link is None or not computes(link.from_node):
             return Source(socket, socket.node, scope, False)
         node, output = link.from_node, link.from_socket
         if node.mute:
@@ -59,7 +66,7 @@ def resolve(socket: Any, scope: Scope = ()) -> Source:
             socket = passed.from_socket
         elif node.type == "REROUTE":
             socket = node.inputs[0]
-        elif node.type == "GROUP" and node.node_tree is not None:
+        elif node.type == "GROUP":
             inside = _group_output(node.node_tree, output.identifier)
             if inside is None:
                 return Source(socket, socket.node, scope, False)
