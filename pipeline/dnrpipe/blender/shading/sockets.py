@@ -48,7 +48,7 @@ def find_input(node: Any, *names: str) -> Any | None:
 
 
 def computes(node: Any) -> bool:
-    """Whether a node has values at all. Cycles drops nodes of unknown type and groups without tree, with their links."""
+    """Whether a node has values. Cycles drops nodes of unknown type and groups without tree, and their links."""
     return node.bl_idname != UNDEFINED and not (node.type == "GROUP" and node.node_tree is None)
 
 
