@@ -18,6 +18,7 @@ from .bundle.export import export_bundle
 from .cameras import camera_animation, scene_cameras
 from .census import take_census
 from .geometry.frozen import save_geometry
+from .geometry.surroundings import describe_surroundings
 from .passes.gbuffer_scene import add_gbuffer_scene
 from .reading.loading import load_scene
 from .reading.packing import pack_everything, save_blend
@@ -73,7 +74,7 @@ def prepare(
     external = {str(path): "missing" for path in loaded.missing}
     external |= {str(path): file_sha256(path) for path in loaded.external}
     warnings = loaded.warnings + pack_everything()
-    add_gbuffer_scene(frozen.meshes, {name: converted.opacity for name, converted in materials.items()})
+    gbuffer = add_gbuffer_scene(frozen.meshes, {name: converted.opacity for name, converted in materials.items()})
     summary = SceneSummary(
         bounds=loaded.bounds,
         triangles=sum(mesh.triangles for mesh in frozen.meshes),
@@ -82,6 +83,7 @@ def prepare(
         object_names={str(mesh.object_id): mesh.object_name for mesh in frozen.meshes},
         cameras=cameras,
         animation=animation,
+        surroundings=describe_surroundings(gbuffer, cameras, animation),
         resolution=_resolution(scene),
         blender_version=bpy.app.version_string,
         atlas=atlas,

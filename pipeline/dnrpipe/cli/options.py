@@ -54,7 +54,8 @@ CAMERA_OPTIONS = [
     click.option(
         "--cameras",
         metavar="SOURCE",
-        help="dome (default), sphere, scene, animation, or a NeRF transforms.json.",
+        help="auto (default: inside for rooms and animated cameras, else dome), dome, sphere, inside, scene, animation,"
+        " or a NeRF transforms.json.",
     ),
     click.option("--views", type=int, metavar="N", help="Number of candidate views."),
     click.option("--resolution", type=int, metavar="PIXELS", help="Square image size."),

@@ -1,4 +1,4 @@
-"""Which views exist: domes and spheres around the scene, its own cameras, camera files.
+"""Which views exist: domes and spheres around the scene, places inside, its own cameras, camera files.
 
 Notation
     center, radius   bounding sphere of the scene, scene units
@@ -21,7 +21,9 @@ from .errors import UserError
 from .scene_records import Lens, SceneCamera, SceneSummary
 from .settings import CameraSettings
 
-KEYWORDS = ("auto", "dome", "sphere", "scene", "animation")
+KEYWORDS = ("auto", "dome", "sphere", "inside", "scene", "animation")
+ENCLOSED = 0.75
+"""Share of all directions in which the scene's camera meets a surface, from which on it stands inside."""
 DEFAULT_LENS = 50.0  # mm on a 36 mm sensor: Blender's default camera
 DEFAULT_SENSOR = 36.0
 SQUARE_PIXELS = 1e-4  # largest relative difference of fl_x and fl_y that counts as square
@@ -35,9 +37,11 @@ def make_cameras(summary: SceneSummary, settings: CameraSettings) -> dict[str, l
 
     Raises UserError: a source that the scene does not have, or a broken camera file.
     """
-    source = settings.source
-    if source in ("auto", "dome", "sphere"):
+    source = automatic_source(summary)[0] if settings.source == "auto" else settings.source
+    if source in ("dome", "sphere"):
         return {split: sphere_views(summary, settings, split) for split in SPLITS}
+    if source == "inside":
+        return inside_views(summary, settings)
     if source in ("scene", "animation"):
         own = [view for view, _ in _own_views(summary, settings)]
         if source == "scene" and not own:
@@ -48,6 +52,46 @@ def make_cameras(summary: SceneSummary, settings: CameraSettings) -> dict[str, l
     path = Path(source)
     views = read_camera_file(path, settings)
     return own_splits(path, views) or split_views(views, settings)
+
+
+def automatic_source(summary: SceneSummary) -> tuple[str, str]:
+    """What ``auto`` comes to, ``dome`` or ``inside``, and why."""
+    around = summary.surroundings
+    if around is None or not around.standpoints:
+        return "dome", "around the scene, which its own camera does not tell the inside of"
+    if around.moves:
+        return "inside", "beside the path of the scene's animated camera, looking at what it sees"
+    if around.enclosed >= ENCLOSED:
+        return "inside", f"inside, as the scene's own camera meets surfaces in {around.enclosed:.0%} of all directions"
+    return "dome", f"around the scene, as its own camera meets surfaces in {around.enclosed:.0%} of all directions"
+
+
+def inside_views(summary: SceneSummary, settings: CameraSettings) -> dict[str, list[View]]:
+    """Views of each split from standpoints inside the scene, with the lens of the scene's own camera.
+
+    Every split has standpoints of its own: half of all are for candidates, a quarter each for the others.
+
+    Raises UserError: the scene has no standpoints, or too few.
+    """
+    around = summary.surroundings
+    if around is None or not around.standpoints:
+        raise UserError("--cameras inside: the scene's own camera stands in no free air; use --cameras dome")
+    focal, _ = framing(summary, settings)
+    shares = {"train": (0, 2), "val": (1, 4), "test": (3, 4)}
+    views = {}
+    for split, (first, step) in shares.items():
+        own, wanted = around.standpoints[first::step], getattr(settings, split)
+        if wanted > len(own):
+            raise UserError(
+                f"--cameras inside: the scene has {len(own)} standpoints for cameras.{split}, {wanted} are wanted;"
+                f" use --set cameras.{split}={len(own)}, or --cameras dome"
+            )
+        order = np.random.default_rng([settings.seed, _STREAM[split]]).permutation(len(own))[:wanted]
+        views[split] = [
+            look_at_view(f"{index:04d}", np.array(own[k].place), np.array(own[k].target), focal, settings)
+            for index, k in enumerate(order)
+        ]
+    return views
 
 
 def own_splits(path: Path, views: Sequence[View]) -> dict[str, list[View]] | None:

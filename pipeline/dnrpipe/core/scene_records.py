@@ -70,6 +70,27 @@ class SceneCamera(SceneRecord):
     dof: Lens | None
 
 
+class Standpoint(SceneRecord):
+    """A place for a camera in free air, and a point to look at; world space."""
+
+    place: Vector
+    target: Vector
+
+
+class Surroundings(SceneRecord):
+    """What the scene's own camera stands in.
+
+    Args:
+        enclosed: share of all directions in which it meets a surface; of an animated camera the mean over its path.
+        moves: whether the camera is animated.
+        standpoints: in free air around its place or beside its path, in random order.
+    """
+
+    enclosed: float
+    moves: bool
+    standpoints: list[Standpoint]
+
+
 class AtlasFacts(SceneRecord):
     """The scene atlas, measured at ``size``² texels.
 
@@ -98,6 +119,7 @@ class SceneSummary(SceneRecord):
         triangles: of all meshes, each instance's shape counted once.
         objects: the highest object number; ``object_names``: by number.
         animation: the active camera over the frame range; empty where it does not move.
+        surroundings: of the active camera; None where it is no perspective camera, or meets nothing.
         resolution: width and height that the file asks for, pixels.
         repairs: dropped triangles and replaced normals, UVs and colours, by kind.
         has_light: whether the file brought light of its own.
@@ -113,6 +135,7 @@ class SceneSummary(SceneRecord):
     object_names: dict[str, str]
     cameras: list[SceneCamera]
     animation: list[SceneCamera]
+    surroundings: Surroundings | None = None
     resolution: tuple[int, int]
     blender_version: str
     atlas: AtlasFacts

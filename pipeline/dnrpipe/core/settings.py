@@ -35,7 +35,9 @@ class CameraSettings(Strict):
     """Which views exist."""
 
     source: str = Field(
-        default="auto", description="auto (= dome), dome, sphere, scene, animation, or a transforms.json"
+        default="auto",
+        description="auto (inside where the scene's own camera stands inside or is animated, else dome), dome, sphere,"
+        " inside, scene, animation, or a transforms.json",
     )
     source_sha256: str = Field(default="", description="set by --cameras FILE, so that a changed file is noticed")
     train: int = Field(default=100, ge=1, le=100_000, description="candidate views")

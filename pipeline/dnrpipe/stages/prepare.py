@@ -24,7 +24,7 @@ from ..blender.tasks import (
     PrepareAnswer,
     PrepareTask,
 )
-from ..core.cameras import depth_range, make_cameras
+from ..core.cameras import automatic_source, depth_range, make_cameras
 from ..core.console import Console
 from ..core.errors import UserError
 from ..core.scene_files import (
@@ -94,6 +94,8 @@ def _plan_effects(run: Run) -> None:
 def scene_and_views(run: Run) -> tuple[SceneSummary, dict[str, list[View]]]:
     """Convert the scene and place the cameras, where that is not done: (summary, views by split). No passes."""
     summary = convert_scene(run)
+    if run.settings.cameras.source == "auto":
+        run.console.say(f"cameras: {automatic_source(summary)[1]} (--cameras dome or inside decides otherwise)")
     return summary, _place_cameras(run.workspace, run.settings, summary)
 
 
