@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import UserError
+from ..core.machine import forget_all
 
 APT_LINE = (
     "apt-get install -y libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1"
@@ -27,7 +28,8 @@ TORCH_CODE = (
 
 
 def examine() -> list[dict[str, Any]]:
-    """One row per check: name, state (ok, warn, fail), text. Renderers are tried in their own processes."""
+    """One row per check: name, state (ok, warn, fail), text. Renderers are tried anew, in their own processes."""
+    forget_all()
     return [
         _row("python", "ok", f"{platform.python_version()} on {platform.platform()}"),
         _machine(),

@@ -6,6 +6,7 @@ Dr.Jit aborts the whole process on a missing driver or an unsuitable LLVM (15 an
 
 from __future__ import annotations
 
+import ctypes
 import ctypes.util
 import json
 import os
@@ -17,6 +18,7 @@ from functools import cache
 from pathlib import Path
 
 from ..core.errors import UserError
+from ..core.machine import remember, remembered
 
 ORDER = ("cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
 PROBE_TIMEOUT = 120.0
@@ -75,7 +77,26 @@ def _environments(variant: str) -> list[dict[str, str]]:
 
 
 def _probe(variant: str, environment: dict[str, str]) -> str | None:
-    """None when a small scene renders to finite, lit pixels; else one line on what went wrong."""
+    """None when a small scene renders to finite, lit pixels; else one line on what went wrong.
+
+    What works is remembered per machine and driver. What does not is tried again: a GPU may have been full.
+    """
+    if variant.startswith("cuda") and sys.platform == "linux":
+        library = os.environ.get("DRJIT_LIBCUDA_PATH", "libcuda.so.1")
+        try:
+            ctypes.CDLL(library)
+        except OSError:
+            return f"no CUDA driver ({library})"
+    name = f"mitsuba-{variant}"
+    if remembered(name) == environment:
+        return None
+    problem = _try(variant, environment)
+    if problem is None:
+        remember(name, environment)
+    return problem
+
+
+def _try(variant: str, environment: dict[str, str]) -> str | None:
     try:
         done = subprocess.run(
             [sys.executable, "-m", "dnrpipe.raytrace.probe", variant],

@@ -7,7 +7,6 @@ state              = missing | partial | stale | done
 
 from __future__ import annotations
 
-import os
 import platform
 import shutil
 import time
@@ -22,6 +21,7 @@ from ..core.console import clock
 from ..core.effect_names import NEURAL
 from ..core.errors import UserError
 from ..core.ledger import StageName
+from ..core.machine import cache_root
 from ..core.scene_files import scene_fingerprint
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest
@@ -272,8 +272,7 @@ def clear(stage: Stage, workspace: Workspace) -> None:
 
 def weights_cached() -> bool:
     """Whether `dnrpipe weights` has been here; a look at the folder, without importing torch."""
-    base = os.environ.get("DNRPIPE_CACHE") or Path.home() / ".cache" / "dnrpipe"
-    return (Path(base) / "weights" / "weights.json").is_file()
+    return (cache_root() / "weights" / "weights.json").is_file()
 
 
 @dataclass(frozen=True)

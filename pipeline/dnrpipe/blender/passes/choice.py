@@ -10,11 +10,13 @@ import sys
 from typing import NamedTuple
 
 from dnrpipe.core.errors import UserError
+from dnrpipe.core.machine import remember, remembered
 
 from ..tasks import RasterTrial
 
 ENGINES = ("eevee", "workbench", "cycles-direct")
 TIMEOUT = 120.0  # seconds
+NO_ANSWER = "no frame within"
 SLOWEST_FRAME = 1.0  # seconds per 256² frame (a GPU: milliseconds); beyond it direct light is the better bargain
 
 
@@ -53,12 +55,22 @@ class Trial(NamedTuple):
 
 @functools.cache
 def try_engine(engine: str) -> Trial:
-    """Render two small frames with ``engine`` in a subprocess, once per process."""
+    """Render two small frames with ``engine`` in a subprocess, once per machine and driver (`machine.remembered`)."""
+    name = f"raster-{engine}"
+    if (kept := remembered(name)) is not None:
+        return Trial(*kept)
+    trial = _try(engine)
+    if not trial.reason.startswith(NO_ANSWER):  # a busy machine is no property of the driver
+        remember(name, trial)
+    return trial
+
+
+def _try(engine: str) -> Trial:
     command = [sys.executable, "-m", "dnrpipe.blender.passes.probe", engine]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, stdin=subprocess.DEVNULL)
     except subprocess.TimeoutExpired:
-        return Trial(None, f"no frame within {TIMEOUT:.0f} s")
+        return Trial(None, f"{NO_ANSWER} {TIMEOUT:.0f} s")
     if done.returncode < 0:
         return Trial(None, f"its trial was killed by {signal.Signals(-done.returncode).name}")
     lines = [line for line in done.stdout.splitlines() if line.startswith('{"ok"')]
