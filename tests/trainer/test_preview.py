@@ -100,7 +100,7 @@ def test_when_a_picture_is_due(scene: Scene, monkeypatch: pytest.MonkeyPatch) ->
         previewer = Previewer(Preview(unseen(scene, target=False), pause), "cpu")
         found = []
         for number in range(1, 101):
-            done = EpochEnd("step2", number, 100, {}, {}, 1.0, 1.0, 1)
+            done = EpochEnd(stage="step2", epoch=number, epochs=100, seconds=1.0)
             for event in previewer.after(done, model, None):
                 found.append(event.epoch)
                 clock += cost  # rendering and whoever writes the picture

@@ -28,7 +28,7 @@ from dnrtrain.losses import Step2Loss
 from dnrtrain.metrics import psnr
 from dnrtrain.model import DNR, render_views
 from dnrtrain.precision import decide_bfloat16
-from dnrtrain.schedule import guarded_step, learning_rate
+from dnrtrain.schedule import Averaged, guarded_step, learning_rate
 from dnrtrain.selector.agent import Reward
 from dnrtrain.settings import LossWeights, ModelSettings, Step1Settings, Step2Settings
 from dnrtrain.step1 import run_step1
@@ -303,9 +303,13 @@ def test_the_averaged_weights_are_the_model(scene: Scene, tmp_path: Path) -> Non
     tracks = []
     for steps in (1, 2, 3):
         loss, folder = Step2Loss(settings, None), tmp_path / f"cut{steps}"
-        run = _Step2(data, None, DNR(model, 0), settings, loss, 0, "run", folder, "cpu")
+        dnr = DNR(model, 0)
+        dnr.use_bfloat16 = decide_bfloat16(settings.precision, "cpu")
+        run = _Step2(
+            dnr=dnr, views=data, val=None, settings=settings, loss=loss, seed=0, run="run", folder=folder, device="cpu",
+            average=Averaged(dnr, settings.ema),
+        )  # fmt: skip
         run._restore()
-        run.steps_per_epoch = 3
         taken = 0
 
         def stop_after(*args: object, steps: int = steps) -> bool:

@@ -5,27 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from .records import Epoch
+
 if TYPE_CHECKING:
     import numpy as np
 
 
-@dataclass(frozen=True)
-class EpochEnd:
-    """One epoch is done and its checkpoint is on disk.
-
-    losses: mean of each loss term over the epoch's steps. val: metrics on validation views or {}.
-    seconds: wall time; cpu_seconds: process time; steps: optimiser steps; skipped: non-finite steps.
-    """
+class EpochEnd(Epoch):
+    """One epoch is done and its checkpoint is on disk."""
 
     stage: str
-    epoch: int
     epochs: int
-    losses: dict[str, float]
-    val: dict[str, float]
-    seconds: float
-    cpu_seconds: float
-    steps: int
-    skipped: int = 0
     device: str = "cpu"
 
 
@@ -47,19 +37,13 @@ class Selected:
     cpu_seconds: float = field(default=0.0, compare=False)
 
 
-@dataclass(frozen=True)
-class Diverged:
+class Diverged(Epoch):
     """An epoch diverged. Training goes on from the state before it, at a lower rate; ``text`` says so.
 
-    The epoch's time was spent all the same: seconds, cpu_seconds, steps and device are as in `EpochEnd`.
+    The epoch's time was spent all the same.
     """
 
-    stage: str
-    epoch: int
     text: str
-    seconds: float
-    cpu_seconds: float
-    steps: int
     device: str = "cpu"
 
 
