@@ -103,8 +103,8 @@ def test_a_training_that_never_recovers_is_refused(scene: Scene, tmp_path: Path)
 
 
 def finite_state(folder: Path) -> bool:
-    saved = checkpoint.load_state(folder)
-    return saved is not None and all(bool(torch.isfinite(t).all()) for t in saved.tensors.values())
+    saved = checkpoint.load(folder / checkpoint.STATE)
+    return saved is not None and all(bool(torch.isfinite(t).all()) for t in saved[0].values())
 
 
 def test_the_watch() -> None:

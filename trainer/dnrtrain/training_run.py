@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from . import checkpoint
+from .contract import ContractError, DamagedFile
 from .dataset import Batch, ViewSet
 from .events import Diverged, EpochEnd, Event, Note
 from .model import DNR
@@ -126,7 +127,11 @@ class TrainingRun(ABC, Generic[Settings]):
         reason = self.watch.trouble(book, self.term, self.history, picture, *self.trained())
         if reason is not None:
             text = f"step {self.number}: {self.watch.restart(epoch + 1, reason)}"
-            self._load(checkpoint.require_state(self.folder, self.run))
+            saved = checkpoint.load_state(self.folder, self.run)
+            if saved is None:
+                path = self.folder / checkpoint.STATE
+                raise ContractError(f"{path}: was removed or replaced while training; run the same command again")
+            self._load(saved)
             self._save(epoch)
             return Diverged(**dict(book.entry(epoch + 1, 0.0, {})), text=text, device=self.device)
         with averaged_weights(self.dnr, self.average):
@@ -174,7 +179,11 @@ class TrainingRun(ABC, Generic[Settings]):
 
     def _restore(self) -> int:
         """Load the state that this run was interrupted in -> epochs done. Else start afresh."""
-        saved = checkpoint.interrupted(self.folder, self.run, self.notes)
+        try:
+            saved = checkpoint.load_state(self.folder, self.run)
+        except DamagedFile as damage:
+            self.notes.append(f"{damage.path}: damaged; training starts afresh")
+            saved = None
         if saved is None:
             self._save(0)
             return 0
