@@ -66,21 +66,25 @@ def run_tasks(
     *,
     workers: int,
     log: Path,
+    retried: Callable[[Retry], object] = lambda retry: None,
     timeout: float | None = None,
     environment: dict[str, str] | None = None,
     next_tasks: Callable[[TaskResult], Sequence[dict[str, Any]]] | None = None,
-) -> Generator[TaskResult | Retry, None, None]:
-    """Run ``tasks`` on ``workers`` processes; yield a TaskResult per task, and a Retry for each new try.
+) -> Generator[TaskResult, None, None]:
+    """Run ``tasks`` on ``workers`` processes; yield each task's outcome as it comes.
 
     Args:
         module: importable module with a class ``Worker(common)`` that is callable with a task.
         common: JSON-able, sent once to each worker.
         log: file to which the workers' output is appended.
+        retried: called when a task is tried once more.
         timeout: seconds after which a silent task counts as hung; its worker is killed. None: see `patience`.
         environment: variables added to the workers' environment.
         next_tasks: called with each TaskResult before it is yielded; returns tasks to do after it.
 
-    Closing the iterator (Ctrl-C in the consumer) kills the workers. Raises UserError: see `TaskTimeout`.
+    Closing the iterator (Ctrl-C in the consumer) kills the workers.
+
+    Raises UserError: see `TaskTimeout`. Raises OSError: the disk is full.
     """
     task_timeout = TaskTimeout(timeout)
     pending: queue.SimpleQueue[tuple[dict[str, Any], int]] = queue.SimpleQueue()
@@ -137,11 +141,15 @@ def run_tasks(
     try:
         while open_tasks > 0:
             outcome = outcomes.get()
-            if isinstance(outcome, TaskResult):
-                more = next_tasks(outcome) if next_tasks is not None else ()
-                for task in more:
-                    pending.put((task, 1))
-                open_tasks += len(more) - 1
+            if isinstance(outcome, Retry):
+                retried(outcome)
+                continue
+            more = next_tasks(outcome) if next_tasks is not None else ()
+            for task in more:
+                pending.put((task, 1))
+            open_tasks += len(more) - 1
+            if outcome.errno == errno.ENOSPC:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), outcome.task.get("output", str(log.parent)))
             yield outcome
     finally:
         if open_tasks > 0:

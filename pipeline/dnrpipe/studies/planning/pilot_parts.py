@@ -22,8 +22,8 @@ from ...raytrace.tasks import BaseTask, TracerCommon, TraceTask
 from ...stages.base_images import BaseRenderer, bake_light, base_renderer
 from ...stages.raytrace import view_seed
 from ...stages.stage import Run
-from ...workers.answers import answers, warn_of_retries
-from ...workers.view_tasks import worker_count
+from ...workers.processes import run_tasks
+from ...workers.view_tasks import warn_of_retries, worker_count
 from ..cells.scenes import choose_by_pose
 from .pilot_worker import FramesTask, PilotCommon, TrainTask
 from .records import FOLDER, BasePart, FramePart, LightPart, LightPoint, Traced, TracePart, TrainingPart
@@ -181,7 +181,7 @@ class Piloting:
         """(task, result) of each. Raises UserError where one failed twice."""
         found = []
         with self.console.bar(label, len(tasks)) as bar:
-            for outcome in answers(
+            for outcome in run_tasks(
                 module,
                 common,
                 tasks,
