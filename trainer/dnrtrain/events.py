@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from .records import Epoch
+from .records import Epoch, Selection
 
 if TYPE_CHECKING:
     import numpy as np
@@ -21,18 +21,13 @@ class EpochEnd(Epoch):
 
 @dataclass(frozen=True)
 class Selected:
-    """Step 1 is done: names of the chosen views, in order, and what the policy says of itself.
+    """Step 1 is done.
 
-    gains, why: per view, see `dnrtrain.selector.protocol.Choice`.
     seconds, cpu_seconds: wall and process time of choosing, beside that of the epochs; 0 where a finished run is found
     again.
     """
 
-    views: list[str]
-    policy: str
-    details: dict[str, Any] = field(default_factory=dict)
-    gains: list[float] = field(default_factory=list)
-    why: list[str] = field(default_factory=list)
+    selection: Selection
     seconds: float = field(default=0.0, compare=False)
     cpu_seconds: float = field(default=0.0, compare=False)
 

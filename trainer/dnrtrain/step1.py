@@ -25,6 +25,7 @@ from .dataset import ViewSet
 from .events import Event, Selected
 from .model import DNR
 from .precision import decide_bfloat16
+from .records import Selection
 from .schedule import STEP1, EpochBook, guarded_step, require_target, run_fingerprint, step_random
 from .selector.policies import untrained
 from .selector.protocol import Candidates, Choice, check_budget
@@ -89,9 +90,10 @@ def run_step1(
     )
     if choice is None:
         step.walker = Walker(step, candidates, budget)
-    finished = step.finished()
-    if finished is not None:
-        yield Selected(finished.selected, policy, finished.details, finished.gains, finished.why)
+    done = step.finished()
+    if done is not None:
+        known = {"policy": policy, "budget": budget, "seed": seed, "views": done.selected}
+        yield Selected(Selection(**known, gains=done.gains, why=done.why, details=done.details))
         return
     yield from step.train()
     book = EpochBook()
@@ -99,18 +101,11 @@ def run_step1(
         choice = step.walker.roll_out()
     assert choice is not None  # given, the rule's, or the agent's
     spent = book.entry(0, 0.0, {})
-    names = [views.names[i] for i in choice.views]
-    step.save_model(
-        fingerprint,
-        policy=policy,
-        budget=budget,
-        selected=names,
-        details=choice.details,
-        gains=choice.gains,
-        why=choice.why,
-        choosing={"seconds": spent.seconds, "cpu_seconds": spent.cpu_seconds},
-    )
-    yield Selected(names, policy, choice.details, choice.gains, choice.why, spent.seconds, spent.cpu_seconds)
+    selection = choice.selection(views.names, policy, seed)
+    facts = selection.model_dump(exclude={"views", "seed"})
+    choosing = {"seconds": spent.seconds, "cpu_seconds": spent.cpu_seconds}
+    step.save_model(fingerprint, selected=selection.views, choosing=choosing, **facts)
+    yield Selected(selection, **choosing)
 
 
 @dataclass(kw_only=True)

@@ -18,7 +18,7 @@ from .losses import Step2Loss
 from .model import DNR
 from .perceptual import PerceptualLoss
 from .precision import decide_bfloat16
-from .preview import Preview, Previewer
+from .preview import Preview
 from .schedule import STEP2, Averaged, EpochBook, guarded_step, require_target, run_fingerprint, step_random
 from .settings import ModelSettings, Step2Settings
 from .training_run import TrainingRun
@@ -83,7 +83,7 @@ def run_step2(
         device=device,
         average=Averaged(dnr, settings.ema) if settings.ema else None,
         notes=notes,
-        previewer=None if preview is None else Previewer(preview, device),
+        preview=preview,
     )
     if step.finished() is not None:
         yield Note("step 2 is finished already")
@@ -120,7 +120,7 @@ class _Step2(TrainingRun[Step2Settings]):
     number, term = 2, "photometric"
 
     loss: Step2Loss
-    previewer: Previewer | None = None
+    preview: Preview | None = None
 
     @property
     def steps_per_epoch(self) -> int:
@@ -149,8 +149,8 @@ class _Step2(TrainingRun[Step2Settings]):
         return random_patch(self.views.batch([0]), self.settings.patch, np.random.default_rng(0))
 
     def after_epoch(self, done: EpochEnd) -> Iterator[Event]:
-        if self.previewer is not None:
-            yield from self.previewer.after(done, self.dnr, self.average)
+        if self.preview is not None:
+            yield from self.preview.after(done, self.dnr, self.average)
 
 
 def random_patch(batch: Batch, side: int, random: np.random.Generator) -> Batch:
