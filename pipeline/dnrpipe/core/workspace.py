@@ -29,6 +29,7 @@ from filelock import FileLock, Timeout
 from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from dnrtrain.atomic import write_json
+from dnrtrain.records import first_error
 
 from .errors import UserError
 from .ledger import Ledger
@@ -201,11 +202,8 @@ class Workspace:
         try:
             return cls(root, Manifest.model_validate(data))
         except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(map(str, first["loc"]))
-            raise DamagedManifest(
-                f"{path}: damaged ({where}: {first['msg']}); run `dnrpipe prepare SCENE` again"
-            ) from None
+            reason = first_error(error)
+            raise DamagedManifest(f"{path}: damaged ({reason}); run `dnrpipe prepare SCENE` again") from None
 
     def save(self) -> None:
         """Write the manifest atomically."""
