@@ -101,19 +101,15 @@ class Ledger:
         """
         line = json.dumps(record.model_dump(), allow_nan=False).encode("ascii") + b"\n"
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(self.path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
-        try:
-            end = os.lseek(descriptor, 0, os.SEEK_END)
-            if end > 0:
-                os.lseek(descriptor, end - 1, os.SEEK_SET)
-                if os.read(descriptor, 1) != b"\n":
+        with self.path.open("a+b", buffering=0) as file:
+            if file.seek(0, os.SEEK_END) > 0:
+                file.seek(-1, os.SEEK_END)
+                if file.read(1) != b"\n":
                     line = b"\n" + line
-            written = os.write(descriptor, line)
+            written = file.write(line)
             if written != len(line):
                 raise OSError(errno.ENOSPC, f"only {written} of {len(line)} bytes written", str(self.path))
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+            os.fsync(file.fileno())
 
     def read(self) -> list[CostRecord]:
         """All whole records in file order; [] when there is no ledger yet. Truncated records are left out.

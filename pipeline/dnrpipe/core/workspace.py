@@ -137,24 +137,9 @@ class Workspace:
         self.root = root
         self.manifest = manifest
         self.ledger = Ledger(root / "costs.jsonl")
-
-    # Paths. Every stage names its files through these.
-
-    @property
-    def scene(self) -> Path:
-        return self.root / "scene"
-
-    @property
-    def selection(self) -> Path:
-        return self.root / "selection.json"
-
-    @property
-    def evaluation(self) -> Path:
-        return self.root / "evaluation"
-
-    @property
-    def preview(self) -> Path:
-        return self.root / "preview"
+        # Every stage names its files through these paths, and the methods below.
+        self.scene, self.selection = root / "scene", root / "selection.json"
+        self.evaluation, self.preview = root / "evaluation", root / "preview"
 
     def cameras(self, split: str) -> Path:
         return self.root / "cameras" / f"{split}.json"
