@@ -93,13 +93,13 @@ def run_tasks(
     outcomes: queue.SimpleQueue[TaskResult | Retry] = queue.SimpleQueue()
     stopping = threading.Event()
     open_tasks = len(tasks)  # not answered for yet: written by the consumer alone, read by the workers' threads
-    processes: list[subprocess.Popen[str] | None] = [None] * max(1, min(workers, len(tasks)))
-    log.parent.mkdir(parents=True, exist_ok=True)
     # Workers end without Blender's own clean-up (see _worker_main); what it leaves in the temporary folder goes here.
     temp_dir = tempfile.TemporaryDirectory(prefix="dnrpipe-workers-", ignore_cleanup_errors=True)
     worker_environment = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), temp_dir.name) | (environment or {})
+    count = max(1, min(workers, len(tasks)))
+    processes = [LocalWorker(module, common, log, worker_environment) for _ in range(count)]
 
-    def serve(slot: int) -> None:
+    def serve(worker: LocalWorker) -> None:
         # The thread lives as long as its worker: PR_SET_PDEATHSIG follows the spawning thread.
         try:
             while not stopping.is_set() and open_tasks > 0:
@@ -109,20 +109,14 @@ def run_tasks(
                     continue
                 started = time.monotonic()
                 try:
-                    process = processes[slot]
-                    if process is None or process.poll() is not None:
-                        process = processes[slot] = _spawn(module, common, log, worker_environment)
-                    answer = _ask(process, task, task_timeout.limit(attempt), task_timeout.reason())
+                    answer = worker.answer(task, task_timeout.limit(attempt), task_timeout.reason())
                 except (WorkerDied, OSError, ValueError) as death:  # also: cannot be started, truncated answer
-                    _kill(processes[slot])
-                    processes[slot] = None
                     answer = {"error": " ".join(str(death).split()), "retry": True, "died": True}
                 if stopping.is_set():
                     return
                 seconds = time.monotonic() - started
                 if answer.get("retry"):  # on a fresh worker: this one may be short of memory, or half broken
-                    _close(processes[slot], force=True)
-                    processes[slot] = None
+                    worker.close()
                 if "error" not in answer:
                     task_timeout.took(seconds)
                     outcomes.put(TaskResult(task, answer["result"], None, attempt, seconds))
@@ -133,9 +127,9 @@ def run_tasks(
                     died, number = answer.get("died", False), answer.get("errno")
                     outcomes.put(TaskResult(task, None, answer["error"], attempt, seconds, died, number))
         finally:
-            _close(processes[slot], force=stopping.is_set())
+            worker.close(force=stopping.is_set())
 
-    threads = [threading.Thread(target=serve, args=(slot,), daemon=True) for slot in range(len(processes))]
+    threads = [threading.Thread(target=serve, args=(worker,), daemon=True) for worker in processes]
     for thread in threads:
         thread.start()
     try:
@@ -154,8 +148,8 @@ def run_tasks(
     finally:
         if open_tasks > 0:
             stopping.set()
-            for process in processes:
-                _kill(process)
+            for worker in processes:
+                worker.kill()
         for thread in threads:
             thread.join(timeout=10)
         temp_dir.cleanup()
@@ -170,7 +164,7 @@ class TaskFailed(RuntimeError):
 
 
 class LocalWorker:
-    """One worker process that is asked task by task, outside of `run_tasks`. Not for several threads at once.
+    """One worker process that is asked task by task. Not for several threads at once.
 
     Linux kills it when the thread that asked first ends.
 
@@ -182,12 +176,9 @@ class LocalWorker:
         self._process: subprocess.Popen[str] | None = None
 
     def ask(self, task: dict[str, Any], timeout: float) -> dict[str, Any]:
-        """The worker's answer; it is started where there is none. Raises WorkerDied, TaskFailed."""
-        if self._process is None or self._process.poll() is not None:
-            self.log.parent.mkdir(parents=True, exist_ok=True)
-            self._process = _spawn(self.module, self.common, self.log, self.environment)
+        """The result of a task. Raises WorkerDied, TaskFailed."""
         try:
-            answer = _ask(self._process, task, timeout)
+            answer = self.answer(task, timeout)
         except WorkerDied:
             self.close()
             raise
@@ -195,33 +186,59 @@ class LocalWorker:
             raise TaskFailed(answer["error"])
         return answer["result"]
 
-    def close(self) -> None:
-        """End the process."""
-        _close(self._process, force=True)
-        self._process = None
+    def answer(self, task: dict[str, Any], timeout: float, why: str = "") -> dict[str, Any]:
+        """What the worker says, as `_worker_main` makes it; the worker is started where there is none.
+
+        Raises WorkerDied, also after ``timeout`` seconds (``why``: where that number is from).
+        """
+        if self._process is None or self._process.poll() is not None:
+            self._process = self._spawn()
+        return _ask(self._process, task, timeout, why)
+
+    def kill(self) -> None:
+        """At once, and from any thread; `close` is still to be called."""
+        if self._process is not None and self._process.poll() is None:
+            self._process.kill()
+
+    def close(self, *, force: bool = True) -> None:
+        """End the process. Without ``force`` it may finish first."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        with contextlib.suppress(OSError):
+            if process.stdin:
+                process.stdin.close()
+        if force:
+            process.kill()
+        try:
+            process.wait(timeout=20)
+        except subprocess.TimeoutExpired:  # a library that hangs at exit; its work is on disk already
+            process.kill()
+            process.wait()
+        if process.stdout:
+            process.stdout.close()
+
+    def _spawn(self) -> subprocess.Popen[str]:
+        self.log.parent.mkdir(parents=True, exist_ok=True)
+        with self.log.open("a") as sink:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "dnrpipe.workers.processes", self.module, str(os.getpid())],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=sink,
+                text=True,
+                env={**os.environ, "PYTHONUNBUFFERED": "1", **self.environment},
+            )
+        assert process.stdin is not None
+        try:
+            process.stdin.write(json.dumps(self.common) + "\n")
+            process.stdin.flush()
+        except OSError:
+            raise WorkerDied(_exit_reason(process)) from None
+        return process
 
 
-def _spawn(module: str, common: dict[str, Any], log: Path, environment: dict[str, str]) -> subprocess.Popen[str]:
-    with log.open("a") as sink:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "dnrpipe.workers.processes", module, str(os.getpid())],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=sink,
-            text=True,
-            env={**os.environ, "PYTHONUNBUFFERED": "1", **environment},
-        )
-    assert process.stdin is not None
-    try:
-        process.stdin.write(json.dumps(common) + "\n")
-        process.stdin.flush()
-    except OSError:
-        raise WorkerDied(_exit_reason(process)) from None
-    return process
-
-
-def _ask(process: subprocess.Popen[str], task: dict[str, Any], timeout: float, why: str = "") -> dict[str, Any]:
-    """The answer to a task. Raises WorkerDied, also after ``timeout`` seconds (``why``: where that number is from)."""
+def _ask(process: subprocess.Popen[str], task: dict[str, Any], timeout: float, why: str) -> dict[str, Any]:
     assert process.stdin is not None and process.stdout is not None
     hung = threading.Event()
 
@@ -255,28 +272,6 @@ def _exit_reason(process: subprocess.Popen[str]) -> str:
             guess = " (out of memory?)" if -code == signal.SIGKILL else ""
             return f"worker was killed by {signal.Signals(-code).name}{guess}"
     return f"worker ended with exit code {code}"
-
-
-def _kill(process: subprocess.Popen[str] | None) -> None:
-    if process is not None and process.poll() is None:
-        process.kill()
-
-
-def _close(process: subprocess.Popen[str] | None, *, force: bool) -> None:
-    if process is None:
-        return
-    with contextlib.suppress(OSError):
-        if process.stdin:
-            process.stdin.close()
-    if force:
-        _kill(process)
-    try:
-        process.wait(timeout=20)
-    except subprocess.TimeoutExpired:  # a library that hangs at exit; its work is on disk already
-        process.kill()
-        process.wait()
-    if process.stdout:
-        process.stdout.close()
 
 
 def die_with_parent(parent: int) -> None:
