@@ -13,7 +13,7 @@ from torch import Tensor
 from . import checkpoint
 from .contract import ContractError
 from .dataset import DIHEDRAL_ORDER, Batch, ViewSet
-from .events import EpochEnd, Event, Note
+from .events import Event, Note
 from .losses import Step2Loss
 from .model import DNR
 from .perceptual import PerceptualLoss
@@ -120,7 +120,6 @@ class _Step2(TrainingRun[Step2Settings]):
     number, term = 2, "photometric"
 
     loss: Step2Loss
-    preview: Preview | None = None
 
     @property
     def steps_per_epoch(self) -> int:
@@ -147,10 +146,6 @@ class _Step2(TrainingRun[Step2Settings]):
 
     def first_views(self) -> Batch:
         return random_patch(self.views.batch([0]), self.settings.patch, np.random.default_rng(0))
-
-    def after_epoch(self, done: EpochEnd) -> Iterator[Event]:
-        if self.preview is not None:
-            yield from self.preview.after(done, self.dnr, self.average)
 
 
 def random_patch(batch: Batch, side: int, random: np.random.Generator) -> Batch:

@@ -16,6 +16,7 @@ from .contract import ContractError, DamagedFile
 from .dataset import Batch, ViewSet
 from .events import Diverged, EpochEnd, Event, Note
 from .model import DNR
+from .preview import Preview
 from .records import Epoch, ModelRecord, Progress
 from .schedule import Averaged, EpochBook, Watch, adam, averaged_weights, learning_rate, validate
 from .settings import Step1Settings, Step2Settings
@@ -35,6 +36,7 @@ class TrainingRun(ABC, Generic[Settings]):
         folder: where checkpoints and the model go.
         device: torch's.
         average: of the weights, where that becomes the model.
+        preview: decides after which epochs to show a view.
         notes: what the caller should be told before training.
     """
 
@@ -51,6 +53,7 @@ class TrainingRun(ABC, Generic[Settings]):
     folder: Path
     device: str
     average: Averaged | None = None
+    preview: Preview | None = None
     notes: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -87,10 +90,6 @@ class TrainingRun(ABC, Generic[Settings]):
     def load_more(self, saved: checkpoint.State) -> None:
         """Take back what `more_state` gave."""
 
-    def after_epoch(self, done: EpochEnd) -> Iterator[Event]:
-        """Further events after a good epoch."""
-        yield from ()
-
     # -- the run ---------------------------------------------------------------------------------------
 
     def finished(self) -> ModelRecord | None:
@@ -110,7 +109,8 @@ class TrainingRun(ABC, Generic[Settings]):
             yield done
             if isinstance(done, EpochEnd):
                 epoch += 1
-                yield from self.after_epoch(done)
+                if self.preview is not None:
+                    yield from self.preview.after(done, self.dnr, self.average)
 
     def rate(self, step: int) -> float:
         """Learning rate of a step, counted from the first epoch on."""

@@ -6,20 +6,16 @@ import functools
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
-
-from pydantic import BaseModel
+from typing import Any
 
 from dnrtrain.contract import SPLITS, DamagedFile, SceneFrame, View, read_cameras
-from dnrtrain.records import Selection, read
+from dnrtrain.records import Model, Selection, read
 
 from .errors import UserError
 from .scene_records import Census, Conversion, RasterChoice, SceneSummary
 from .workspace import Workspace, digest, file_sha256
 
 SCENE_VERSION = 6  # raise when the conversion or the G-buffer scene changes what it writes
-
-Model = TypeVar("Model", bound=BaseModel)
 
 
 def read_json(path: Path) -> Any:
