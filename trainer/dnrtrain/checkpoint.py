@@ -12,6 +12,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,13 +34,15 @@ from .settings import ModelSettings
 HEADER = "dnrtrain"
 CHECKSUM = "sha256"
 STATE = "state.safetensors"
+Parts = dict[str, dict[str, Tensor]]
+"""Tensors by name, by what they are of: a module, an optimiser."""
 
 
 @dataclass(frozen=True)
 class State:
-    """An unfinished training: tensors by name (on the CPU), and how far it is."""
+    """An unfinished training: its parts (on the CPU), and how far it is."""
 
-    tensors: dict[str, Tensor]
+    parts: Parts
     progress: Progress
 
 
@@ -106,16 +109,8 @@ def restore_optimiser(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Te
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
 
 
-def prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {f"{prefix}/{name}": tensor for name, tensor in tensors.items()}
-
-
-def unprefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    start = f"{prefix}/"
-    return {name.removeprefix(start): t for name, t in tensors.items() if name.startswith(start)}
-
-
-def save_state(folder: Path, tensors: Mapping[str, Tensor], progress: Progress) -> None:
+def save_state(folder: Path, parts: Parts, progress: Progress) -> None:
+    tensors = {f"{part}/{name}": tensor for part, tensors in parts.items() for name, tensor in tensors.items()}
     save(folder / STATE, tensors, progress.data())
     records.write(folder / records.PROGRESS, progress)
 
@@ -130,7 +125,11 @@ def load_state(folder: Path, run: str) -> State | None:
         progress = Progress.model_validate(info)
     except ValidationError as error:
         raise DamagedFile(folder / STATE, error.errors()[0]["msg"]) from None
-    return State(tensors, progress) if progress.run == run else None
+    parts: Parts = defaultdict(dict)
+    for name, tensor in tensors.items():
+        part, _, own = name.partition("/")
+        parts[part][own] = tensor
+    return State(parts, progress) if progress.run == run else None
 
 
 def save_model(folder: Path, model: DNR, record: ModelRecord) -> None:

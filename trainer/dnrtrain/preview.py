@@ -40,10 +40,6 @@ class Preview:
             if self.trained < self.pause and epoch.epoch < epoch.epochs:
                 return
         started = time.monotonic()
-        yield self._render(epoch, model, average, started)
-        self.trained, self.pause = 0.0, max(self.pause, (time.monotonic() - started) / SHARE)
-
-    def _render(self, epoch: EpochEnd, model: DNR, average: Averaged | None, started: float) -> Previewed:
         training = model.training
         model.eval()
         try:
@@ -53,7 +49,7 @@ class Preview:
             model.train(training)
         target = self.views.tensors.target
         score = None if target is None else float(psnr(picture, target.cpu().float()).mean())
-        return Previewed(
+        yield Previewed(
             epoch.stage,
             epoch.epoch,
             epoch.epochs,
@@ -63,3 +59,4 @@ class Preview:
             time.monotonic() - started,
             epoch.device,
         )
+        self.trained, self.pause = 0.0, max(self.pause, (time.monotonic() - started) / SHARE)

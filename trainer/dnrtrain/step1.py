@@ -156,10 +156,10 @@ class _Step1(TrainingRun[Step1Settings]):
     def trained(self) -> list[nn.Module]:
         return [self.dnr] if self.walker is None else [self.dnr, self.walker.agent]
 
-    def more_state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    def more_state(self) -> tuple[checkpoint.Parts, dict[str, Any]]:
         if self.walker is None:
             return {}, {"reward_mean": None}
-        return self.walker.tensors(), {"reward_mean": self.walker.scale.mean}
+        return self.walker.parts(), {"reward_mean": self.walker.scale.mean}
 
     def load_more(self, saved: checkpoint.State) -> None:
         if self.walker is not None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from . import checkpoint
 from .contract import ContractError, DamagedFile
@@ -83,8 +83,8 @@ class TrainingRun(ABC, Generic[Settings]):
         """Modules whose weights must stay finite."""
         return [self.dnr]
 
-    def more_state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Further tensors, and further fields of `Progress`, for a checkpoint."""
+    def more_state(self) -> tuple[checkpoint.Parts, dict[str, Any]]:
+        """Further parts, and further fields of `Progress`, for a checkpoint."""
         return {}, {}
 
     def load_more(self, saved: checkpoint.State) -> None:
@@ -161,11 +161,10 @@ class TrainingRun(ABC, Generic[Settings]):
     # -- checkpoints -----------------------------------------------------------------------------------
 
     def _save(self, epoch: int) -> None:
-        tensors, fields = self.more_state()
-        tensors |= checkpoint.prefixed("dnr", self.dnr.state_dict())
-        tensors |= checkpoint.prefixed("adam", checkpoint.optimiser_tensors(self.optimiser))
+        parts, fields = self.more_state()
+        parts |= {"dnr": self.dnr.state_dict(), "adam": checkpoint.optimiser_tensors(self.optimiser)}
         if self.average is not None:
-            tensors |= checkpoint.prefixed("average", self.average.sums)
+            parts["average"] = self.average.sums
             fields["average_steps"] = self.average.steps
         progress = Progress(
             run=self.run,
@@ -175,7 +174,7 @@ class TrainingRun(ABC, Generic[Settings]):
             history=self.history,
             **fields,
         )
-        checkpoint.save_state(self.folder, tensors, progress)
+        checkpoint.save_state(self.folder, parts, progress)
 
     def _restore(self) -> int:
         """Load the state that this run was interrupted in -> epochs done. Else start afresh."""
@@ -193,8 +192,8 @@ class TrainingRun(ABC, Generic[Settings]):
 
     def _load(self, saved: checkpoint.State) -> None:
         self.dnr.use_bfloat16, self.history = saved.progress.bfloat16, saved.progress.history
-        self.dnr.load_state_dict(checkpoint.unprefixed("dnr", saved.tensors))
-        checkpoint.restore_optimiser(self.optimiser, checkpoint.unprefixed("adam", saved.tensors))
+        self.dnr.load_state_dict(saved.parts["dnr"])
+        checkpoint.restore_optimiser(self.optimiser, saved.parts["adam"])
         if self.average is not None:
-            self.average.restore(checkpoint.unprefixed("average", saved.tensors), saved.progress.average_steps)
+            self.average.restore(saved.parts["average"], saved.progress.average_steps)
         self.load_more(saved)

@@ -127,15 +127,14 @@ class Walker:
         why = ["drawn at random, as in every episode", *(f"highest action value: {value:.4f}" for value in values)]
         return Choice(order, [0.0, *finite], why, details)
 
-    def tensors(self) -> dict[str, Tensor]:
-        """Its part of step 1's checkpoint."""
-        tensors = checkpoint.prefixed("agent", self.agent.state_dict())
-        tensors |= checkpoint.prefixed("slow", self.slow.state_dict())
-        return tensors | checkpoint.prefixed("adam_agent", checkpoint.optimiser_tensors(self.adam))
+    def parts(self) -> checkpoint.Parts:
+        """Its parts of step 1's checkpoint."""
+        adam = checkpoint.optimiser_tensors(self.adam)
+        return {"agent": self.agent.state_dict(), "slow": self.slow.state_dict(), "adam_agent": adam}
 
     def load(self, saved: checkpoint.State) -> None:
         """Go on from step 1's checkpoint."""
         self.scale = RewardScale(saved.progress.reward_mean, raw=self.settings.reward_scale == "raw")
-        self.agent.load_state_dict(checkpoint.unprefixed("agent", saved.tensors))
-        self.slow.load_state_dict(checkpoint.unprefixed("slow", saved.tensors))
-        checkpoint.restore_optimiser(self.adam, checkpoint.unprefixed("adam_agent", saved.tensors))
+        self.agent.load_state_dict(saved.parts["agent"])
+        self.slow.load_state_dict(saved.parts["slow"])
+        checkpoint.restore_optimiser(self.adam, saved.parts["adam_agent"])
