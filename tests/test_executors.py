@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from dnrpipe.core.errors import UserError
-from dnrpipe.workers import timeouts as timeouts_module
+from dnrpipe.workers import processes as processes_module
 from dnrpipe.workers.processes import LocalWorker, Retry, TaskFailed, TaskResult, WorkerDied, run_tasks
 
 WORKER = """
@@ -126,14 +126,14 @@ def test_a_time_limit_from_the_environment(module: str, tmp_path: Path, monkeypa
 
 def test_a_time_limit_from_what_tasks_took(module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Hours before anything is known, then a multiple of the longest, and twice that for the second try."""
-    timeout = timeouts_module.TaskTimeout()
+    timeout = processes_module.TaskTimeout()
     assert (timeout.limit(1), timeout.reason()) == (6 * 3600, "")
     for seconds in (4.0, 100.0, 50.0):
         timeout.took(seconds)
     assert (timeout.limit(1), timeout.limit(2)) == (3000, 6000)
     assert timeout.reason() == "; the longest so far took 100 s"
-    monkeypatch.setattr(timeouts_module, "LEAST_LIMIT", 0.5)
-    monkeypatch.setattr(timeouts_module, "SLOWEST", 1.0)
+    monkeypatch.setattr(processes_module, "LEAST_LIMIT", 0.5)
+    monkeypatch.setattr(processes_module, "SLOWEST", 1.0)
     results, retries = _run(module, tmp_path, ["sleep", "hang"], workers=1)
     assert results[0].error is None
     assert "hung" in retries[0].reason and "the longest so far took" in retries[0].reason

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from .contract import BASE_CHANNELS, RASTER_CHANNELS, ContractError, DamagedFile, SceneFrame, View, require_channels
 from .display import ALPHA_FLOOR, DisplayTransform
+from .exr import read_exr
 
 INPUT_CHANNELS = ("depth.Z", "normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "mask", "coverage")
 Base = Literal["none", "raster", "baked", "direct", "path"]
@@ -162,8 +163,6 @@ def load_views(
         ContractError: counts differ, files missing or damaged, channels missing, mixed resolutions,
             not finite, near >= far, no views.
     """
-    from .exr import read_exr
-
     if (base in ("baked", "direct", "path")) != (base_files is not None):
         raise ContractError(f"base image '{base}' with {'no ' if base_files is None else ''}base files: must agree")
 

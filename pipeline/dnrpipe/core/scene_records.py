@@ -10,8 +10,6 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import ConfigDict
-
 from dnrtrain.records import Record
 
 Vector = tuple[float, float, float]
@@ -20,13 +18,9 @@ Lens = dict[str, float]
 FindingKind = Literal["exact", "approximated", "baked", "ignored", "missing"]
 
 
-class SceneRecord(Record):
-    """Keys of other versions are ignored.
-
-    Paths may hold surrogates (bytes that are no UTF-8), which pydantic's own JSON refuses: read and write plain values.
-    """
-
-    model_config = ConfigDict(frozen=True)
+class SceneRecord(Record, frozen=True):
+    """Paths may hold surrogates (bytes that are no UTF-8), which pydantic's own JSON refuses: read and write plain
+    values."""
 
 
 class Bounds(SceneRecord):

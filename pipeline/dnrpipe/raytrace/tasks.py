@@ -14,17 +14,15 @@ import time
 from pathlib import Path
 from typing import Any, Literal, NotRequired, TypedDict
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel
 
 from dnrtrain.contract import View
 
 from ..core.scene_records import Lens
 
 
-class Task(BaseModel):
+class Task(BaseModel, frozen=True):
     """Unknown keys are ignored."""
-
-    model_config = ConfigDict(frozen=True)
 
 
 class BundleCommon(Task):

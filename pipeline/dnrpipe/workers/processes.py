@@ -29,9 +29,16 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import UserError
-from .timeouts import TaskTimeout
+from ..core.units import parse_seconds
 
 MAX_ATTEMPTS = 2
+TIMEOUT_VARIABLE = "DNRPIPE_TASK_TIMEOUT"
+FIRST_LIMIT = 6 * 3600.0
+"""Seconds that a task may take while none has ended yet: paper-sized light on two cores is well within."""
+LEAST_LIMIT = 600.0
+"""Below it nothing counts as hung, however quick the others were: machines swap, and sleep."""
+SLOWEST = 30.0
+"""A task may take so many times the longest one so far."""
 
 
 @dataclass
@@ -59,6 +66,48 @@ class Retry:
     reason: str
 
 
+class TaskTimeout:
+    """The limit of each task of one run.
+
+    Args:
+        fixed: seconds; None: those of DNRPIPE_TASK_TIMEOUT, else SLOWEST times the longest task that ended so far
+            (LEAST_LIMIT at least, FIRST_LIMIT before any has).
+
+    Raises UserError: the variable is no number of seconds above 0.
+    """
+
+    def __init__(self, fixed: float | None = None) -> None:
+        self.fixed = _configured_limit() if fixed is None else fixed
+        self.longest: float | None = None
+
+    def limit(self, attempt: int) -> float:
+        """Seconds for try number ``attempt`` of a task; further tries get twice as long, unless told otherwise."""
+        if self.fixed is not None:
+            return self.fixed
+        usual = FIRST_LIMIT if self.longest is None else max(LEAST_LIMIT, SLOWEST * self.longest)
+        return usual * (1 if attempt == 1 else 2)
+
+    def took(self, seconds: float) -> None:
+        """A task ended after so many seconds."""
+        self.longest = max(seconds, self.longest or 0.0)
+
+    def reason(self) -> str:
+        """What the limit came from."""
+        if self.fixed is not None or self.longest is None:
+            return ""
+        return f"; the longest so far took {self.longest:.0f} s"
+
+
+def _configured_limit() -> float | None:
+    text = os.environ.get(TIMEOUT_VARIABLE, "").strip()
+    if not text:
+        return None
+    try:
+        return parse_seconds(text)
+    except ValueError:
+        raise UserError(f"{TIMEOUT_VARIABLE}={text}: expected a time such as 90, 20m or 2h") from None
+
+
 def run_tasks(
     module: str,
     common: dict[str, Any],
@@ -78,7 +127,7 @@ def run_tasks(
         common: JSON-able, sent once to each worker.
         log: file to which the workers' output is appended.
         retried: called when a task is tried once more.
-        timeout: seconds after which a silent task counts as hung; its worker is killed. None: see `patience`.
+        timeout: seconds after which a silent task counts as hung; its worker is killed. None: see `TaskTimeout`.
         environment: variables added to the workers' environment.
         next_tasks: called with each TaskResult before it is yielded; returns tasks to do after it.
 
@@ -193,7 +242,29 @@ class LocalWorker:
         """
         if self._process is None or self._process.poll() is not None:
             self._process = self._spawn()
-        return _ask(self._process, task, timeout, why)
+        process = self._process
+        assert process.stdin is not None and process.stdout is not None
+        hung = threading.Event()
+
+        def kill() -> None:
+            hung.set()
+            process.kill()
+
+        timer = threading.Timer(timeout, kill)
+        timer.daemon = True
+        timer.start()
+        try:
+            try:
+                process.stdin.write(json.dumps(task) + "\n")
+                process.stdin.flush()
+                line = process.stdout.readline()
+            except OSError:
+                line = ""
+            if not line:
+                raise WorkerDied(f"worker hung for {timeout:.0f} s{why}" if hung.is_set() else _exit_reason(process))
+            return json.loads(line)
+        finally:
+            timer.cancel()
 
     def kill(self) -> None:
         """At once, and from any thread; `close` is still to be called."""
@@ -236,31 +307,6 @@ class LocalWorker:
         except OSError:
             raise WorkerDied(_exit_reason(process)) from None
         return process
-
-
-def _ask(process: subprocess.Popen[str], task: dict[str, Any], timeout: float, why: str) -> dict[str, Any]:
-    assert process.stdin is not None and process.stdout is not None
-    hung = threading.Event()
-
-    def kill() -> None:
-        hung.set()
-        process.kill()
-
-    timer = threading.Timer(timeout, kill)
-    timer.daemon = True
-    timer.start()
-    try:
-        try:
-            process.stdin.write(json.dumps(task) + "\n")
-            process.stdin.flush()
-            line = process.stdout.readline()
-        except OSError:
-            line = ""
-        if not line:
-            raise WorkerDied(f"worker hung for {timeout:.0f} s{why}" if hung.is_set() else _exit_reason(process))
-        return json.loads(line)
-    finally:
-        timer.cancel()
 
 
 def _exit_reason(process: subprocess.Popen[str]) -> str:

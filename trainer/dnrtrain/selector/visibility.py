@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..contract import ContractError, View, require_channels
+from ..exr import read_exr
 
 if TYPE_CHECKING:
     from ..dataset import ViewSet
@@ -78,7 +79,6 @@ def read_visibility(
 
     Raises ContractError: counts differ, or a file is missing, damaged, of another size, or lacks channels.
     """
-    from ..exr import read_exr
 
     def look() -> Iterable[SurfaceVisibility]:
         for file, view in zip(files, views, strict=True):
