@@ -60,8 +60,8 @@ class Features(nn.Module):
         self.register_buffer("scale", torch.tensor(SCALE).view(1, 3, 1, 1))
         self.convolutions = nn.ModuleList()
         inputs = 3
-        for index, (channels, *shape) in enumerate(LAYOUT[network][: self.taps[-1] + 1]):
-            layer = nn.Conv2d(inputs, channels, *shape)
+        for index, (channels, kernel, stride, padding) in enumerate(LAYOUT[network][: self.taps[-1] + 1]):
+            layer = nn.Conv2d(inputs, channels, kernel, stride, padding)
             layer.load_state_dict({"weight": weights[f"conv.{index}.weight"], "bias": weights[f"conv.{index}.bias"]})
             self.convolutions.append(layer)
             inputs = channels
