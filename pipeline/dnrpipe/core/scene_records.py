@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from typing import Literal
 
+from pydantic import ConfigDict
+
 from dnrtrain.records import Record
 
 Vector = tuple[float, float, float]
@@ -18,9 +20,11 @@ Lens = dict[str, float]
 FindingKind = Literal["exact", "approximated", "baked", "ignored", "missing"]
 
 
-class SceneRecord(Record, frozen=True):
+class SceneRecord(Record):
     """Paths may hold surrogates (bytes that are no UTF-8), which pydantic's own JSON refuses: read and write plain
     values."""
+
+    model_config = ConfigDict(frozen=True)
 
 
 class Bounds(SceneRecord):

@@ -14,15 +14,17 @@ import time
 from pathlib import Path
 from typing import Any, Literal, NotRequired, TypedDict
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ConfigDict
 
 from dnrtrain.contract import View
 
 from ..core.scene_records import Lens
 
 
-class Task(BaseModel, frozen=True):
+class Task(BaseModel):
     """Unknown keys are ignored."""
+
+    model_config = ConfigDict(frozen=True)
 
 
 class BundleCommon(Task):
