@@ -56,11 +56,6 @@ class StageRecord(BaseModel, extra="forbid"):
     seconds: float
     detail: dict[str, Any] = Field(default_factory=dict)
 
-    @property
-    def perceptual(self) -> bool | None:
-        """Whether it had perceptual weights; None where it needs none."""
-        return self.detail.get("perceptual")
-
 
 class PrepareDetail(BaseModel, strict=True):
     """What stage `prepare` tells of itself.

@@ -77,35 +77,27 @@ class TaskTimeout:
     """
 
     def __init__(self, fixed: float | None = None) -> None:
-        self.fixed = _configured_limit() if fixed is None else fixed
-        self.longest: float | None = None
+        self.fixed, self.longest = fixed, 0.0
+        if fixed is None and (text := os.environ.get(TIMEOUT_VARIABLE, "").strip()):
+            try:
+                self.fixed = parse_seconds(text)
+            except ValueError:
+                raise UserError(f"{TIMEOUT_VARIABLE}={text}: expected a time such as 90, 20m or 2h") from None
 
     def limit(self, attempt: int) -> float:
         """Seconds for try number ``attempt`` of a task; further tries get twice as long, unless told otherwise."""
         if self.fixed is not None:
             return self.fixed
-        usual = FIRST_LIMIT if self.longest is None else max(LEAST_LIMIT, SLOWEST * self.longest)
+        usual = max(LEAST_LIMIT, SLOWEST * self.longest) if self.longest else FIRST_LIMIT
         return usual * (1 if attempt == 1 else 2)
 
     def took(self, seconds: float) -> None:
         """A task ended after so many seconds."""
-        self.longest = max(seconds, self.longest or 0.0)
+        self.longest = max(seconds, self.longest)
 
     def reason(self) -> str:
         """What the limit came from."""
-        if self.fixed is not None or self.longest is None:
-            return ""
-        return f"; the longest so far took {self.longest:.0f} s"
-
-
-def _configured_limit() -> float | None:
-    text = os.environ.get(TIMEOUT_VARIABLE, "").strip()
-    if not text:
-        return None
-    try:
-        return parse_seconds(text)
-    except ValueError:
-        raise UserError(f"{TIMEOUT_VARIABLE}={text}: expected a time such as 90, 20m or 2h") from None
+        return f"; the longest so far took {self.longest:.0f} s" if self.fixed is None and self.longest else ""
 
 
 def run_tasks(
