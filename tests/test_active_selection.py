@@ -225,7 +225,7 @@ def test_pieces_are_the_visible_cells_by_direction(raster: ViewSet) -> None:
     seen = look_at(synthetic.gbuffer(view), view)
     count = int(views.tensors.mask[1].sum())
     found = pieces_of(views, 1, np.full(count, 2.0))
-    assert found.pixels.sum() == pytest.approx(seen.seen) and found.unsure == pytest.approx(2 * found.pixels)
+    assert found.pixels.sum() == pytest.approx(seen.seen[0]) and found.unsure == pytest.approx(2 * found.pixels)
     assert np.unique(found.keys // 32).tolist() == np.unique(cells_of(views, 1)).tolist()
     table = visibility_of(views)
     assert table.cells[table.of(1)].tolist() == seen.cells.tolist() == np.unique(cells_of(views, 1)).tolist()

@@ -17,11 +17,10 @@ from dnrpipe.core.ledger import (
     CostSummary,
     Ledger,
     break_even_frames,
-    by_purpose,
-    by_stage,
     latest_epochs,
     summarise,
     total,
+    total_by,
     traced_views,
     tracing_all_would_cost,
     upfront_seconds,
@@ -145,12 +144,12 @@ def test_sums_by_stage_and_purpose_and_wall_clock() -> None:
         record(name="test/1", purpose="evaluation", seconds=6.0, workers=2, peak_mb=300.0),
         record(name="test/2", purpose="evaluation", seconds=0.0, cache_hit=True),
     ]
-    stages = by_stage(records)
+    stages = total_by("stage", records)
     assert list(stages) == ["raytrace", "finetune"]  # the pipeline's order, not the file's
     assert stages["raytrace"].seconds == 10.0
     assert stages["raytrace"].wall_seconds == 5.0
     assert stages["raytrace"].cache_hits == 1
-    purposes = by_purpose(records)
+    purposes = total_by("purpose", records)
     assert purposes["training"].seconds == 14.0
     assert purposes["training"].wall_seconds == 12.0
     assert purposes["evaluation"].wall_seconds == 3.0
@@ -208,7 +207,7 @@ def test_repeated_epochs_count_once_in_what_a_stage_costs() -> None:
         for i, s in ((1, 9.0), (2, 9.0), (1, 5.0), (2, 6.0))
     ]
     assert [e.seconds for e in latest_epochs([*epochs, record()], "select")] == [5.0, 6.0]
-    assert by_stage(epochs)["select"].seconds == 29.0
+    assert total_by("stage", epochs)["select"].seconds == 29.0
 
 
 def test_tracing_all_before_tracing_and_with_bad_counts() -> None:

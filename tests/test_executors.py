@@ -8,12 +8,13 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from dnrpipe.core.errors import UserError
-from dnrpipe.workers import timeouts as timeouts_module
+from dnrpipe.workers import processes as processes_module
 from dnrpipe.workers.processes import LocalWorker, Retry, TaskFailed, TaskResult, WorkerDied, run_tasks
 
 WORKER = """
@@ -62,10 +63,10 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 
 def _run(module: str, folder: Path, kinds: list[str], **options) -> tuple[list[TaskResult], list[Retry]]:
     tasks = [{"kind": kind, "n": n} for n, kind in enumerate(kinds)]
-    options = {"workers": 2, "log": folder / "log.txt", **options}
-    outcomes = list(run_tasks(module, {"folder": str(folder)}, tasks, **options))
-    results = sorted((o for o in outcomes if isinstance(o, TaskResult)), key=lambda o: o.task["n"])
-    return results, [o for o in outcomes if isinstance(o, Retry)]
+    retries: list[Retry] = []
+    options = {"workers": 2, "log": folder / "log.txt", "retried": retries.append, **options}
+    results = sorted(run_tasks(module, {"folder": str(folder)}, tasks, **options), key=lambda o: o.task["n"])
+    return results, retries
 
 
 def test_all_tasks_are_done_on_several_processes(module: str, tmp_path: Path) -> None:
@@ -125,14 +126,14 @@ def test_a_time_limit_from_the_environment(module: str, tmp_path: Path, monkeypa
 
 def test_a_time_limit_from_what_tasks_took(module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Hours before anything is known, then a multiple of the longest, and twice that for the second try."""
-    timeout = timeouts_module.TaskTimeout()
+    timeout = processes_module.TaskTimeout()
     assert (timeout.limit(1), timeout.reason()) == (6 * 3600, "")
     for seconds in (4.0, 100.0, 50.0):
         timeout.took(seconds)
     assert (timeout.limit(1), timeout.limit(2)) == (3000, 6000)
     assert timeout.reason() == "; the longest so far took 100 s"
-    monkeypatch.setattr(timeouts_module, "LEAST_LIMIT", 0.5)
-    monkeypatch.setattr(timeouts_module, "SLOWEST", 1.0)
+    monkeypatch.setattr(processes_module, "LEAST_LIMIT", 0.5)
+    monkeypatch.setattr(processes_module, "SLOWEST", 1.0)
     results, retries = _run(module, tmp_path, ["sleep", "hang"], workers=1)
     assert results[0].error is None
     assert "hung" in retries[0].reason and "the longest so far took" in retries[0].reason
@@ -246,12 +247,15 @@ def test_a_scene_that_opened_at_the_second_try_is_said(
     from dnrpipe.core.workspace import Source, Workspace
     from dnrpipe.stages import prepare
     from dnrpipe.stages.stage import Run
-    from dnrpipe.workers import answers
 
     workspace = Workspace.create(tmp_path / "a.dnr", Source(path="a.blend", sha256=""))
     for last in (TaskResult({}, {"bakes": None}), TaskResult({}, None, "worker hung for 60 s", 2, died=True)):
-        outcomes = [Retry({}, "worker hung for 60 s"), last]
-        monkeypatch.setattr(answers, "run_tasks", lambda *_, found=outcomes, **__: (outcome for outcome in found))
+
+        def run_tasks(*_: object, retried: Callable[[Retry], None], found: TaskResult = last, **__: object) -> list:
+            retried(Retry({}, "worker hung for 60 s"))
+            return [found]
+
+        monkeypatch.setattr(prepare, "run_tasks", run_tasks)
         run = Run(workspace, Settings(), Console(quiet=True))
         if last.result is not None:
             prepare._run_conversion(run, tmp_path / "a.blend", tmp_path / "scene")

@@ -54,11 +54,13 @@ def test_the_fuzz_can_fail(tmp_path: Path) -> None:
     assert fuzz("careless", careless, tmp_path, 50, 0)["escaped"] > 10
 
 
-@pytest.mark.parametrize(("record", "read"), [(scene_summary(), read_summary), (scene_census(), read_census)])
-def test_mutated_records_of_a_scene(tmp_path: Path, record: Record, read: Callable[[Path], Record]) -> None:
+@pytest.mark.parametrize(
+    ("name", "record", "read"),
+    [("summary.json", scene_summary(), read_summary), ("census.json", scene_census(), read_census)],
+)
+def test_mutated_records_of_a_scene(tmp_path: Path, name: str, record: Record, read: Callable[[Path], Record]) -> None:
     from tools.faults.fuzz import Target, fuzz
 
-    name = f"{read.__name__.removeprefix('read_')}.json"
     target = Target(name, json.dumps(record.data()).encode(), lambda path: read(path.parent), text=True)
     row = fuzz(name, target, tmp_path, 300, 0)
     assert row["escaped"] == 0, row["errors"]

@@ -18,7 +18,7 @@ from dnrpipe.raytrace.pictures import repair
 from dnrpipe.stages.base_images import BaseRenderer, bake_light
 from dnrpipe.stages.effect_plan import run_pilots
 from dnrpipe.stages.stage import Run
-from dnrpipe.workers import answers
+from dnrpipe.workers import view_tasks
 from dnrpipe.workers.processes import TaskResult
 from dnrpipe.workers.view_tasks import warn_of_repairs
 from dnrtrain.contract import ContractError, View
@@ -118,7 +118,7 @@ def test_pilot_pictures_that_are_not_finite_are_counted(
     answer = worker(task)
     assert answer["masked"] == 6  # one pixel of two warm-up frames and two halves of two configurations
     assert answer["error"]["mean"] == 0
-    monkeypatch.setattr(answers, "run_tasks", lambda *_, **__: (item for item in [TaskResult(task, answer)]))
+    monkeypatch.setattr(view_tasks, "run_tasks", lambda *_, **__: [TaskResult(task, answer)])
     choice: Any = SimpleNamespace(environment={})
     assert run_pilots([task], choice, Console(quiet=True), "pilot", tmp_path / "log") == [answer]
     assert "repaired: 6 pixels of pilot pictures were not finite" in capsys.readouterr().err
@@ -130,7 +130,7 @@ def test_light_that_is_not_finite_is_said(
     """The baker's count reaches the terminal and the ledger."""
     task = {"output": str(tmp_path / "light.npz"), "fingerprint": "f", "size": 16, "spp": 4}
     result = {"seconds": 1.0, "cpu_seconds": 1.0, "peak_mb": 1.0, "texels": 9, "lost": 12}
-    monkeypatch.setattr(answers, "run_tasks", lambda *_, **__: (item for item in [TaskResult(task, result)]))
+    monkeypatch.setattr(view_tasks, "run_tasks", lambda *_, **__: [TaskResult(task, result)])
     workspace = Workspace.create(tmp_path / "a.dnr", Source(path="a.blend", sha256=""))
     run = Run(workspace, Settings(), Console(quiet=True), "raytrace", "r")
     bake_light(run, BaseRenderer({"bundle": "b", "variant": "v"}, {}, task, "f"))

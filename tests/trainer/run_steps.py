@@ -39,7 +39,7 @@ def run(scene: Path, out: Path, policy: str) -> list[str]:
         policy=policy, budget=BUDGET, seed=5, device="cpu", checkpoints=out / "step1", fingerprint="a",
     ):  # fmt: skip
         if isinstance(event, Selected):
-            selected = event.views
+            selected = event.selection.views
     chosen = traced.subset([traced.index(name) for name in selected])
     for _ in run_step2(
         chosen, None, out / "step1", MODEL, STEP2,

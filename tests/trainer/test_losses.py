@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
 
 from dnrtrain import losses
 from dnrtrain.model import Output
-from dnrtrain.perceptual import LAYOUT, LOSS_WEIGHTS, TAPS, Features, PerceptualLoss
+from dnrtrain.perceptual import LOSS_WEIGHTS, Features, PerceptualLoss, weight_shapes
 from dnrtrain.settings import LossWeights, Step2Settings
 
 TERMS = {"photometric", "ssim", "perceptual", "frequency", "total_variation", "regularisation"}
@@ -18,18 +20,11 @@ def random_weights(network: str) -> dict[str, torch.Tensor]:
     """Weights of the right shapes: the mechanics need no trained network."""
     generator = torch.Generator().manual_seed(0)
     weights: dict[str, torch.Tensor] = {}
-    inputs, outputs = 3, []
-    for item in LAYOUT[network]:
-        if isinstance(item, str):
-            continue
-        scale = (2.0 / (inputs * item[1] ** 2)) ** 0.5
-        shape = (item[0], inputs, item[1], item[1])
-        weights[f"conv.{len(outputs)}.weight"] = scale * torch.randn(shape, generator=generator)
-        weights[f"conv.{len(outputs)}.bias"] = torch.zeros(item[0])
-        outputs.append(item[0])
-        inputs = item[0]
-    for j, tap in enumerate(TAPS[network]):
-        weights[f"head.{j}"] = torch.rand(1, outputs[tap], 1, 1, generator=generator)
+    for name, shape in weight_shapes(network).items():
+        if name.endswith("weight"):
+            weights[name] = (2.0 / math.prod(shape[1:])) ** 0.5 * torch.randn(shape, generator=generator)
+        else:
+            weights[name] = torch.zeros(shape) if name.endswith("bias") else torch.rand(shape, generator=generator)
     return weights
 
 

@@ -16,7 +16,7 @@ from dnrtrain.selector.medoids import Facilities, KMedoidsPolicy, build, camera_
 from dnrtrain.selector.names import NAMES, TRAINED_NAMES, UNTRAINED_NAMES
 from dnrtrain.selector.policies import UNTRAINED, untrained
 from dnrtrain.selector.protocol import Candidates
-from dnrtrain.selector.visibility import ViewVisibility, collect, look_at
+from dnrtrain.selector.visibility import SurfaceVisibility, collect, look_at
 
 SIDE, GRID = 16, 8
 DETERMINISTIC = ("auto", "coverage", "kmedoids")
@@ -176,10 +176,13 @@ def test_lazy_greedy_is_greedy(seed: int, budget: int) -> None:
         known |= sets[element]
 
 
-def seen(cells: list[int], view_directions: tuple[float, float, float], picture: int) -> ViewVisibility:
+def seen(cells: list[int], view_directions: tuple[float, float, float], picture: int) -> SurfaceVisibility:
     share = np.full(len(cells), 0.5 / len(cells), np.float32)
     towards = np.tile(np.array(view_directions, np.float32), (len(cells), 1))
-    return ViewVisibility(np.array(cells, np.int32), share, towards, 0.5, picture)
+    start, half = np.array([0, len(cells)]), np.array([0.5], np.float32)
+    return SurfaceVisibility(
+        GRID, start, np.array(cells, np.int32), share, towards, half, np.array([picture], np.uint64)
+    )
 
 
 def test_what_is_seen_counts_where_poses_say_nothing() -> None:

@@ -18,7 +18,7 @@ from dnrtrain.dataset import ViewSet
 from dnrtrain.events import EpochEnd, Event, Previewed
 from dnrtrain.metrics import psnr
 from dnrtrain.model import DNR, render_views
-from dnrtrain.preview import Preview, Previewer
+from dnrtrain.preview import Preview
 from dnrtrain.settings import LossWeights, ModelSettings, Step2Settings
 from dnrtrain.step2 import run_step2
 
@@ -97,11 +97,11 @@ def test_when_a_picture_is_due(scene: Scene, monkeypatch: pytest.MonkeyPatch) ->
 
     def pictures(pause: float, cost: float) -> list[int]:
         nonlocal clock
-        previewer = Previewer(Preview(unseen(scene, target=False), pause), "cpu")
+        preview = Preview(unseen(scene, target=False), pause)
         found = []
         for number in range(1, 101):
-            done = EpochEnd("step2", number, 100, {}, {}, 1.0, 1.0, 1)
-            for event in previewer.after(done, model, None):
+            done = EpochEnd(stage="step2", epoch=number, epochs=100, seconds=1.0)
+            for event in preview.after(done, model, None):
                 found.append(event.epoch)
                 clock += cost  # rendering and whoever writes the picture
         return found

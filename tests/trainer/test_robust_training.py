@@ -71,7 +71,7 @@ def test_step1_takes_a_spike_back_too(scene: Scene, tmp_path: Path) -> None:
         )
     )  # fmt: skip
     assert any(isinstance(event, Diverged) for event in events)
-    assert isinstance(events[-1], Selected) and len(set(events[-1].views)) == 4
+    assert isinstance(events[-1], Selected) and len(set(events[-1].selection.views)) == 4
     assert finite(tmp_path / "step1")
 
 
@@ -103,8 +103,8 @@ def test_a_training_that_never_recovers_is_refused(scene: Scene, tmp_path: Path)
 
 
 def finite_state(folder: Path) -> bool:
-    saved = checkpoint.load_state(folder)
-    return saved is not None and all(bool(torch.isfinite(t).all()) for t in saved.tensors.values())
+    saved = checkpoint.load(folder / checkpoint.STATE)
+    return saved is not None and all(bool(torch.isfinite(t).all()) for t in saved[0].values())
 
 
 def test_the_watch() -> None:
@@ -169,7 +169,7 @@ def test_identical_views(scene: Scene, tmp_path: Path) -> None:
                 policy=policy, budget=4, seed=0, device="cpu", checkpoints=tmp_path / policy, fingerprint="f",
             )
         )  # fmt: skip
-        assert isinstance(events[-1], Selected) and len(set(events[-1].views)) == 4
+        assert isinstance(events[-1], Selected) and len(set(events[-1].selection.views)) == 4
     epochs = [event for event in fine_tune(same, tmp_path, FRESH) if isinstance(event, EpochEnd)]
     assert epochs[-1].losses["photometric"] < epochs[0].losses["photometric"]
 

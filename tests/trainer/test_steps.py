@@ -28,7 +28,7 @@ from dnrtrain.losses import Step2Loss
 from dnrtrain.metrics import psnr
 from dnrtrain.model import DNR, render_views
 from dnrtrain.precision import decide_bfloat16
-from dnrtrain.schedule import guarded_step, learning_rate
+from dnrtrain.schedule import Averaged, guarded_step, learning_rate
 from dnrtrain.selector.agent import Reward
 from dnrtrain.settings import LossWeights, ModelSettings, Step1Settings, Step2Settings
 from dnrtrain.step1 import run_step1
@@ -72,10 +72,10 @@ def test_selection_and_books(scene: Scene, tmp_path: Path, policy: str) -> None:
     assert epochs[1].losses["dnr"] < epochs[0].losses["dnr"] and epochs[0].val["psnr"] > 0
     assert ("rl" in epochs[0].losses) == (policy == "rl-paper")
     last = events[-1]
-    assert isinstance(last, Selected) and last.policy == policy
-    assert len(set(last.views)) == 4 and set(last.views) <= set(scene.raster.names)
+    assert isinstance(last, Selected) and last.selection.policy == policy
+    assert len(set(last.selection.views)) == 4 and set(last.selection.views) <= set(scene.raster.names)
     record = read_record(tmp_path / "step1")
-    assert record is not None and record.selected == last.views
+    assert record is not None and record.selected == last.selection.views
     assert [entry.epoch for entry in record.history] == [1, 2]
     assert sorted(path.name for path in (tmp_path / "step1").iterdir()) == ["model.json", "model.safetensors"]
     # A finished step answers at once, and the same.
@@ -88,7 +88,7 @@ def test_every_budget_and_reward(scene: Scene, tmp_path: Path, budget: int, rewa
     settings = QUICK1.model_copy(update={"epochs": 1, "reward": reward})
     events = step1(scene.raster, tmp_path, budget=budget, settings=settings)
     assert isinstance(events[-1], Selected)
-    assert len(set(events[-1].views)) == budget
+    assert len(set(events[-1].selection.views)) == budget
 
 
 def test_seeds_decide(scene: Scene, tmp_path: Path) -> None:
@@ -96,7 +96,7 @@ def test_seeds_decide(scene: Scene, tmp_path: Path) -> None:
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
         event = step1(scene.raster, tmp_path / name, seed=seed)[-1]
         assert isinstance(event, Selected)
-        chosen.append(event.views)
+        chosen.append(event.selection.views)
     weights = [(tmp_path / name / "step1" / "model.safetensors").read_bytes() for name in "abc"]
     assert chosen[0] == chosen[1] and weights[0] == weights[1] != weights[2]
 
@@ -303,9 +303,13 @@ def test_the_averaged_weights_are_the_model(scene: Scene, tmp_path: Path) -> Non
     tracks = []
     for steps in (1, 2, 3):
         loss, folder = Step2Loss(settings, None), tmp_path / f"cut{steps}"
-        run = _Step2(data, None, DNR(model, 0), settings, loss, 0, "run", folder, "cpu")
+        dnr = DNR(model, 0)
+        dnr.use_bfloat16 = decide_bfloat16(settings.precision, "cpu")
+        run = _Step2(
+            dnr=dnr, views=data, val=None, settings=settings, loss=loss, seed=0, run="run", folder=folder, device="cpu",
+            average=Averaged(dnr, settings.ema),
+        )  # fmt: skip
         run._restore()
-        run.steps_per_epoch = 3
         taken = 0
 
         def stop_after(*args: object, steps: int = steps) -> bool:

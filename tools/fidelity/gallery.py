@@ -19,7 +19,7 @@ from PIL import Image
 
 from dnrpipe.core.console import Console
 from dnrpipe.core.workspace import file_sha256
-from dnrpipe.workers.processes import TaskResult, run_tasks
+from dnrpipe.workers.processes import run_tasks
 from dnrtrain.atomic import atomic_path, write_json, write_text
 
 from . import ours
@@ -156,7 +156,7 @@ def _told(findings: Sequence[dict[str, Any]]) -> str:
 
 def _cycles(task: dict[str, Any], log: Path) -> None:
     for outcome in run_tasks("tools.fidelity.existing", {}, [task], workers=1, log=log, timeout=TIMEOUT):
-        if isinstance(outcome, TaskResult) and outcome.result is None:
+        if outcome.result is None:
             raise ours.FidelityError(f"Cycles: {outcome.error}")
 
 

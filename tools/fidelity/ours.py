@@ -19,7 +19,7 @@ from dnrpipe.core.workspace import Source, Workspace, file_sha256
 from dnrpipe.raytrace.variants import choose_variant
 from dnrpipe.stages.prepare import convert_scene
 from dnrpipe.stages.stage import Run
-from dnrpipe.workers.processes import Retry, TaskResult, run_tasks
+from dnrpipe.workers.processes import TaskResult, run_tasks
 from dnrtrain.exr import read_exr
 
 from .reference_settings import PATH_DEPTH
@@ -73,8 +73,8 @@ def trace(
     return [result.result or {} for result in done]
 
 
-def _finish(outcomes: Iterable[TaskResult | Retry]) -> list[TaskResult]:
-    finished = [outcome for outcome in outcomes if isinstance(outcome, TaskResult)]
+def _finish(outcomes: Iterable[TaskResult]) -> list[TaskResult]:
+    finished = list(outcomes)
     for outcome in finished:
         if outcome.result is None:
             raise FidelityError(str(outcome.error))

@@ -17,7 +17,7 @@ from typing import Any
 
 from dnrpipe.core.console import Console
 from dnrpipe.raytrace.variants import choose_variant
-from dnrpipe.workers.processes import TaskResult, run_tasks
+from dnrpipe.workers.processes import run_tasks
 from dnrtrain.atomic import write_json
 
 from . import ours, reference_settings
@@ -71,11 +71,10 @@ def make_references(cases: Sequence[Case], plan: Plan, console: Console) -> dict
         for outcome in run_tasks(
             "tools.fidelity.reference", {}, tasks, workers=plan.jobs, log=log, timeout=REFERENCE_TIMEOUT
         ):
-            if isinstance(outcome, TaskResult):
-                if outcome.result is None:
-                    failed[outcome.task["case"]] = f"Cycles: {outcome.error}"
-                    console.warn(f"{outcome.task['case']}: {outcome.error}")
-                bar.advance(note=outcome.task["case"])
+            if outcome.result is None:
+                failed[outcome.task["case"]] = f"Cycles: {outcome.error}"
+                console.warn(f"{outcome.task['case']}: {outcome.error}")
+            bar.advance(note=outcome.task["case"])
     return failed
 
 

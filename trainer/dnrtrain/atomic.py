@@ -26,13 +26,10 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     temporary = path.parent / f".{path.stem}.{os.getpid()}.tmp{path.suffix}"
     try:
         yield temporary
-        descriptor = os.open(temporary, os.O_RDWR)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        _fsync(temporary, os.O_RDWR)
         temporary.replace(path)
-        _fsync_directory(path.parent)
+        if os.name != "nt":  # directories cannot be opened on Windows
+            _fsync(path.parent, os.O_RDONLY)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -48,10 +45,8 @@ def write_json(path: str | os.PathLike[str], value: Any) -> None:
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
-def _fsync_directory(folder: Path) -> None:
-    if os.name == "nt":  # directories cannot be opened on Windows
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
+def _fsync(path: Path, flags: int) -> None:
+    descriptor = os.open(path, flags)
     try:
         os.fsync(descriptor)
     finally:

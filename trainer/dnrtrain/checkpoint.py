@@ -12,6 +12,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,21 +34,15 @@ from .settings import ModelSettings
 HEADER = "dnrtrain"
 CHECKSUM = "sha256"
 STATE = "state.safetensors"
-
-
-@dataclass(frozen=True)
-class Saved:
-    """Tensors by name (on the CPU) and the JSON that was stored with them."""
-
-    tensors: dict[str, Tensor]
-    info: dict[str, Any]
+Parts = dict[str, dict[str, Tensor]]
+"""Tensors by name, by what they are of: a module, an optimiser."""
 
 
 @dataclass(frozen=True)
 class State:
-    """An unfinished training: tensors by name (on the CPU), and how far it is."""
+    """An unfinished training: its parts (on the CPU), and how far it is."""
 
-    tensors: dict[str, Tensor]
+    parts: Parts
     progress: Progress
 
 
@@ -64,8 +59,8 @@ def save(path: Path, tensors: Mapping[str, Tensor], info: Mapping[str, Any]) -> 
         raise OSError(number, str(error), str(path)) from None
 
 
-def load(path: Path) -> Saved | None:
-    """Read what `save` wrote; None when the file is missing. Raises DamagedFile when it does not read."""
+def load(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
+    """The tensors (on the CPU) and the JSON of `save`; None without the file. Raises DamagedFile: it does not read."""
     if not Path(path).exists():
         return None
     try:
@@ -78,7 +73,7 @@ def load(path: Path) -> Saved | None:
         raise DamagedFile(path, "its header holds no JSON object")
     if info.pop(CHECKSUM, "") not in ("", checksum(tensors)):
         raise DamagedFile(path, "weights are not those that were written")
-    return Saved(tensors, info)
+    return tensors, info
 
 
 def checksum(tensors: Mapping[str, Tensor]) -> str:
@@ -114,47 +109,27 @@ def restore_optimiser(optimiser: torch.optim.Optimizer, tensors: Mapping[str, Te
     optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
 
 
-def prefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {f"{prefix}/{name}": tensor for name, tensor in tensors.items()}
-
-
-def unprefixed(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    start = f"{prefix}/"
-    return {name.removeprefix(start): t for name, t in tensors.items() if name.startswith(start)}
-
-
-def save_state(folder: Path, tensors: Mapping[str, Tensor], progress: Progress) -> None:
+def save_state(folder: Path, parts: Parts, progress: Progress) -> None:
+    tensors = {f"{part}/{name}": tensor for part, tensors in parts.items() for name, tensor in tensors.items()}
     save(folder / STATE, tensors, progress.data())
     records.write(folder / records.PROGRESS, progress)
 
 
-def load_state(folder: Path) -> State | None:
-    """The state of the last whole epoch, or None when there is none. Raises DamagedFile."""
+def load_state(folder: Path, run: str) -> State | None:
+    """The state of the run's last whole epoch, or None when there is none. Raises DamagedFile."""
     saved = load(folder / STATE)
     if saved is None:
         return None
+    tensors, info = saved
     try:
-        return State(saved.tensors, Progress.model_validate(saved.info))
+        progress = Progress.model_validate(info)
     except ValidationError as error:
         raise DamagedFile(folder / STATE, error.errors()[0]["msg"]) from None
-
-
-def interrupted(folder: Path, run: str, notes: list[str]) -> State | None:
-    """The state that the run was interrupted in, or None. A damaged one is no state; ``notes`` then says so."""
-    try:
-        saved = load_state(folder)
-    except DamagedFile as damage:
-        notes.append(f"{damage.path}: damaged; training starts afresh")
-        return None
-    return saved if saved is not None and saved.progress.run == run else None
-
-
-def require_state(folder: Path, run: str) -> State:
-    """The state that the run wrote last. Raises ContractError when it is gone, or another run's."""
-    saved = load_state(folder)
-    if saved is None or saved.progress.run != run:
-        raise ContractError(f"{folder / STATE}: was removed or replaced while training; run the same command again")
-    return saved
+    parts: Parts = defaultdict(dict)
+    for name, tensor in tensors.items():
+        part, _, own = name.partition("/")
+        parts[part][own] = tensor
+    return State(parts, progress) if progress.run == run else None
 
 
 def save_model(folder: Path, model: DNR, record: ModelRecord) -> None:
@@ -191,22 +166,14 @@ def load_model(folder: Path, device: str | torch.device = "cpu") -> DNR:
         raise ContractError(f"{folder}: holds no finished model; run `dnrpipe finetune` (again)")
     try:
         settings = ModelSettings.model_validate(record.model)
-        _refuse_bomb(settings, saved)
+        # The model is made before its weights are put in: a few bytes of JSON must not make it take 70 GB.
+        texels = 0 if settings.aggregator == "early" else settings.texture_size**2 * settings.texture_channels
+        if texels > max((tensor.numel() for tensor in saved[0].values()), default=0):
+            raise ValueError(f"textures of {settings.texture_size} texels, but no tensor of {texels} numbers")
         model = DNR(settings, seed=0)
-        model.load_state_dict(saved.tensors)
+        model.load_state_dict(saved[0])
     except (ValidationError, RuntimeError, KeyError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ContractError(f"{folder}: model does not fit this version ({reason}); train it again") from None
     model.use_bfloat16 = record.bfloat16
     return model.to(device).eval()
-
-
-def _refuse_bomb(settings: ModelSettings, saved: Saved) -> None:
-    """Raise ValueError where ``model.json`` wants textures larger than any tensor of the weights.
-
-    The model is made before its weights are put in: a few bytes of JSON must not make it take 70 GB.
-    """
-    texels = 0 if settings.aggregator == "early" else settings.texture_size**2 * settings.texture_channels
-    largest = max((tensor.numel() for tensor in saved.tensors.values()), default=0)
-    if texels > largest:
-        raise ValueError(f"textures of {settings.texture_size} texels, but no tensor of {texels} numbers")

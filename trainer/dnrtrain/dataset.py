@@ -13,6 +13,7 @@ from torch import Tensor
 
 from .contract import BASE_CHANNELS, RASTER_CHANNELS, ContractError, DamagedFile, SceneFrame, View, require_channels
 from .display import ALPHA_FLOOR, DisplayTransform
+from .exr import read_exr
 
 INPUT_CHANNELS = ("depth.Z", "normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "mask", "coverage")
 Base = Literal["none", "raster", "baked", "direct", "path"]
@@ -48,7 +49,7 @@ class Batch:
     mask: Tensor
     coverage: Tensor
     view_dir: Tensor
-    target: Tensor | None
+    target: Tensor | None = None
     base: Tensor | None = None
     diffuse: Tensor | None = None
     albedo: Tensor | None = None
@@ -162,8 +163,6 @@ def load_views(
         ContractError: counts differ, files missing or damaged, channels missing, mixed resolutions,
             not finite, near >= far, no views.
     """
-    from .exr import read_exr
-
     if (base in ("baked", "direct", "path")) != (base_files is not None):
         raise ContractError(f"base image '{base}' with {'no ' if base_files is None else ''}base files: must agree")
 
@@ -178,20 +177,20 @@ def load_views(
         raise ContractError(f"frame.json: near {frame.near} is not below far {frame.far}; run `dnrpipe prepare` again")
     display = DisplayTransform(frame, folder)
     size = (cameras[0].height, cameras[0].width)
-    stacks: dict[str, list[Tensor]] = {f.name: [] for f in fields(Batch) if f.name != "display"}
+    found: list[dict[str, Tensor]] = []
     for index, (pass_file, camera) in enumerate(zip(pass_files, cameras, strict=True)):
         channels, _ = read_exr(pass_file)
         raster = base == "raster" or (target and image_files is None)
         require_channels(pass_file, channels, (*INPUT_CHANNELS, *(RASTER_CHANNELS if raster else ())))
         _check_size(pass_file, channels, size, camera)
-        for name, tensor in _input_maps(pass_file, channels, frame, camera).items():
-            stacks[name].append(tensor)
+        maps = _input_maps(pass_file, channels, frame, camera, base)
+        found.append(maps)
         if base_files is not None:
-            for name, tensor in _read_base(base_files[index], size, camera).items():
-                stacks[name].append(tensor)
-        elif base == "raster":
-            colour = _stack(pass_file, channels, RASTER_CHANNELS)
-            stacks["base"].append(_straight(colour[:3], colour[3:]))
+            base_file = base_files[index]
+            base_channels, _ = read_exr(base_file)
+            require_channels(base_file, base_channels, BASE_CHANNELS, "delete it and run the stage again")
+            _check_size(base_file, base_channels, size, camera)
+            maps |= _base_maps(base_file, base_channels)
         if not target:
             continue
         image_file = pass_file
@@ -201,11 +200,8 @@ def load_views(
             require_channels(image_file, channels, RASTER_CHANNELS)
             _check_size(image_file, channels, size, camera)
         colour = _stack(image_file, channels, RASTER_CHANNELS)
-        stacks["target"].append(display.over_white(colour[:3], colour[3:]))
-    # One map after the other: no more than the largest of them is in memory twice.
-    maps = {name: torch.stack(values) if (values := stacks.pop(name)) else None for name in list(stacks)}
-    tensors = Batch(**maps, display=None if base == "none" else display)  # type: ignore[arg-type]
-    return ViewSet(tuple(c.name for c in cameras), np.stack([c.matrix for c in cameras]), tensors)
+        maps["target"] = display.over_white(colour[:3], colour[3:])
+    return _view_set(found, cameras, None if base == "none" else display)
 
 
 def view_in_memory(
@@ -221,23 +217,28 @@ def view_in_memory(
     rendered = base in ("baked", "direct", "path")
     require_channels(source, channels, (*wanted, *(BASE_CHANNELS if rendered else ())))
     _check_size(source, channels, (camera.height, camera.width), camera)
-    maps = _input_maps(source, channels, frame, camera)
+    maps = _input_maps(source, channels, frame, camera, base)
     if rendered:
-        maps |= _base_maps(_stack(source, channels, BASE_CHANNELS))
-    elif base == "raster":
-        colour = _stack(source, channels, RASTER_CHANNELS)
-        maps["base"] = _straight(colour[:3], colour[3:])
-    tensors = Batch(**{"target": None} | {name: value[None] for name, value in maps.items()})  # type: ignore[arg-type]
-    tensors = replace(tensors, display=None if base == "none" else display)
-    return ViewSet((camera.name,), camera.matrix[None], tensors)
+        maps |= _base_maps(source, channels)
+    return _view_set([maps], [camera], None if base == "none" else display)
 
 
-def _input_maps(path: Path, channels: dict[str, np.ndarray], frame: SceneFrame, camera: View) -> dict[str, Tensor]:
-    """The maps of `Batch` that every view has, [C, H, W]."""
+def _view_set(maps: Sequence[dict[str, Tensor]], cameras: Sequence[View], display: DisplayTransform | None) -> ViewSet:
+    """The maps of each view, [C, H, W], as one set; ``maps`` is emptied."""
+    # One map after the other: no more than the largest of them is in memory twice.
+    tensors = {name: torch.stack([view.pop(name) for view in maps]) for name in list(maps[0])}
+    batch = Batch(**tensors, display=display)
+    return ViewSet(tuple(c.name for c in cameras), np.stack([c.matrix for c in cameras]), batch)
+
+
+def _input_maps(
+    path: Path, channels: dict[str, np.ndarray], frame: SceneFrame, camera: View, base: Base
+) -> dict[str, Tensor]:
+    """The maps of `Batch` that pass files hold, [C, H, W]; the base image where that is the raster colour."""
     inputs = _stack(path, channels, INPUT_CHANNELS)
     mask = (inputs[6:7] > 0.5).float()
     depth = ((inputs[0:1] - frame.near) / (frame.far - frame.near)).clamp(0.0, 1.0)
-    return {
+    maps = {
         "depth": depth * mask,
         "normal": inputs[1:4] * mask,
         "uv": (2.0 * inputs[4:6] - 1.0) * mask,
@@ -245,20 +246,15 @@ def _input_maps(path: Path, channels: dict[str, np.ndarray], frame: SceneFrame, 
         "coverage": inputs[7:8].clamp(0.0, 1.0),
         "view_dir": torch.from_numpy(-camera.ray_directions()).permute(2, 0, 1).contiguous(),
     }
+    if base == "raster":
+        colour = _stack(path, channels, RASTER_CHANNELS)
+        maps["base"] = _straight(colour[:3], colour[3:])
+    return maps
 
 
-def _read_base(path: Path, size: tuple[int, int], camera: View) -> dict[str, Tensor]:
-    """A base file's maps by their name in `Batch`."""
-    from .exr import read_exr
-
-    channels, _ = read_exr(path)
-    require_channels(path, channels, BASE_CHANNELS, "delete it and run the stage again")
-    _check_size(path, channels, size, camera)
-    return _base_maps(_stack(path, channels, BASE_CHANNELS))
-
-
-def _base_maps(values: Tensor) -> dict[str, Tensor]:
-    """Channels of BASE_CHANNELS [C, H, W] as maps."""
+def _base_maps(path: Path, channels: dict[str, np.ndarray]) -> dict[str, Tensor]:
+    """The maps of `Batch` that base files hold, [C, H, W]."""
+    values = _stack(path, channels, BASE_CHANNELS)
     alpha, mask = values[3:4], (values[12:13] > 0.5).float()
     return {
         "base": _straight(values[0:3], alpha),

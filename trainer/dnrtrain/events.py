@@ -3,63 +3,42 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from .records import Epoch, Selection
 
 if TYPE_CHECKING:
     import numpy as np
 
 
-@dataclass(frozen=True)
-class EpochEnd:
-    """One epoch is done and its checkpoint is on disk.
-
-    losses: mean of each loss term over the epoch's steps. val: metrics on validation views or {}.
-    seconds: wall time; cpu_seconds: process time; steps: optimiser steps; skipped: non-finite steps.
-    """
+class EpochEnd(Epoch):
+    """One epoch is done and its checkpoint is on disk."""
 
     stage: str
-    epoch: int
     epochs: int
-    losses: dict[str, float]
-    val: dict[str, float]
-    seconds: float
-    cpu_seconds: float
-    steps: int
-    skipped: int = 0
     device: str = "cpu"
 
 
 @dataclass(frozen=True)
 class Selected:
-    """Step 1 is done: names of the chosen views, in order, and what the policy says of itself.
+    """Step 1 is done.
 
-    gains, why: per view, see `dnrtrain.selector.protocol.Choice`.
     seconds, cpu_seconds: wall and process time of choosing, beside that of the epochs; 0 where a finished run is found
     again.
     """
 
-    views: list[str]
-    policy: str
-    details: dict[str, Any] = field(default_factory=dict)
-    gains: list[float] = field(default_factory=list)
-    why: list[str] = field(default_factory=list)
+    selection: Selection
     seconds: float = field(default=0.0, compare=False)
     cpu_seconds: float = field(default=0.0, compare=False)
 
 
-@dataclass(frozen=True)
-class Diverged:
+class Diverged(Epoch):
     """An epoch diverged. Training goes on from the state before it, at a lower rate; ``text`` says so.
 
-    The epoch's time was spent all the same: seconds, cpu_seconds, steps and device are as in `EpochEnd`.
+    The epoch's time was spent all the same.
     """
 
-    stage: str
-    epoch: int
     text: str
-    seconds: float
-    cpu_seconds: float
-    steps: int
     device: str = "cpu"
 
 

@@ -58,7 +58,8 @@ class DNR(nn.Module):
         initialise(self, generator)
         self.aggregator.zero_residual()
         if settings.base == "none":
-            nn.init.constant_(_bias(self.renderer.head), 0.5)
+            assert self.renderer.head.bias is not None
+            nn.init.constant_(self.renderer.head.bias, 0.5)
         else:
             nn.init.zeros_(self.renderer.head.weight)
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -88,11 +89,6 @@ def initialise(module: nn.Module, generator: torch.Generator) -> None:
             nn.init.kaiming_normal_(layer.weight, a=SLOPE, generator=generator)
             if layer.bias is not None:
                 nn.init.zeros_(layer.bias)
-
-
-def _bias(layer: nn.Conv2d) -> Tensor:
-    assert layer.bias is not None
-    return layer.bias
 
 
 @torch.no_grad()

@@ -151,11 +151,12 @@ class Graph(nn.Module):
         self.near, self.range = frame.near, frame.far - frame.near
         self.display = _GatheredDisplay(frame, folder)
         self.names = input_names(model.settings)
-        self.tables = {
-            id(part): _merged(part)
-            for part in model.aggregator.modules()
-            if isinstance(part, TexturePyramid) and part.mergeable and part.levels[0].numel() <= MERGED_VALUES
-        }
+        self.tables: dict[int, Tensor] = {}
+        """Pyramids as one texture [1, C, height, width] each, whose outermost texel centres lie on the border."""
+        for part in model.aggregator.modules():
+            if isinstance(part, TexturePyramid) and part.mergeable and part.levels[0].numel() <= MERGED_VALUES:
+                table, width, height = part.merged()
+                self.tables[id(part)] = table.view(1, height, width, -1).permute(0, 3, 1, 2).contiguous()
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         batch = self.batch(dict(zip(self.names, inputs, strict=True)))
@@ -260,13 +261,6 @@ class _GatheredDisplay(DisplayTransform):
             colour = table.index_select(0, index.reshape(-1)).t().reshape(1, 3, height, width)
             parts.append(colour * share[:, None])
         return functools.reduce(torch.add, parts).clamp(0.0, 1.0)
-
-
-def _merged(pyramid: TexturePyramid) -> Tensor:
-    """All levels as one texture [1, C, height, width] whose outermost texel centres lie on the border."""
-    with torch.no_grad():
-        table, width, height = pyramid.merged()
-    return table.view(1, height, width, -1).permute(0, 3, 1, 2).contiguous()
 
 
 def _expm1(graph: Any, x: Any) -> Any:

@@ -17,18 +17,13 @@ from .precision import at_least_float32
 
 Network = Literal["vgg", "alex"]
 
-# (channels, kernel, stride, padding) per convolution; "M" is the network's max-pooling.
-VGG16: tuple[tuple[int, int, int, int] | str, ...] = (
-    (64, 3, 1, 1), (64, 3, 1, 1), "M",
-    (128, 3, 1, 1), (128, 3, 1, 1), "M",
-    (256, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1), "M",
-    (512, 3, 1, 1), (512, 3, 1, 1), (512, 3, 1, 1), "M",
-    (512, 3, 1, 1), (512, 3, 1, 1), (512, 3, 1, 1),
-)  # fmt: skip
-ALEXNET: tuple[tuple[int, int, int, int] | str, ...] = (
-    (64, 11, 4, 2), "M", (192, 5, 1, 2), "M", (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1),
-)  # fmt: skip
-LAYOUT = {"vgg": VGG16, "alex": ALEXNET}
+LAYOUT: dict[str, list[tuple[int, int, int, int]]] = {
+    "vgg": [(channels, 3, 1, 1) for channels in (64, 64, 128, 128, *[256] * 3, *[512] * 6)],
+    "alex": [(64, 11, 4, 2), (192, 5, 1, 2), (384, 3, 1, 1), (256, 3, 1, 1), (256, 3, 1, 1)],
+}
+"""Channels, kernel, stride and padding of each convolution."""
+POOLED = {"vgg": (2, 4, 7, 10), "alex": (1, 2)}
+"""Convolutions that max-pooling comes before."""
 TAPS = {"vgg": (1, 3, 6, 9, 12), "alex": (0, 1, 2, 3, 4)}
 """Convolutions whose ReLU output LPIPS compares (VGG: relu1_2, 2_2, 3_3, 4_3, 5_3)."""
 POOL = {"vgg": 2, "alex": 3}  # window; the stride is 2 in both
@@ -65,13 +60,7 @@ class Features(nn.Module):
         self.register_buffer("scale", torch.tensor(SCALE).view(1, 3, 1, 1))
         self.convolutions = nn.ModuleList()
         inputs = 3
-        for item in LAYOUT[network]:
-            if isinstance(item, str):
-                continue
-            index = len(self.convolutions)
-            if index > self.taps[-1]:
-                break
-            channels, kernel, stride, padding = item
+        for index, (channels, kernel, stride, padding) in enumerate(LAYOUT[network][: self.taps[-1] + 1]):
             layer = nn.Conv2d(inputs, channels, kernel, stride, padding)
             layer.load_state_dict({"weight": weights[f"conv.{index}.weight"], "bias": weights[f"conv.{index}.bias"]})
             self.convolutions.append(layer)
@@ -85,22 +74,15 @@ class Features(nn.Module):
         """Display RGB in [0, 1], [N, 3, H, W] -> ReLU features per tap (float32 or bfloat16)."""
         x = ((2.0 * at_least_float32(image) - 1.0) - self.shift) / self.scale
         x = x.contiguous(memory_format=torch.channels_last)
-        weights = self._weights(x.device, bfloat16=bfloat16)
         x = x.bfloat16() if bfloat16 else x
         found: list[Tensor] = []
-        index = 0
-        for item in LAYOUT[self.network]:
-            if isinstance(item, str):
+        for index, (weight, bias) in enumerate(self._weights(x.device, bfloat16=bfloat16)):
+            if index in POOLED[self.network]:
                 x = F.max_pool2d(x, POOL[self.network], 2)
-                continue
-            weight, bias = weights[index]
-            _, _, stride, padding = item
+            _, _, stride, padding = LAYOUT[self.network][index]
             x = F.relu(F.conv2d(x, weight, bias, stride=stride, padding=padding))
             if index in self.taps:
                 found.append(x)
-            if index == self.taps[-1]:
-                break
-            index += 1
         return found
 
     def _weights(self, device: torch.device, *, bfloat16: bool) -> list[tuple[Tensor, Tensor]]:
@@ -193,6 +175,16 @@ class PerceptualLoss(nn.Module):
 
 def _unit(feature: Tensor) -> Tensor:
     return feature / torch.sqrt(feature.square().sum(dim=1, keepdim=True) + 1e-20)
+
+
+def weight_shapes(network: str) -> dict[str, tuple[int, ...]]:
+    """Of all tensors of a network in `dnrtrain.weights`, by name."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    inputs = 3
+    for index, (channels, kernel, _, _) in enumerate(LAYOUT[network]):
+        shapes |= {f"conv.{index}.weight": (channels, inputs, kernel, kernel), f"conv.{index}.bias": (channels,)}
+        inputs = channels
+    return shapes | {f"head.{j}": (1, LAYOUT[network][tap][0], 1, 1) for j, tap in enumerate(TAPS[network])}
 
 
 def build_lpips(weights: Mapping[str, Mapping[str, Tensor]]) -> dict[str, Lpips]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 from .dataset import ViewSet
 from .events import EpochEnd, Previewed
@@ -19,26 +18,19 @@ SHARE = 0.03
 """Of the training time, at most, goes into pictures between the first and the last one."""
 
 
-@dataclass(frozen=True)
 class Preview:
-    """views: exactly one, with a target where its PSNR is wanted. seconds: of training between pictures, at least."""
-
-    views: ViewSet
-    seconds: float
-
-    def __post_init__(self) -> None:
-        if len(self.views) != 1:
-            raise ValueError(f"a preview shows one view, not {len(self.views)}")
-        if not self.seconds > 0:
-            raise ValueError(f"seconds between previews must be above 0, got {self.seconds}")
-
-
-class Previewer:
     """Decides after which epochs a picture is due: the first of this process, the last, and between them after
-    ``seconds`` of training, or more where pictures would take more than SHARE of the time."""
+    ``seconds`` of training, or more where pictures would take more than SHARE of the time.
 
-    def __init__(self, preview: Preview, device: str) -> None:
-        self.views, self.pause, self.device = preview.views.to(device), preview.seconds, device
+    views: exactly one, with a target where its PSNR is wanted.
+    """
+
+    def __init__(self, views: ViewSet, seconds: float) -> None:
+        if len(views) != 1:
+            raise ValueError(f"a preview shows one view, not {len(views)}")
+        if not seconds > 0:
+            raise ValueError(f"seconds between previews must be above 0, got {seconds}")
+        self.views, self.pause = views, seconds
         self.trained: float | None = None  # seconds since the last picture; None before the first
 
     def after(self, epoch: EpochEnd, model: DNR, average: Averaged | None) -> Iterator[Previewed]:
@@ -48,10 +40,6 @@ class Previewer:
             if self.trained < self.pause and epoch.epoch < epoch.epochs:
                 return
         started = time.monotonic()
-        yield self._render(epoch, model, average, started)
-        self.trained, self.pause = 0.0, max(self.pause, (time.monotonic() - started) / SHARE)
-
-    def _render(self, epoch: EpochEnd, model: DNR, average: Averaged | None, started: float) -> Previewed:
         training = model.training
         model.eval()
         try:
@@ -61,7 +49,7 @@ class Previewer:
             model.train(training)
         target = self.views.tensors.target
         score = None if target is None else float(psnr(picture, target.cpu().float()).mean())
-        return Previewed(
+        yield Previewed(
             epoch.stage,
             epoch.epoch,
             epoch.epochs,
@@ -69,5 +57,6 @@ class Previewer:
             picture[0].permute(1, 2, 0).contiguous().numpy(),
             score,
             time.monotonic() - started,
-            self.device,
+            epoch.device,
         )
+        self.trained, self.pause = 0.0, max(self.pause, (time.monotonic() - started) / SHARE)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from .atomic import write_json
 from .contract import DamagedFile
@@ -21,8 +21,6 @@ MODEL = "model.json"
 
 class Record(BaseModel):
     """Keys of other versions are ignored. Fields that were not given are not written."""
-
-    model_config = ConfigDict(extra="ignore")
 
     def data(self) -> dict[str, Any]:
         """The record as plain values, ready for JSON."""

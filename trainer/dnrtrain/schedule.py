@@ -124,17 +124,11 @@ def averaged_weights(module: nn.Module, average: Averaged | None) -> Iterator[No
         yield
         return
     own = {name: p.detach().clone() for name, p in module.named_parameters()}
-    _put(module, average.weights())
+    module.load_state_dict(average.weights(), strict=False)  # buffers stay
     try:
         yield
     finally:
-        _put(module, own)
-
-
-@torch.no_grad()
-def _put(module: nn.Module, weights: dict[str, Tensor]) -> None:
-    for name, parameter in module.named_parameters():
-        parameter.copy_(weights[name])
+        module.load_state_dict(own, strict=False)
 
 
 @dataclass

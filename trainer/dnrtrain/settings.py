@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 
-class Strict(BaseModel):
+class Strict(BaseModel, extra="forbid", allow_inf_nan=False, validate_assignment=True):
     """Unknown keys are errors; NaN and infinity are not numbers."""
-
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, validate_assignment=True)
 
 
 class ModelSettings(Strict):

@@ -12,6 +12,7 @@ detached, so the two gradients touch disjoint parameters and the sum splits exac
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,12 @@ from torch import Tensor, nn
 
 from . import checkpoint
 from .contract import ContractError
-from .dataset import Batch, ViewSet
+from .dataset import ViewSet
 from .events import Event, Selected
 from .model import DNR
 from .precision import decide_bfloat16
-from .records import ModelRecord
-from .schedule import STEP1, EpochBook, guarded_step, learning_rate, require_target, run_fingerprint, step_random
+from .records import Selection
+from .schedule import STEP1, EpochBook, guarded_step, require_target, run_fingerprint, step_random
 from .selector.policies import untrained
 from .selector.protocol import Candidates, Choice, check_budget
 from .settings import ModelSettings, Step1Settings
@@ -74,13 +75,25 @@ def run_step1(
     if rule is not None and choice is None:
         choice = rule.choose(candidates, budget, seed)
     parts = [model.coarse().model_dump(), settings.model_dump(), policy, budget, seed, device]
-    run = run_fingerprint(fingerprint, views, parts)
-    step = _Step1(views, val, model.coarse(), settings, budget, seed, run, Path(checkpoints), device)
+    dnr = DNR(model.coarse(), seed).to(device)
+    dnr.use_bfloat16 = decide_bfloat16(settings.precision, device)
+    step = _Step1(
+        dnr=dnr,
+        views=views,
+        val=val,
+        settings=settings,
+        budget=budget,
+        seed=seed,
+        run=run_fingerprint(fingerprint, views, parts),
+        folder=Path(checkpoints),
+        device=device,
+    )
     if choice is None:
-        step.walker = Walker(step.dnr, step.views, candidates, settings, budget, seed, device)
-    finished = step.finished()
-    if finished is not None:
-        yield Selected(finished.selected, policy, finished.details, finished.gains, finished.why)
+        step.walker = Walker(step, candidates, budget)
+    done = step.finished()
+    if done is not None:
+        known = {"policy": policy, "budget": budget, "seed": seed, "views": done.selected}
+        yield Selected(Selection(**known, gains=done.gains, why=done.why, details=done.details))
         return
     yield from step.train()
     book = EpochBook()
@@ -88,103 +101,66 @@ def run_step1(
         choice = step.walker.roll_out()
     assert choice is not None  # given, the rule's, or the agent's
     spent = book.entry(0, 0.0, {})
-    names = [views.names[i] for i in choice.views]
-    record = ModelRecord(
-        model=step.dnr.settings.model_dump(mode="json"),
-        fingerprint=fingerprint,
-        run=run,
-        stage="step1",
-        settings=settings.model_dump(mode="json"),
-        policy=policy,
-        budget=budget,
-        seed=seed,
-        selected=names,
-        details=choice.details,
-        gains=choice.gains,
-        why=choice.why,
-        bfloat16=step.dnr.use_bfloat16,
-        restarts=step.watch.restarts,
-        history=step.history,
-        choosing={"seconds": spent.seconds, "cpu_seconds": spent.cpu_seconds},
-    )
-    checkpoint.save_model(step.folder, step.dnr, record)
-    yield Selected(names, policy, choice.details, choice.gains, choice.why, spent.seconds, spent.cpu_seconds)
+    selection = choice.selection(views.names, policy, seed)
+    facts = selection.model_dump(exclude={"views", "seed"})
+    choosing = {"seconds": spent.seconds, "cpu_seconds": spent.cpu_seconds}
+    step.save_model(fingerprint, selected=selection.views, choosing=choosing, **facts)
+    yield Selected(selection, **choosing)
 
 
-class _Step1(TrainingRun):
+@dataclass(kw_only=True)
+class _Step1(TrainingRun[Step1Settings]):
     """``walker``: the agent, where the policy has one."""
 
     number, term = 1, "dnr"
 
-    def __init__(
-        self,
-        views: ViewSet,
-        val: ViewSet | None,
-        model: ModelSettings,
-        settings: Step1Settings,
-        budget: int,
-        seed: int,
-        run: str,
-        folder: Path,
-        device: str,
-    ) -> None:
-        super().__init__(DNR(model, seed).to(device), settings, val, run, folder, device)
-        self.views, self.settings, self.seed = views.to(device), settings, seed
-        self.walker: Walker | None = None
-        self.episodes = -(-len(views) // budget)
-        self.steps_per_epoch = self.episodes * budget
-        self.book = EpochBook()
-        self.step = 0
+    budget: int
+    walker: Walker | None = None
+    step: int = 0
 
-    def train_epoch(self, epoch: int, book: EpochBook) -> float:
-        self.book, self.step = book, epoch * self.steps_per_epoch
-        if self.walker is None:
-            self._train_all(epoch)
-        else:
-            for episode in range(self.episodes):
-                self.walker.episode(epoch, episode, self._train_view, lambda: self._rate(self.step - 1), book)
-        return self._rate(self.step - 1)
+    @property
+    def episodes(self) -> int:
+        return -(-len(self.views) // self.budget)
 
-    def first_views(self) -> Batch:
-        return self.views.batch([0])
+    @property
+    def steps_per_epoch(self) -> int:
+        return self.episodes * self.budget
 
-    def decide_precision(self) -> None:
-        self.dnr.use_bfloat16 = decide_bfloat16(self.settings.precision, self.device)
+    def train_epoch(self, epoch: int, book: EpochBook) -> None:
+        self.step = epoch * self.steps_per_epoch
 
-    def trained(self) -> list[nn.Module]:
-        return [self.dnr] if self.walker is None else [self.dnr, self.walker.agent]
+        def train_view(view: int) -> tuple[float, Tensor]:
+            """One DNR step on one view -> (L_DNRc before the step, T of the view)."""
+            batch = self.views.batch([view])
+            assert batch.target is not None
+            output = self.dnr(batch)
+            loss = F.mse_loss(output.rgb, batch.target)
+            book.count(guarded_step(self.optimiser, self.settings.weight_dnr * loss, self.rate(self.step)))
+            value = float(loss.detach())
+            book.add(dnr=value)
+            self.step += 1
+            return value, output.texture.detach()
 
-    def more_state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        if self.walker is None:
-            return {}, {"reward_mean": None}
-        return self.walker.tensors(), {"reward_mean": self.walker.scale.mean}
-
-    def load_more(self, saved: checkpoint.State) -> None:
         if self.walker is not None:
-            self.walker.load(saved)
-
-    def _rate(self, step: int) -> float:
-        s = self.settings
-        total = s.epochs * self.steps_per_epoch
-        return self.watch.scale * learning_rate(step, total, s.learning_rate, s.learning_rate_end)
-
-    def _train_view(self, view: int) -> tuple[float, Tensor]:
-        """One DNR step on one view -> (L_DNRc before the step, T of the view)."""
-        batch = self.views.batch([view])
-        assert batch.target is not None
-        output = self.dnr(batch)
-        loss = F.mse_loss(output.rgb, batch.target)
-        self.book.count(guarded_step(self.optimiser, self.settings.weight_dnr * loss, self._rate(self.step)))
-        value = float(loss.detach())
-        self.book.add(dnr=value)
-        self.step += 1
-        return value, output.texture.detach()
-
-    def _train_all(self, epoch: int) -> None:
-        """All candidates in random order, cycled to as many steps as an RL epoch has."""
+            for episode in range(self.episodes):
+                self.walker.episode(epoch, episode, train_view, lambda: self.rate(self.step - 1), book)
+            return
+        # All candidates in random order, cycled to as many steps as an RL epoch has.
         random = step_random(self.seed, STEP1, epoch, -1)
         order: list[int] = []
         while len(order) < self.steps_per_epoch:
             order += [int(i) for i in random.permutation(len(self.views))]
         for view in order[: self.steps_per_epoch]:
-            self._train_view(view)
+            train_view(view)
+
+    def trained(self) -> list[nn.Module]:
+        return [self.dnr] if self.walker is None else [self.dnr, self.walker.agent]
+
+    def more_state(self) -> tuple[checkpoint.Parts, dict[str, Any]]:
+        if self.walker is None:
+            return {}, {"reward_mean": None}
+        return self.walker.parts(), {"reward_mean": self.walker.scale.mean}
+
+    def load_more(self, saved: checkpoint.State) -> None:
+        if self.walker is not None:
+            self.walker.load(saved)

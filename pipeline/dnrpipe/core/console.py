@@ -32,16 +32,11 @@ EVENT_INTERVAL = 0.2  # least seconds between progress events
 class Bar:
     """One running progress bar. ``advance`` counts units; ``note`` is shown at its end."""
 
-    def __init__(
-        self, label: str, total: int, done: int, progress: Progress | None, quiet: bool, events: EventStream
-    ) -> None:
+    def __init__(self, console: Console, label: str, total: int, done: int, progress: Progress | None) -> None:
         self.label, self.total, self.done = label, total, done
-        self._events = events
-        self._reported = 0.0
-        self._first = done
+        self._console, self._first, self._reported = console, done, 0.0
         self._progress = progress
         self._task = progress.add_task(label, total=total, completed=done, note="") if progress else None
-        self._quiet = quiet
         self._started = self._last = time.monotonic()
         self._report("")
 
@@ -52,7 +47,7 @@ class Bar:
             self._progress.update(self._task, completed=self.done, note=note)
             return
         now = time.monotonic()
-        if now - self._last >= PLAIN_INTERVAL and self.done < self.total and not self._quiet:
+        if now - self._last >= PLAIN_INTERVAL and self.done < self.total and not self._console.quiet:
             self._last = now
             left = clock(self._seconds_left(now) or 0.0)
             print(f"{self.label}: {self.done}/{self.total}, {left} left {note}".rstrip(), file=sys.stderr, flush=True)
@@ -67,7 +62,7 @@ class Bar:
             return
         self._reported = now
         left = self._seconds_left(now)
-        self._events.send(
+        self._console.events.send(
             "progress",
             label=self.label,
             done=self.done,
@@ -106,7 +101,7 @@ class Console:
     def bar(self, label: str, total: int, done: int = 0) -> Iterator[Bar]:
         """A progress bar with time left; a line every ten seconds where there is no terminal."""
         if self.quiet or total <= 0 or not self._rich.is_terminal:
-            yield Bar(label, total, done, None, self.quiet, self.events)
+            yield Bar(self, label, total, done, None)
             return
         with Progress(
             TextColumn("{task.description}"),
@@ -117,7 +112,7 @@ class Console:
             TextColumn("{task.fields[note]}"),
             console=self._rich,
         ) as progress:
-            yield Bar(label, total, done, progress, self.quiet, self.events)
+            yield Bar(self, label, total, done, progress)
 
 
 def clock(seconds: float) -> str:

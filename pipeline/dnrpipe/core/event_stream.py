@@ -15,11 +15,12 @@ The file is appended to, so that a command that is run again goes on in it. Read
 from __future__ import annotations
 
 import json
-import math
 import os
 import time
 from pathlib import Path
 from typing import Any
+
+from pydantic_core import to_jsonable_python
 
 from .errors import UserError
 
@@ -45,20 +46,15 @@ class EventStream:
         return cls(Path(path) if path else None)
 
     def send(self, kind: str, **facts: Any) -> None:
-        """Append one event. A reader's troubles (disk full, file gone) never end the work that is reported on."""
+        """Append one event; NaN and infinity become None.
+
+        A reader's troubles (disk full, file gone) never end the work that is reported on.
+        """
         if self._descriptor is None:
             return
-        event = {"time": round(time.time(), 3), "kind": kind, **_finite(facts)}
+        plain = to_jsonable_python(facts, inf_nan_mode="null")
+        event = {"time": round(time.time(), 3), "kind": kind, **plain}
         try:
             os.write(self._descriptor, json.dumps(event, allow_nan=False).encode() + b"\n")
         except OSError:
             self._descriptor = None
-
-
-def _finite(value: Any) -> Any:
-    """NaN and infinity are not JSON: None instead."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

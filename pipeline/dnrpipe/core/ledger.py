@@ -29,9 +29,6 @@ Purpose = Literal["training", "evaluation", "inference"]
 Unit = Literal["scene", "view", "epoch"]
 UpfrontPart = Literal["conversion", "passes", "pilot", "selection", "tracing", "light", "base images", "training"]
 
-STAGE_ORDER: tuple[str, ...] = get_args(StageName)
-PURPOSE_ORDER: tuple[str, ...] = get_args(Purpose)
-
 
 class CostRecord(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """One unit of work that cost time.
@@ -104,19 +101,15 @@ class Ledger:
         """
         line = json.dumps(record.model_dump(), allow_nan=False).encode("ascii") + b"\n"
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(self.path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
-        try:
-            end = os.lseek(descriptor, 0, os.SEEK_END)
-            if end > 0:
-                os.lseek(descriptor, end - 1, os.SEEK_SET)
-                if os.read(descriptor, 1) != b"\n":
+        with self.path.open("a+b", buffering=0) as file:
+            if file.seek(0, os.SEEK_END) > 0:
+                file.seek(-1, os.SEEK_END)
+                if file.read(1) != b"\n":
                     line = b"\n" + line
-            written = os.write(descriptor, line)
+            written = file.write(line)
             if written != len(line):
                 raise OSError(errno.ENOSPC, f"only {written} of {len(line)} bytes written", str(self.path))
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+            os.fsync(file.fileno())
 
     def read(self) -> list[CostRecord]:
         """All whole records in file order; [] when there is no ledger yet. Truncated records are left out.
@@ -182,17 +175,9 @@ def total(records: Iterable[CostRecord]) -> CostSum:
     )
 
 
-def by_stage(records: Sequence[CostRecord]) -> dict[str, CostSum]:
-    """Totals per stage, in the order of the pipeline; stages without records are absent."""
-    return _group(records, STAGE_ORDER, "stage")
-
-
-def by_purpose(records: Sequence[CostRecord]) -> dict[str, CostSum]:
-    """Totals per purpose: training, evaluation, inference; absent where there are none."""
-    return _group(records, PURPOSE_ORDER, "purpose")
-
-
-def _group(records: Sequence[CostRecord], order: Sequence[str], field: str) -> dict[str, CostSum]:
+def total_by(field: Literal["stage", "purpose"], records: Sequence[CostRecord]) -> dict[str, CostSum]:
+    """Totals per stage or purpose, in the order of `StageName` and `Purpose`; those without records are absent."""
+    order = get_args(StageName if field == "stage" else Purpose)
     sums = {name: total(r for r in records if getattr(r, field) == name) for name in order}
     return {name: value for name, value in sums.items() if value.records}
 
@@ -392,14 +377,13 @@ def summarise(
         only: names of the training views that count as chosen (``train/0007``); None = all in the ledger.
         truncated_records: of the ledger.
     """
-    stages = by_stage(records)
-    chosen = {purpose: only if purpose == "training" else None for purpose in PURPOSE_ORDER}
-    traced = {purpose: traced_views(records, purpose, names) for purpose, names in chosen.items()}
+    stages = total_by("stage", records)
+    traced = {p: traced_views(records, p, only if p == "training" else None) for p in get_args(Purpose)}
     return CostSummary(
         total=total(records),
         by_stage=stages,
-        by_purpose=by_purpose(records),
-        by_stage_and_purpose={name: by_purpose([r for r in records if r.stage == name]) for name in stages},
+        by_purpose=total_by("purpose", records),
+        by_stage_and_purpose={name: total_by("purpose", [r for r in records if r.stage == name]) for name in stages},
         raytraced={purpose: _raytraced(views) for purpose, views in traced.items() if views},
         tracing_all=None if n_candidates is None else tracing_all_would_cost(records, n_candidates, only),
         runs=len({r.run for r in records}),

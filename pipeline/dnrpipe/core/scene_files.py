@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import functools
 import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
-
-from pydantic import BaseModel
+from typing import Any
 
 from dnrtrain.contract import SPLITS, DamagedFile, SceneFrame, View, read_cameras
-from dnrtrain.records import Selection, read
+from dnrtrain.records import Model, Selection, read
 
 from .errors import UserError
 from .scene_records import Census, Conversion, RasterChoice, SceneSummary
 from .workspace import Workspace, digest, file_sha256
 
 SCENE_VERSION = 6  # raise when the conversion or the G-buffer scene changes what it writes
-
-Model = TypeVar("Model", bound=BaseModel)
 
 
 def read_json(path: Path) -> Any:
@@ -39,19 +36,14 @@ def read_record(path: Path, kind: type[Model]) -> Model:
         raise UserError(f"{path}: is missing; run `dnrpipe prepare --force`") from None
 
 
-def read_summary(scene: Path) -> SceneSummary:
-    """``summary.json`` of the folder ``scene/``. Raises UserError, DamagedFile as `read_json`."""
-    return read_record(scene / "summary.json", SceneSummary)
+def _of_scene(name: str, kind: type[Model]) -> Callable[[Path], Model]:
+    """Reads the file of that name in the folder ``scene/``. Raises UserError, DamagedFile as `read_json`."""
+    return lambda scene: read_record(scene / name, kind)
 
 
-def read_census(scene: Path) -> Census:
-    """``census.json`` of the folder ``scene/``. Raises UserError, DamagedFile as `read_json`."""
-    return read_record(scene / "census.json", Census)
-
-
-def read_conversion(scene: Path) -> Conversion:
-    """``prepared.json`` of the folder ``scene/``. Raises UserError, DamagedFile as `read_json`."""
-    return read_record(scene / "prepared.json", Conversion)
+read_summary = _of_scene("summary.json", SceneSummary)
+read_census = _of_scene("census.json", Census)
+read_conversion = _of_scene("prepared.json", Conversion)
 
 
 def read_raster_choice(workspace: Workspace) -> RasterChoice | None:

@@ -21,10 +21,8 @@ FindingKind = Literal["exact", "approximated", "baked", "ignored", "missing"]
 
 
 class SceneRecord(Record):
-    """Keys of other versions are ignored.
-
-    Paths may hold surrogates (bytes that are no UTF-8), which pydantic's own JSON refuses: read and write plain values.
-    """
+    """Paths may hold surrogates (bytes that are no UTF-8), which pydantic's own JSON refuses: read and write plain
+    values."""
 
     model_config = ConfigDict(frozen=True)
 

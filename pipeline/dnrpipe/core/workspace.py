@@ -29,6 +29,7 @@ from filelock import FileLock, Timeout
 from pydantic import BaseModel, Field, ValidationError, field_validator
 
 from dnrtrain.atomic import write_json
+from dnrtrain.records import first_error
 
 from .errors import UserError
 from .ledger import Ledger
@@ -54,11 +55,6 @@ class StageRecord(BaseModel, extra="forbid"):
     finished: float
     seconds: float
     detail: dict[str, Any] = Field(default_factory=dict)
-
-    @property
-    def perceptual(self) -> bool | None:
-        """Whether it had perceptual weights; None where it needs none."""
-        return self.detail.get("perceptual")
 
 
 class PrepareDetail(BaseModel, strict=True):
@@ -136,24 +132,9 @@ class Workspace:
         self.root = root
         self.manifest = manifest
         self.ledger = Ledger(root / "costs.jsonl")
-
-    # Paths. Every stage names its files through these.
-
-    @property
-    def scene(self) -> Path:
-        return self.root / "scene"
-
-    @property
-    def selection(self) -> Path:
-        return self.root / "selection.json"
-
-    @property
-    def evaluation(self) -> Path:
-        return self.root / "evaluation"
-
-    @property
-    def preview(self) -> Path:
-        return self.root / "preview"
+        # Every stage names its files through these paths, and the methods below.
+        self.scene, self.selection = root / "scene", root / "selection.json"
+        self.evaluation, self.preview = root / "evaluation", root / "preview"
 
     def cameras(self, split: str) -> Path:
         return self.root / "cameras" / f"{split}.json"
@@ -201,11 +182,8 @@ class Workspace:
         try:
             return cls(root, Manifest.model_validate(data))
         except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(map(str, first["loc"]))
-            raise DamagedManifest(
-                f"{path}: damaged ({where}: {first['msg']}); run `dnrpipe prepare SCENE` again"
-            ) from None
+            reason = first_error(error)
+            raise DamagedManifest(f"{path}: damaged ({reason}); run `dnrpipe prepare SCENE` again") from None
 
     def save(self) -> None:
         """Write the manifest atomically."""

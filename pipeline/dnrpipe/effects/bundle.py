@@ -47,7 +47,7 @@ def bundle_facts(path: Path) -> dict[str, list[str]]:
             note("alpha", bsdf)
         if bsdf.get("type") == "null":
             note("null", bsdf)
-        if _parameter(bsdf, "flatness") is not None:
+        if bsdf.find("*[@name='flatness']") is not None:
             note("subsurface", bsdf)
     for medium in root.iter("medium"):
         note("volumes", medium)
@@ -103,12 +103,8 @@ def _read(path: Path) -> ET.Element:
         raise UserError(f"{path}: damaged ({error}); run `dnrpipe prepare --force`") from None
 
 
-def _parameter(element: ET.Element, name: str) -> ET.Element | None:
-    return next((child for child in element if child.get("name") == name), None)
-
-
 def _drop(element: ET.Element, name: str) -> None:
-    found = _parameter(element, name)
+    found = element.find(f"*[@name='{name}']")
     if found is not None:
         element.remove(found)
 
@@ -132,7 +128,7 @@ def _is_lamp(shape: ET.Element) -> bool:
 def _refracts(bsdf: ET.Element) -> bool:
     if bsdf.get("type") in DIELECTRICS:
         return True
-    share = _parameter(bsdf, "spec_trans")
+    share = bsdf.find("*[@name='spec_trans']")
     return share is not None and (share.tag != "float" or float(share.get("value", "0")) > 0)
 
 

@@ -22,25 +22,26 @@ class Evidence:
     words: tuple[str, ...] = ()
 
 
-NOTHING: dict[EffectName, str] = {
-    "indirect": "no surface reflects light",
-    "refraction": "no material refracts",
-    "caustics": "no sharp metal or glass beside a surface that shows its caustics",
-    "volumes": "no media",
-    "subsurface": "no material scatters below its surface",
-    "alpha": "no material is transparent or cut out",
-    "environment": "the world is dark",
-    "area-lights": "no lamp with a surface",
-    "point-lights": "no point, spot or sun lamp without size",
-    "glow": "no material emits",
-    "hair": "no strands",
-    "depth-of-field": "no camera in use has it",
-    "spectral": "nothing in the converted scene depends on the wavelength",
-    "motion": "the scene does not ask for it",
-    "view-dependence": "all surfaces look the same from every side",
-    "depth": "all surfaces look the same from every side: their place in the atlas says all",
-    "normal": "all surfaces look the same from every side: their place in the atlas says all",
+WORDS: dict[EffectName, tuple[str, str]] = {
+    "indirect": ("indirect light", "no surface reflects light"),
+    "refraction": ("refraction", "no material refracts"),
+    "caustics": ("caustics", "no sharp metal or glass beside a surface that shows its caustics"),
+    "volumes": ("volumes", "no media"),
+    "subsurface": ("subsurface", "no material scatters below its surface"),
+    "alpha": ("alpha masks", "no material is transparent or cut out"),
+    "environment": ("environment light", "the world is dark"),
+    "area-lights": ("area lights", "no lamp with a surface"),
+    "point-lights": ("point, spot and sun lights", "no point, spot or sun lamp without size"),
+    "glow": ("glowing surfaces", "no material emits"),
+    "hair": ("hair strands", "no strands"),
+    "depth-of-field": ("depth of field", "no camera in use has it"),
+    "spectral": ("spectral rendering", "nothing in the converted scene depends on the wavelength"),
+    "motion": ("motion blur", "the scene does not ask for it"),
+    "view-dependence": ("spherical harmonics of the view", "all surfaces look the same from every side"),
+    "depth": ("texture by depth", "all surfaces look the same from every side: their place in the atlas says all"),
+    "normal": ("texture by normal", "all surfaces look the same from every side: their place in the atlas says all"),
 }
+"""Title, and what is said where nothing calls for it."""
 
 
 def gather(census: Census, bundle: Mapping[str, Sequence[str]], lenses: Sequence[str]) -> dict[EffectName, Evidence]:

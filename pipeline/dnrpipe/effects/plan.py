@@ -14,10 +14,10 @@ from pydantic import Field
 
 from dnrtrain.settings import ModelSettings, Strict
 
-from ..core.effect_names import FORCEABLE, LAMPS, NAMES, NEURAL, REMOVABLE, TITLES, EffectName
+from ..core.effect_names import FORCEABLE, LAMPS, NAMES, NEURAL, REMOVABLE, EffectName
 from ..core.scene_records import Census
 from ..raytrace.statistics import REFERENCE_DEPTH, DepthStep, Measured
-from .evidence import NOTHING, Evidence, gather
+from .evidence import WORDS, Evidence, gather
 
 DIRECT_DEPTH = 2
 
@@ -112,7 +112,7 @@ def plan_effects(
     evidence["indirect"] = _indirect(evidence["indirect"], depth, depth_by, pilot)
     effects = []
     for name in NAMES:
-        found = evidence[name]
+        found, (title, nothing) = evidence[name], WORDS[name]
         on = found.called_for
         if name in disable and (found.present or not on):
             on = False
@@ -121,12 +121,12 @@ def plan_effects(
         effects.append(
             Effect(
                 name=name,
-                title=TITLES[name],
+                title=title,
                 part="neural" if name in NEURAL else "light",
                 on=on,
                 by="scene" if on == found.called_for else "user",
                 present=found.present,
-                evidence=found.words or (NOTHING[name],),
+                evidence=found.words or (nothing,),
             )
         )
     plan = EffectPlan(effects=tuple(effects), integrator="path", max_depth=depth, depth_by=depth_by, pilot=pilot)

@@ -17,7 +17,7 @@ from ..core.scene_files import read_census, read_json, read_summary, scene_finge
 from ..core.scene_records import Lens
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest
-from ..raytrace.statistics import REFERENCE_DEPTH, Measured
+from ..raytrace.statistics import REFERENCE_DEPTH
 from ..raytrace.variants import VariantChoice, choose_variant
 from .bundle import bundle_facts, write_without
 from .plan import DepthPilot, EffectPlan, plan_effects
@@ -148,11 +148,8 @@ def _stored(workspace: Workspace) -> EffectPlan | None:
 def _with_measurements(plan: EffectPlan, stored: EffectPlan) -> EffectPlan:
     """Columns measured before, where nothing that they depend on changed."""
     same = (plan.integrator, plan.max_depth, plan.left_out) == (stored.integrator, stored.max_depth, stored.left_out)
-    known: dict[str, tuple[Measured | None, Measured | None]] = {e.name: (e.cost, e.error) for e in stored.effects}
+    known = {e.name: {"cost": e.cost, "error": e.error} for e in stored.effects}
     if not same:
         return plan
-    rows = [
-        e.model_copy(update=dict(zip(("cost", "error"), known.get(e.name, (None, None)), strict=True)))
-        for e in plan.effects
-    ]
+    rows = [e.model_copy(update=known.get(e.name, {})) for e in plan.effects]
     return plan.model_copy(update={"effects": tuple(rows)})

@@ -12,7 +12,7 @@ from ..core.console import Console
 from ..core.errors import UserError
 from ..core.workspace import Workspace
 from ..raytrace.variants import choose_variant
-from ..workers.answers import only_answer
+from ..workers.view_tasks import only_answer
 
 SAMPLES = 16
 """Points per texel."""

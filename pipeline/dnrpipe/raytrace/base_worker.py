@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from dnrpipe.core.errors import UserError
 from dnrtrain.contract import View
 from dnrtrain.exr import write_exr
 
 from .base_renderer import BaseRenderer
 from .denoise import denoise
-from .engine import Engine, masked
+from .engine import BundleWorker, masked
 from .frames import Frames
 from .light_worker import read_light
 from .sensors import scaled_view
@@ -24,16 +23,15 @@ MIRROR = 0.02
 """Diffuse reflectance below which a surface counts as mirror or glass."""
 
 
-class Worker:
+class Worker(BundleWorker):
     """Renders base images. common: a `BakedCommon` or a `SampledCommon`, task: a `BaseTask`."""
+
+    compiled_for = "base images need"
 
     def __init__(self, common: dict[str, Any]) -> None:
         kind = BakedCommon if common["kind"] == "baked" else SampledCommon
         self.common = kind.model_validate(common)
-        self.bundle = self.common.bundle
-        self.engine = Engine(self.common.variant, 0, [self.bundle])
-        if not self.engine.compiled:
-            raise UserError("base images need a jit variant of Mitsuba (LLVM or CUDA; see `dnrpipe doctor`)")
+        super().__init__(common)
         dark = np.zeros((2, 2, 2, 2, 3), np.float32)
         light = read_light(self.common.light) if isinstance(self.common, BakedCommon) else dark
         scene = self.engine.scenes[str(self.bundle)]
@@ -42,10 +40,8 @@ class Worker:
         self.warm = False
         self.repaired = self.masked = 0  # pixels of the view at hand: samples left out, set to zero
 
-    def __call__(self, task: dict[str, Any]) -> BaseAnswer:
-        return self._render(BaseTask.model_validate(task))
-
-    def _render(self, task: BaseTask) -> BaseAnswer:
+    def __call__(self, asked: dict[str, Any]) -> BaseAnswer:
+        task = BaseTask.model_validate(asked)
         view = task.view
         if not self.warm:
             self.channels(view)  # compiles the kernel, which is no cost of a frame

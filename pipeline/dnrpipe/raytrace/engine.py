@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from . import paths, plugins
 from .auxiliary import auxiliary_integrator
 from .recorded import without_collection
 from .sensors import scaled_lens, scaled_view, sensor_dict, unit_scale
+from .tasks import BundleCommon
 from .visibility import camera_integrator
 
 # Samples per kernel launch x pixels: bounds the wavefront's memory (about 1 GiB on the CPU).
@@ -143,6 +144,22 @@ class Engine:
             done += samples
             launch += 1
         return total / done, done
+
+
+class BundleWorker:
+    """A worker that loads one bundle when it starts.
+
+    compiled_for: what needs a jit variant, in words; under a scalar one it raises UserError then. "": any will do.
+    """
+
+    compiled_for: ClassVar[str] = ""
+
+    def __init__(self, common: dict[str, Any]) -> None:
+        settings = BundleCommon.model_validate(common)
+        self.bundle = settings.bundle
+        self.engine = Engine(settings.variant, settings.threads, [self.bundle])
+        if self.compiled_for and not self.engine.compiled:
+            raise UserError(f"{self.compiled_for} a jit variant of Mitsuba (LLVM or CUDA; see `dnrpipe doctor`)")
 
 
 def _refuse_instances(bundles: Sequence[Path]) -> None:

@@ -12,31 +12,24 @@ from dnrpipe.core.errors import UserError
 from dnrtrain.atomic import atomic_path
 from dnrtrain.contract import NPZ_ERRORS
 
-from .engine import Engine
+from .engine import BundleWorker
 from .lightmap import LightBaker
-from .tasks import BundleCommon, LightAnswer, LightTask, costs_since
+from .tasks import LightAnswer, LightTask, costs_since
 from .texels import grouped_meshes
 from .visibility import ROULETTE_DEPTH
 
 
-class Worker:
+class Worker(BundleWorker):
     """Bakes light maps. common: a `BundleCommon`, task: a `LightTask`.
 
     The file is an ``npz`` with ``light`` (float32 [2, 2, size, size, 3]: E and S of front and back, row 0 at V = 0) and
     ``fingerprint``.
     """
 
-    def __init__(self, common: dict[str, Any]) -> None:
-        settings = BundleCommon.model_validate(common)
-        self.bundle = settings.bundle
-        self.engine = Engine(settings.variant, 0, [self.bundle])
-        if not self.engine.compiled:
-            raise UserError("baked light needs a jit variant of Mitsuba (LLVM or CUDA; see `dnrpipe doctor`)")
+    compiled_for = "baked light needs"
 
-    def __call__(self, task: dict[str, Any]) -> LightAnswer:
-        return self._bake(LightTask.model_validate(task))
-
-    def _bake(self, task: LightTask) -> LightAnswer:
+    def __call__(self, asked: dict[str, Any]) -> LightAnswer:
+        task = LightTask.model_validate(asked)
         started, cpu = time.monotonic(), time.process_time()
         scene, groups = self.engine.scenes[str(self.bundle)], grouped_meshes(self.bundle)
         baker = LightBaker(self.engine.mi, scene, self._indirect(task), groups)

@@ -55,7 +55,7 @@ def group_noise(groups: np.ndarray) -> Noise:
     # Half as many samples: twice the variance, twice the bias of the curve.
     first, second = (_squares(part, halved=2.0).mean(axis=-1) for part in (groups[:half], groups[half:]))
     spread = math.sqrt(float(((first - second) ** 2).sum()) / 4) / first.size
-    return _noise(float(squares.mean()), spread, _level(groups.mean(axis=0)))
+    return _noise(float(squares.mean()), spread, display(groups.mean(axis=0)))
 
 
 def half_noise(half_a: np.ndarray, half_b: np.ndarray) -> Noise:
@@ -67,7 +67,7 @@ def half_noise(half_a: np.ndarray, half_b: np.ndarray) -> Noise:
     a, b = display(half_a), display(half_b)
     squares = (((a - b) / 2) ** 2).mean(axis=-1)
     spread = math.sqrt(float((squares**2).sum())) / squares.size
-    return _noise(float(squares.mean()), spread, float(np.sqrt(np.mean(((a + b) / 2) ** 2))))
+    return _noise(float(squares.mean()), spread, (a + b) / 2)
 
 
 def denoised_error(denoised: np.ndarray, others: np.ndarray) -> tuple[float, float]:
@@ -100,12 +100,8 @@ def _squares(groups: np.ndarray, halved: float = 1.0) -> np.ndarray:
     return variance / halved + (bias / halved) ** 2
 
 
-def _level(picture: np.ndarray) -> float:
-    return float(np.sqrt(np.mean(display(picture) ** 2)))
-
-
-def _noise(square: float, spread: float, level: float) -> Noise:
-    """From the mean square, its standard error and the picture's rms; d sqrt(x) = dx / (2 sqrt(x))."""
-    rmse = math.sqrt(square)
+def _noise(square: float, spread: float, shown: np.ndarray) -> Noise:
+    """From the mean square, its standard error and the picture in display space; d sqrt(x) = dx / (2 sqrt(x))."""
+    rmse, level = math.sqrt(square), float(np.sqrt(np.mean(shown**2)))
     scale = 1 / level if level > 0 else 0.0
     return Noise(rmse * scale, spread / (2 * rmse) * scale if rmse > 0 else 0.0, rmse)

@@ -13,22 +13,18 @@ import numpy as np
 
 from dnrtrain.exr import write_exr
 
-from .engine import Engine
 from .grouped import GroupedSensor
 from .noise import GROUPS, group_noise
 from .pictures import finished, repair
 from .samples import Samples, read_samples
-from .tasks import NoiseFigures, PassAnswer, PassTask, TracedView, TracerCommon, WriteAnswer, WriteTask, costs_since
+from .tasks import NoiseFigures, PassAnswer, PassTask, WriteAnswer, WriteTask, costs_since
+from .tracer import ViewTracer
 
 
-class Worker:
-    """Loads the bundle once. common: a `TracerCommon`; task: a `PassTask`, or a `WriteTask` where "add" is 0."""
+class Worker(ViewTracer):
+    """common: a `BundleCommon`; task: a `PassTask`, or a `WriteTask` where "add" is 0."""
 
-    def __init__(self, common: dict[str, Any]) -> None:
-        settings = TracerCommon.model_validate(common)
-        self.bundle = settings.bundle
-        self.engine = Engine(settings.variant, settings.threads, [self.bundle])
-        self.started = False
+    started = False
 
     def __call__(self, task: dict[str, Any]) -> PassAnswer | WriteAnswer:
         return self._add(PassTask.model_validate(task)) if task["add"] else self._write(WriteTask.model_validate(task))
@@ -37,7 +33,7 @@ class Worker:
         first, self.started = not self.started, True
         samples = _samples(task)
         started, cpu = time.monotonic(), time.process_time()
-        integrator, _ = self._integrator(task)
+        integrator, _ = self.integrator(task)
         sensor = GroupedSensor(self.engine, self.bundle, task.view, task.lens)
         facts = samples.facts
         each = max(1, task.add // GROUPS)
@@ -77,27 +73,16 @@ class Worker:
             raise RuntimeError(f"{task.samples}: gone or damaged; run the same command to trace it again")
         started, cpu = time.monotonic(), time.process_time()
         channels, noise = self._pictures(task, samples)
-        _, name = self._integrator(task)
         costs = costs_since(started, cpu)
         facts.seconds += costs["seconds"]
         facts.cpu_seconds += costs["cpu_seconds"]
         answer: WriteAnswer = {
-            "spp": facts.spp,
-            "max_depth": task.max_depth,
-            "seed": task.seed,
-            "integrator": name + ("+lens" if task.lens else ""),
-            "variant": self.engine.variant,
-            "load_seconds": self.engine.load_seconds,
-            **noise,
-            "repaired": facts.repaired,
-            "masked": facts.masked,
-            "denoised": task.denoise,
+            **self.answer(task, facts.spp, costs, noise, facts.repaired, facts.masked),
             "passes": facts.passes,
             "noise_target": task.goal.noise_target,
             "time_target": task.goal.time_target,
             "max_spp": task.goal.max_spp,
             "ended_by": task.goal.ended_by,
-            **costs,
             "seconds": facts.seconds,
             "cpu_seconds": facts.cpu_seconds,
         }
@@ -115,9 +100,6 @@ class Worker:
     def _pictures(self, task: PassTask | WriteTask, samples: Samples) -> tuple[dict[str, np.ndarray], NoiseFigures]:
         noise, image, halves = group_noise(samples.groups), samples.mean, samples.halves
         return finished(self.engine, self.bundle, task.view, image, halves, noise, task.denoise, samples.groups)
-
-    def _integrator(self, task: TracedView) -> tuple[Any, str]:
-        return self.engine.integrator(self.bundle, task.integrator, task.max_depth)
 
 
 def _samples(task: PassTask | WriteTask) -> Samples:

@@ -47,9 +47,7 @@ class Worker:
             task = task.model_copy(update={"config": config})
         spp = task.spp
         chosen, steps, noisy = self._bisect(task, spp)
-        for _ in range(MAX_DOUBLINGS):
-            if not noisy:
-                break
+        while noisy and spp < task.spp << MAX_DOUBLINGS:
             spp *= 2
             chosen, steps, noisy = self._bisect(task, spp)
         return {

@@ -62,7 +62,6 @@ class ViewProgress:
     passes: list[tuple[int, float]] = field(default_factory=list)
     busy: bool = False
     finished: bool = False
-    why: str = ""
 
     @property
     def bound(self) -> float:

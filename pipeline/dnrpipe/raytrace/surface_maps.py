@@ -10,18 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from dnrpipe.core.errors import UserError
 from dnrtrain.atomic import atomic_path
 
 from .denoise import filled
-from .engine import Engine
+from .engine import BundleWorker
 from .lightmap import LightBaker
 from .lobes import diffuse_context, lets_through, reflectance
-from .tasks import BundleCommon, SurfaceAnswer, SurfaceTask
+from .tasks import SurfaceAnswer, SurfaceTask
 from .texels import grouped_meshes
 
 
-class Worker:
+class Worker(BundleWorker):
     """Evaluates surfaces. common: a `BundleCommon`, task: a `SurfaceTask`.
 
     The file is an ``npz``, row 0 at V = 0, gaps between charts filled: ``albedo`` and ``emission`` float32
@@ -30,12 +29,7 @@ class Worker:
     mean.
     """
 
-    def __init__(self, common: dict[str, Any]) -> None:
-        settings = BundleCommon.model_validate(common)
-        self.bundle = settings.bundle
-        self.engine = Engine(settings.variant, 0, [self.bundle])
-        if not self.engine.compiled:
-            raise UserError("surface maps need a jit variant of Mitsuba (LLVM or CUDA; see `dnrpipe doctor`)")
+    compiled_for = "surface maps need"
 
     def __call__(self, task: dict[str, Any]) -> SurfaceAnswer:
         asked = SurfaceTask.model_validate(task)

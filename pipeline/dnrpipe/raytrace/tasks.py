@@ -28,10 +28,14 @@ class Task(BaseModel):
 
 
 class BundleCommon(Task):
-    """A bundle and the Mitsuba variant that renders it. bundle: path of its ``scene.xml``."""
+    """A bundle and the Mitsuba variant that renders it.
+
+    bundle: path of its ``scene.xml``. threads: 1 for bits that repeat, 0 for all cores.
+    """
 
     bundle: Path
     variant: str
+    threads: int = 0
 
 
 class Costs(TypedDict):
@@ -52,12 +56,6 @@ def costs_since(wall: float, cpu: float) -> Costs:
 
 
 # -- tracer, pass_worker: path-traced views ----------------------------------------------------------------
-
-
-class TracerCommon(BundleCommon):
-    """threads: 1 for bits that repeat, 0 for all cores."""
-
-    threads: int
 
 
 class TracedView(Task):

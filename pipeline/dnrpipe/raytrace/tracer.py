@@ -18,28 +18,45 @@ import numpy as np
 
 from dnrtrain.exr import write_exr
 
-from .engine import Engine
+from .engine import BundleWorker
 from .noise import half_noise
 from .pictures import finished, repair
-from .tasks import TraceAnswer, TracerCommon, TraceTask, costs_since
+from .tasks import Costs, NoiseFigures, TraceAnswer, TracedView, TraceTask, costs_since
 
 
-class Worker:
-    """Loads the bundle once; each call traces one view. common: a `TracerCommon`, task: a `TraceTask`."""
+class ViewTracer(BundleWorker):
+    """What this worker and `pass_worker` share."""
 
-    def __init__(self, common: dict[str, Any]) -> None:
-        settings = TracerCommon.model_validate(common)
-        self.bundle = settings.bundle
-        self.engine = Engine(settings.variant, settings.threads, [self.bundle])
+    def integrator(self, task: TracedView) -> tuple[Any, str]:
+        return self.engine.integrator(self.bundle, task.integrator, task.max_depth)
 
-    def __call__(self, task: dict[str, Any]) -> TraceAnswer:
-        return self._trace(TraceTask.model_validate(task))
+    def answer(
+        self, task: TracedView, spp: int, costs: Costs, noise: NoiseFigures, repaired: int, masked: int
+    ) -> TraceAnswer:
+        return {
+            "spp": spp,
+            "max_depth": task.max_depth,
+            "seed": task.seed,
+            "integrator": self.integrator(task)[1] + ("+lens" if task.lens else ""),
+            "variant": self.engine.variant,
+            **costs,
+            "load_seconds": self.engine.load_seconds,
+            **noise,
+            "repaired": repaired,
+            "masked": masked,
+            "denoised": task.denoise,
+        }
 
-    def _trace(self, task: TraceTask) -> TraceAnswer:
+
+class Worker(ViewTracer):
+    """Each call traces one view. common: a `BundleCommon`, task: a `TraceTask`."""
+
+    def __call__(self, asked: dict[str, Any]) -> TraceAnswer:
+        task = TraceTask.model_validate(asked)
         view, spp, seed = task.view, task.spp, task.seed
         started, cpu = time.monotonic(), time.process_time()
         sensor = self.engine.sensor(view, task.lens)
-        integrator, name = self.engine.integrator(self.bundle, task.integrator, task.max_depth)
+        integrator, _ = self.integrator(task)
 
         def render(samples: int, number: int) -> tuple[np.ndarray, int]:
             return self.engine.frame(self.bundle, integrator, sensor, view, samples, number)
@@ -56,19 +73,7 @@ class Worker:
         halves = (half_a, half_b) if done_b else None
         raw = half_noise(half_a, half_b) if done_b else None
         channels, noise = finished(self.engine, self.bundle, view, image, halves, raw, task.denoise)
-        answer: TraceAnswer = {
-            "spp": total,
-            "max_depth": task.max_depth,
-            "seed": seed,
-            "integrator": name + ("+lens" if task.lens else ""),
-            "variant": self.engine.variant,
-            **costs_since(started, cpu),
-            "load_seconds": self.engine.load_seconds,
-            **noise,
-            "repaired": repaired,
-            "masked": masked,
-            "denoised": task.denoise,
-        }
+        answer = self.answer(task, total, costs_since(started, cpu), noise, repaired, masked)
         header = {**answer, "fingerprint": task.fingerprint, "view": view.model_dump(mode="json")}
         write_exr(task.output, channels, header)
         return answer

@@ -23,8 +23,7 @@ from filelock import FileLock, Timeout
 from ..core.errors import UserError
 from ..core.event_stream import VARIABLE
 from ..core.workspace import LOCK_FILES
-from ..workers.processes import die_with_parent
-from ..workers.timeouts import TIMEOUT_VARIABLE
+from ..workers.processes import TIMEOUT_VARIABLE, die_with_parent
 from .config import ServerConfig, tightest
 from .models import Job, Limits
 from .queue import MAX_STARTS, Queue

@@ -12,8 +12,7 @@ from dnrtrain.exr import read_metadata
 from ..core.console import Console
 from ..raytrace.sample_schedule import Goal, Schedule, Step, ViewProgress
 from ..raytrace.samples import read_facts
-from ..workers.answers import answers
-from ..workers.processes import TaskResult
+from ..workers.processes import TaskResult, run_tasks
 from ..workers.view_tasks import Book, Failures, is_made, task_name
 from .stage import Run
 
@@ -57,7 +56,7 @@ def sample_adaptively(
 
     first = [make_task(step) for step in (schedule.next() for _ in range(count)) if step is not None]
     failures = Failures(label, run.console, run.log)
-    outcomes = answers(
+    outcomes = run_tasks(
         "dnrpipe.raytrace.pass_worker",
         common,
         first,

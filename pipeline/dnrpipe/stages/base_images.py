@@ -23,8 +23,7 @@ from ..core.workspace import Workspace, digest
 from ..effects.plan import EffectPlan
 from ..effects.store import plan_of, trace_config
 from ..raytrace.variants import choose_variant
-from ..workers.answers import only_answer
-from ..workers.view_tasks import warn_of_repairs
+from ..workers.view_tasks import only_answer, warn_of_repairs
 from .effect_plan import resolve_plan
 from .stage import Run
 

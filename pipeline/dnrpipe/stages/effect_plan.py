@@ -19,7 +19,7 @@ from ..effects.store import (
 )
 from ..raytrace.statistics import REFERENCE_DEPTH
 from ..raytrace.variants import VariantChoice
-from ..workers.answers import only_answer
+from ..workers.view_tasks import only_answer
 from .stage import Run
 
 

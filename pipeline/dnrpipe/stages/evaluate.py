@@ -87,7 +87,7 @@ def evaluate(run: Run) -> Outcome:
         views=rows,
         mean=mean,
         perceptual=perceptual is not None,
-        trained_with_perceptual=workspace.manifest.stages["finetune"].perceptual or False,
+        trained_with_perceptual=workspace.manifest.stages["finetune"].detail.get("perceptual", False),
         device=torch.cuda.get_device_name() if device.startswith("cuda") else "cpu",
         reference_noise_target=settings.raytrace.evaluation_noise,
         neural_ms=1000 * float(np.median(neural_seconds)),

@@ -164,7 +164,7 @@ def state(stage: Stage, workspace: Workspace, settings: Settings) -> State:
         return "stale"
     if any(state(STAGES[need], workspace, settings) == "stale" for need in stage.needs):
         return "stale"
-    if record.perceptual is False and weights_cached():
+    if record.detail.get("perceptual") is False and weights_cached():
         return "stale"
     return "done" if present >= wanted else "partial"
 

@@ -39,9 +39,8 @@ from ..core.scene_records import Conversion, RasterChoice, SceneSummary
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest, file_sha256
 from ..effects.store import keep_plan
-from ..workers.answers import answers, warn_of_retries
-from ..workers.processes import Retry
-from ..workers.view_tasks import warn_of_repairs, worker_count
+from ..workers.processes import Retry, run_tasks
+from ..workers.view_tasks import warn_of_repairs, warn_of_retries, worker_count
 from .stage import Outcome, Run
 
 Answer = TypeVar("Answer", PrepareAnswer, InspectAnswer)
@@ -211,7 +210,7 @@ def open_scene(module: str, task: PrepareTask | InspectTask, answer: type[Answer
     Raises UserError: both tries failed; says whether Blender itself died of the file. Raises OSError: a full disk.
     """
     failed: list[Retry] = []
-    for outcome in answers(module, {}, [task.data()], workers=1, log=log, retried=failed.append):
+    for outcome in run_tasks(module, {}, [task.data()], workers=1, log=log, retried=failed.append):
         if outcome.died:
             raise UserError(f"{task.source}: Blender could not open it ({outcome.error}): damaged or truncated?")
         if outcome.result is None:
@@ -244,7 +243,7 @@ def bake(run: Run, source: Path, geometry: Path, pending: PendingBakes) -> list[
     refused: list[str] = []
     tasks = [BakeTask(layer=layer, output=folder).data() for layer in pending.layers]
     with console.bar("bakes", len(tasks)) as bar:
-        for outcome in answers(
+        for outcome in run_tasks(
             "dnrpipe.blender.baking.bake",
             common.data(),
             tasks,

@@ -36,16 +36,7 @@ def select_views(run: Run) -> Outcome:
     else:
         chosen = _choose(run, views)
         made = [chosen.views]
-    selection = Selection(
-        policy=chosen.policy,
-        budget=settings.select.budget,
-        seed=settings.select.seed,
-        views=chosen.views,
-        gains=chosen.gains,
-        why=chosen.why,
-        details=chosen.details,
-    )
-    write(workspace.selection, selection)
+    write(workspace.selection, chosen)
     return Outcome(digest(made), {"policy": chosen.policy, "views": chosen.views})
 
 
@@ -66,7 +57,7 @@ def check_budget(budget: int, candidates: int) -> None:
         )
 
 
-def _choose(run: Run, views: list[View]) -> Selected:
+def _choose(run: Run, views: list[View]) -> Selection:
     workspace, policy = run.workspace, run.settings.select.policy
     run.console.say(f"select: no training; policy {policy} needs none, and step 2 starts fresh")
     rule = untrained(policy)
@@ -75,7 +66,7 @@ def _choose(run: Run, views: list[View]) -> Selected:
     # A model of another policy's run would pass for this one's in the report.
     if workspace.checkpoints("step1").exists():
         shutil.rmtree(workspace.checkpoints("step1"))
-    return Selected([views[i].name for i in choice.views], policy, choice.details, choice.gains, choice.why)
+    return choice.selection([view.name for view in views], policy, run.settings.select.seed)
 
 
 def _choose_by(rule: Policy, run: Run, views: list[View]) -> Choice:
@@ -98,7 +89,7 @@ def _book(run: Run, seconds: float, cpu_seconds: float) -> None:
     run.book("training", "scene", "selection", seconds, cpu_seconds=cpu_seconds, device="cpu")
 
 
-def _train_and_choose(run: Run, views: list[View]) -> Selected:
+def _train_and_choose(run: Run, views: list[View]) -> Selection:
     from dnrtrain.step1 import run_step1
 
     workspace, settings, select = run.workspace, run.settings, run.settings.select
@@ -108,7 +99,7 @@ def _train_and_choose(run: Run, views: list[View]) -> Selected:
         run.console.say(f"select: policy {select.policy} needs no training, but step 2 starts from the coarse model")
         choice = _choose_by(rule, run, views)
     validation = split_views(workspace)["val"]
-    chosen: Selected | None = None
+    chosen: Selection | None = None
     events = run_step1(
         load(workspace, views, "train"),
         load(workspace, validation, "val") if validation else None,
@@ -124,7 +115,7 @@ def _train_and_choose(run: Run, views: list[View]) -> Selected:
     )
     for event in follow(run, events, select.step1.epochs):
         if isinstance(event, Selected):
-            chosen = event
+            chosen = event.selection
             if event.seconds and choice is None:  # 0 where a finished run was found
                 _book(run, event.seconds, event.cpu_seconds)
     assert chosen is not None  # run_step1 ends with Selected

@@ -16,7 +16,7 @@ from ..core.settings import Settings
 from ..core.workspace import Workspace
 from ..effects.plan import EffectPlan
 from ..effects.store import plan_of
-from ..workers.answers import answers
+from ..workers.processes import run_tasks
 from ..workers.view_tasks import Book, Failures, is_made, task_name
 
 
@@ -128,7 +128,7 @@ class Run:
             return
         count = max(1, min(workers, len(due)))
         failures = Failures(label, self.console, self.log)
-        outcomes = answers(
+        outcomes = run_tasks(
             module, common, due, workers=count, log=self.log, retried=failures.retried, environment=environment
         )
         with self.console.bar(label, len(tasks), len(tasks) - len(due)) as bar:

@@ -29,9 +29,16 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import UserError
-from .timeouts import TaskTimeout
+from ..core.units import parse_seconds
 
 MAX_ATTEMPTS = 2
+TIMEOUT_VARIABLE = "DNRPIPE_TASK_TIMEOUT"
+FIRST_LIMIT = 6 * 3600.0
+"""Seconds that a task may take while none has ended yet: paper-sized light on two cores is well within."""
+LEAST_LIMIT = 600.0
+"""Below it nothing counts as hung, however quick the others were: machines swap, and sleep."""
+SLOWEST = 30.0
+"""A task may take so many times the longest one so far."""
 
 
 @dataclass
@@ -59,6 +66,40 @@ class Retry:
     reason: str
 
 
+class TaskTimeout:
+    """The limit of each task of one run.
+
+    Args:
+        fixed: seconds; None: those of DNRPIPE_TASK_TIMEOUT, else SLOWEST times the longest task that ended so far
+            (LEAST_LIMIT at least, FIRST_LIMIT before any has).
+
+    Raises UserError: the variable is no number of seconds above 0.
+    """
+
+    def __init__(self, fixed: float | None = None) -> None:
+        self.fixed, self.longest = fixed, 0.0
+        if fixed is None and (text := os.environ.get(TIMEOUT_VARIABLE, "").strip()):
+            try:
+                self.fixed = parse_seconds(text)
+            except ValueError:
+                raise UserError(f"{TIMEOUT_VARIABLE}={text}: expected a time such as 90, 20m or 2h") from None
+
+    def limit(self, attempt: int) -> float:
+        """Seconds for try number ``attempt`` of a task; further tries get twice as long, unless told otherwise."""
+        if self.fixed is not None:
+            return self.fixed
+        usual = max(LEAST_LIMIT, SLOWEST * self.longest) if self.longest else FIRST_LIMIT
+        return usual * (1 if attempt == 1 else 2)
+
+    def took(self, seconds: float) -> None:
+        """A task ended after so many seconds."""
+        self.longest = max(seconds, self.longest)
+
+    def reason(self) -> str:
+        """What the limit came from."""
+        return f"; the longest so far took {self.longest:.0f} s" if self.fixed is None and self.longest else ""
+
+
 def run_tasks(
     module: str,
     common: dict[str, Any],
@@ -66,21 +107,25 @@ def run_tasks(
     *,
     workers: int,
     log: Path,
+    retried: Callable[[Retry], object] = lambda retry: None,
     timeout: float | None = None,
     environment: dict[str, str] | None = None,
     next_tasks: Callable[[TaskResult], Sequence[dict[str, Any]]] | None = None,
-) -> Generator[TaskResult | Retry, None, None]:
-    """Run ``tasks`` on ``workers`` processes; yield a TaskResult per task, and a Retry for each new try.
+) -> Generator[TaskResult, None, None]:
+    """Run ``tasks`` on ``workers`` processes; yield each task's outcome as it comes.
 
     Args:
         module: importable module with a class ``Worker(common)`` that is callable with a task.
         common: JSON-able, sent once to each worker.
         log: file to which the workers' output is appended.
-        timeout: seconds after which a silent task counts as hung; its worker is killed. None: see `patience`.
+        retried: called when a task is tried once more.
+        timeout: seconds after which a silent task counts as hung; its worker is killed. None: see `TaskTimeout`.
         environment: variables added to the workers' environment.
         next_tasks: called with each TaskResult before it is yielded; returns tasks to do after it.
 
-    Closing the iterator (Ctrl-C in the consumer) kills the workers. Raises UserError: see `TaskTimeout`.
+    Closing the iterator (Ctrl-C in the consumer) kills the workers.
+
+    Raises UserError: see `TaskTimeout`. Raises OSError: the disk is full.
     """
     task_timeout = TaskTimeout(timeout)
     pending: queue.SimpleQueue[tuple[dict[str, Any], int]] = queue.SimpleQueue()
@@ -89,13 +134,13 @@ def run_tasks(
     outcomes: queue.SimpleQueue[TaskResult | Retry] = queue.SimpleQueue()
     stopping = threading.Event()
     open_tasks = len(tasks)  # not answered for yet: written by the consumer alone, read by the workers' threads
-    processes: list[subprocess.Popen[str] | None] = [None] * max(1, min(workers, len(tasks)))
-    log.parent.mkdir(parents=True, exist_ok=True)
     # Workers end without Blender's own clean-up (see _worker_main); what it leaves in the temporary folder goes here.
     temp_dir = tempfile.TemporaryDirectory(prefix="dnrpipe-workers-", ignore_cleanup_errors=True)
     worker_environment = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), temp_dir.name) | (environment or {})
+    count = max(1, min(workers, len(tasks)))
+    processes = [LocalWorker(module, common, log, worker_environment) for _ in range(count)]
 
-    def serve(slot: int) -> None:
+    def serve(worker: LocalWorker) -> None:
         # The thread lives as long as its worker: PR_SET_PDEATHSIG follows the spawning thread.
         try:
             while not stopping.is_set() and open_tasks > 0:
@@ -105,20 +150,14 @@ def run_tasks(
                     continue
                 started = time.monotonic()
                 try:
-                    process = processes[slot]
-                    if process is None or process.poll() is not None:
-                        process = processes[slot] = _spawn(module, common, log, worker_environment)
-                    answer = _ask(process, task, task_timeout.limit(attempt), task_timeout.reason())
+                    answer = worker.answer(task, task_timeout.limit(attempt), task_timeout.reason())
                 except (WorkerDied, OSError, ValueError) as death:  # also: cannot be started, truncated answer
-                    _kill(processes[slot])
-                    processes[slot] = None
                     answer = {"error": " ".join(str(death).split()), "retry": True, "died": True}
                 if stopping.is_set():
                     return
                 seconds = time.monotonic() - started
                 if answer.get("retry"):  # on a fresh worker: this one may be short of memory, or half broken
-                    _close(processes[slot], force=True)
-                    processes[slot] = None
+                    worker.close()
                 if "error" not in answer:
                     task_timeout.took(seconds)
                     outcomes.put(TaskResult(task, answer["result"], None, attempt, seconds))
@@ -129,25 +168,29 @@ def run_tasks(
                     died, number = answer.get("died", False), answer.get("errno")
                     outcomes.put(TaskResult(task, None, answer["error"], attempt, seconds, died, number))
         finally:
-            _close(processes[slot], force=stopping.is_set())
+            worker.close(force=stopping.is_set())
 
-    threads = [threading.Thread(target=serve, args=(slot,), daemon=True) for slot in range(len(processes))]
+    threads = [threading.Thread(target=serve, args=(worker,), daemon=True) for worker in processes]
     for thread in threads:
         thread.start()
     try:
         while open_tasks > 0:
             outcome = outcomes.get()
-            if isinstance(outcome, TaskResult):
-                more = next_tasks(outcome) if next_tasks is not None else ()
-                for task in more:
-                    pending.put((task, 1))
-                open_tasks += len(more) - 1
+            if isinstance(outcome, Retry):
+                retried(outcome)
+                continue
+            more = next_tasks(outcome) if next_tasks is not None else ()
+            for task in more:
+                pending.put((task, 1))
+            open_tasks += len(more) - 1
+            if outcome.errno == errno.ENOSPC:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), outcome.task.get("output", str(log.parent)))
             yield outcome
     finally:
         if open_tasks > 0:
             stopping.set()
-            for process in processes:
-                _kill(process)
+            for worker in processes:
+                worker.kill()
         for thread in threads:
             thread.join(timeout=10)
         temp_dir.cleanup()
@@ -162,7 +205,7 @@ class TaskFailed(RuntimeError):
 
 
 class LocalWorker:
-    """One worker process that is asked task by task, outside of `run_tasks`. Not for several threads at once.
+    """One worker process that is asked task by task. Not for several threads at once.
 
     Linux kills it when the thread that asked first ends.
 
@@ -174,12 +217,9 @@ class LocalWorker:
         self._process: subprocess.Popen[str] | None = None
 
     def ask(self, task: dict[str, Any], timeout: float) -> dict[str, Any]:
-        """The worker's answer; it is started where there is none. Raises WorkerDied, TaskFailed."""
-        if self._process is None or self._process.poll() is not None:
-            self.log.parent.mkdir(parents=True, exist_ok=True)
-            self._process = _spawn(self.module, self.common, self.log, self.environment)
+        """The result of a task. Raises WorkerDied, TaskFailed."""
         try:
-            answer = _ask(self._process, task, timeout)
+            answer = self.answer(task, timeout)
         except WorkerDied:
             self.close()
             raise
@@ -187,55 +227,78 @@ class LocalWorker:
             raise TaskFailed(answer["error"])
         return answer["result"]
 
-    def close(self) -> None:
-        """End the process."""
-        _close(self._process, force=True)
-        self._process = None
+    def answer(self, task: dict[str, Any], timeout: float, why: str = "") -> dict[str, Any]:
+        """What the worker says, as `_worker_main` makes it; the worker is started where there is none.
 
+        Raises WorkerDied, also after ``timeout`` seconds (``why``: where that number is from).
+        """
+        if self._process is None or self._process.poll() is not None:
+            self._process = self._spawn()
+        process = self._process
+        assert process.stdin is not None and process.stdout is not None
+        hung = threading.Event()
 
-def _spawn(module: str, common: dict[str, Any], log: Path, environment: dict[str, str]) -> subprocess.Popen[str]:
-    with log.open("a") as sink:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "dnrpipe.workers.processes", module, str(os.getpid())],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=sink,
-            text=True,
-            env={**os.environ, "PYTHONUNBUFFERED": "1", **environment},
-        )
-    assert process.stdin is not None
-    try:
-        process.stdin.write(json.dumps(common) + "\n")
-        process.stdin.flush()
-    except OSError:
-        raise WorkerDied(_exit_reason(process)) from None
-    return process
+        def kill() -> None:
+            hung.set()
+            process.kill()
 
-
-def _ask(process: subprocess.Popen[str], task: dict[str, Any], timeout: float, why: str = "") -> dict[str, Any]:
-    """The answer to a task. Raises WorkerDied, also after ``timeout`` seconds (``why``: where that number is from)."""
-    assert process.stdin is not None and process.stdout is not None
-    hung = threading.Event()
-
-    def kill() -> None:
-        hung.set()
-        process.kill()
-
-    timer = threading.Timer(timeout, kill)
-    timer.daemon = True
-    timer.start()
-    try:
+        timer = threading.Timer(timeout, kill)
+        timer.daemon = True
+        timer.start()
         try:
-            process.stdin.write(json.dumps(task) + "\n")
+            try:
+                process.stdin.write(json.dumps(task) + "\n")
+                process.stdin.flush()
+                line = process.stdout.readline()
+            except OSError:
+                line = ""
+            if not line:
+                raise WorkerDied(f"worker hung for {timeout:.0f} s{why}" if hung.is_set() else _exit_reason(process))
+            return json.loads(line)
+        finally:
+            timer.cancel()
+
+    def kill(self) -> None:
+        """At once, and from any thread; `close` is still to be called."""
+        if self._process is not None and self._process.poll() is None:
+            self._process.kill()
+
+    def close(self, *, force: bool = True) -> None:
+        """End the process. Without ``force`` it may finish first."""
+        process, self._process = self._process, None
+        if process is None:
+            return
+        with contextlib.suppress(OSError):
+            if process.stdin:
+                process.stdin.close()
+        if force:
+            process.kill()
+        try:
+            process.wait(timeout=20)
+        except subprocess.TimeoutExpired:  # a library that hangs at exit; its work is on disk already
+            process.kill()
+            process.wait()
+        if process.stdout:
+            process.stdout.close()
+
+    def _spawn(self) -> subprocess.Popen[str]:
+        self.log.parent.mkdir(parents=True, exist_ok=True)
+        with self.log.open("a") as sink:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "dnrpipe.workers.processes", self.module, str(os.getpid())],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=sink,
+                text=True,
+                env={**os.environ, "PYTHONUNBUFFERED": "1", **self.environment},
+            )
+        assert process.stdin is not None
+        try:
+            process.stdin.write(json.dumps(self.common) + "\n")
             process.stdin.flush()
-            line = process.stdout.readline()
         except OSError:
-            line = ""
-        if not line:
-            raise WorkerDied(f"worker hung for {timeout:.0f} s{why}" if hung.is_set() else _exit_reason(process))
-        return json.loads(line)
-    finally:
-        timer.cancel()
+            raise WorkerDied(_exit_reason(process)) from None
+        return process
 
 
 def _exit_reason(process: subprocess.Popen[str]) -> str:
@@ -247,28 +310,6 @@ def _exit_reason(process: subprocess.Popen[str]) -> str:
             guess = " (out of memory?)" if -code == signal.SIGKILL else ""
             return f"worker was killed by {signal.Signals(-code).name}{guess}"
     return f"worker ended with exit code {code}"
-
-
-def _kill(process: subprocess.Popen[str] | None) -> None:
-    if process is not None and process.poll() is None:
-        process.kill()
-
-
-def _close(process: subprocess.Popen[str] | None, *, force: bool) -> None:
-    if process is None:
-        return
-    with contextlib.suppress(OSError):
-        if process.stdin:
-            process.stdin.close()
-    if force:
-        _kill(process)
-    try:
-        process.wait(timeout=20)
-    except subprocess.TimeoutExpired:  # a library that hangs at exit; its work is on disk already
-        process.kill()
-        process.wait()
-    if process.stdout:
-        process.stdout.close()
 
 
 def die_with_parent(parent: int) -> None:

@@ -1,4 +1,7 @@
-"""Tasks that write one file each: what they are called, whether they are made, what failed, what was repaired."""
+"""Tasks that write one file each: what they are called, whether they are made, what failed, what was repaired.
+
+Also the answer to a single task.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,8 @@ from typing import Any
 from dnrtrain.exr import read_metadata
 
 from ..core.console import Console
-from .processes import Retry, TaskResult
+from ..core.errors import UserError
+from .processes import Retry, TaskResult, run_tasks
 
 Book = Callable[[dict[str, Any], dict[str, Any], int], None]
 """Called with a finished task, its result and the number of workers side by side; writes it into the ledger."""
@@ -29,6 +33,29 @@ def is_made(task: dict[str, Any]) -> bool:
     """True when the task's file is there and was made from the same inputs."""
     metadata = read_metadata(Path(task["output"]))
     return metadata is not None and metadata.get("fingerprint") == task["fingerprint"]
+
+
+def warn_of_retries(label: str, console: Console) -> Callable[[Retry], None]:
+    """A `retried` of `run_tasks` that warns under the label."""
+    return lambda retry: console.warn(f"{label}: {retry.reason}; trying once more")
+
+
+def only_answer(
+    label: str,
+    module: str,
+    common: dict[str, Any],
+    task: dict[str, Any],
+    *,
+    log: Path,
+    console: Console,
+    environment: dict[str, str] | None = None,
+) -> dict[str, Any]:
+    """The result of one task on a worker of its own. Raises UserError: it failed twice."""
+    retried = warn_of_retries(label, console)
+    (outcome,) = run_tasks(module, common, [task], workers=1, log=log, retried=retried, environment=environment)
+    if outcome.result is None:
+        raise UserError(f"{label} failed twice: {outcome.error}; see {log}")
+    return outcome.result
 
 
 class Failures:

@@ -162,14 +162,10 @@ def camera_problem(candidates: Candidates) -> Facilities:
     )
 
 
-def medoids(problem: Facilities, budget: int, tick: Tick | None = None) -> list[int]:
-    """BUILD, then swaps."""
-    return swap(problem, build(problem, budget, tick=tick)[0], tick)
-
-
 def _choose(candidates: Candidates, budget: int, tick: Tick | None) -> Choice:
     problem = camera_problem(candidates)
-    views, gains = build(problem, budget, medoids(problem, budget, tick))
+    medoids = swap(problem, build(problem, budget, tick=tick)[0], tick)
+    views, gains = build(problem, budget, medoids)
     owner = problem.rows(np.array(views)).argmin(axis=0)
     near = np.bincount(owner, minlength=len(views))
     why = [f"stands for {n} candidates around it" if n > 1 else "stands for itself" for n in near]

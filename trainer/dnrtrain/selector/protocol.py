@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 import numpy as np
 
 from ..contract import ContractError, View
+from ..records import Selection
 
 if TYPE_CHECKING:
     from .visibility import SurfaceVisibility
@@ -73,6 +74,18 @@ class Choice:
     gains: list[float]
     why: list[str]
     details: dict[str, Any] = field(default_factory=dict)
+
+    def selection(self, names: Sequence[str], policy: str, seed: int) -> Selection:
+        """The record of the choice. names: of all candidates."""
+        return Selection(
+            policy=policy,
+            budget=len(self.views),
+            seed=seed,
+            views=[names[i] for i in self.views],
+            gains=self.gains,
+            why=self.why,
+            details=self.details,
+        )
 
 
 class Policy(Protocol):

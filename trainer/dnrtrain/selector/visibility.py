@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..contract import ContractError, View, require_channels
+from ..exr import read_exr
 
 if TYPE_CHECKING:
     from ..dataset import ViewSet
@@ -71,17 +72,6 @@ class SurfaceVisibility:
         )
 
 
-@dataclass(frozen=True)
-class ViewVisibility:
-    """One view's part of `SurfaceVisibility`."""
-
-    cells: np.ndarray
-    pixels: np.ndarray
-    view_directions: np.ndarray
-    seen: float
-    picture: int
-
-
 def read_visibility(
     files: Sequence[Path], views: Sequence[View], *, grid: int = GRID, tick: Callable[[], None] | None = None
 ) -> SurfaceVisibility:
@@ -89,9 +79,8 @@ def read_visibility(
 
     Raises ContractError: counts differ, or a file is missing, damaged, of another size, or lacks channels.
     """
-    from ..exr import read_exr
 
-    def look() -> Iterable[ViewVisibility]:
+    def look() -> Iterable[SurfaceVisibility]:
         for file, view in zip(files, views, strict=True):
             channels, _ = read_exr(file)
             require_channels(file, channels, CHANNELS)
@@ -110,22 +99,17 @@ def read_visibility(
     return collect(look(), grid)
 
 
-def collect(looks: Iterable[ViewVisibility], grid: int = GRID) -> SurfaceVisibility:
+def collect(looks: Iterable[SurfaceVisibility], grid: int = GRID) -> SurfaceVisibility:
     """Views one after the other as one table."""
-    every = list(looks)
-    counts = [len(one.cells) for one in every]
-    return SurfaceVisibility(
-        grid,
-        np.concatenate([[0], np.cumsum(counts, dtype=np.int64)]).astype(np.int64),
-        np.concatenate([np.zeros(0, np.int32), *(one.cells for one in every)]),
-        np.concatenate([np.zeros(0, np.float32), *(one.pixels for one in every)]),
-        np.concatenate([np.zeros((0, 3), np.float32), *(one.view_directions for one in every)]),
-        np.array([one.seen for one in every], np.float32),
-        np.array([one.picture for one in every], np.uint64),
-    )
+    nothing = (np.zeros(0, np.int32), np.zeros(0, np.float32), np.zeros((0, 3), np.float32))
+    every = [SurfaceVisibility(grid, np.zeros(1, np.int64), *nothing, np.zeros(0, np.float32), np.zeros(0, np.uint64))]
+    every += looks
+    columns = ("cells", "pixels", "view_directions", "seen", "pictures")
+    start = np.cumsum([0, *(len(one.cells) for one in every[1:])], dtype=np.int64)
+    return SurfaceVisibility(grid, start, *(np.concatenate([getattr(one, name) for one in every]) for name in columns))
 
 
-def look_at(channels: dict[str, np.ndarray], view: View, grid: int = GRID) -> ViewVisibility:
+def look_at(channels: dict[str, np.ndarray], view: View, grid: int = GRID) -> SurfaceVisibility:
     """What one view sees. channels: those of its pass file, [H, W] each."""
     return _look(channels, -view.ray_directions(), grid)
 
@@ -141,7 +125,7 @@ def visibility_of(views: ViewSet, grid: int = GRID) -> SurfaceVisibility:
     )
 
 
-def _look(channels: dict[str, np.ndarray], view_directions: np.ndarray, grid: int) -> ViewVisibility:
+def _look(channels: dict[str, np.ndarray], view_directions: np.ndarray, grid: int) -> SurfaceVisibility:
     """What one view sees. view_directions: unit vectors from the surface to the camera, world space, [H, W, 3]."""
     height, width = channels["mask"].shape
     step = max(1, min(height, width) // LOOK_SIDE)
@@ -156,10 +140,12 @@ def _look(channels: dict[str, np.ndarray], view_directions: np.ndarray, grid: in
     counts = np.bincount(place, minlength=len(cells))
     digest = hashlib.blake2b(np.packbits(mask).tobytes(), digest_size=8)
     digest.update(np.stack([u, v]).tobytes())
-    return ViewVisibility(
+    return SurfaceVisibility(
+        grid,
+        np.array([0, len(cells)], np.int64),
         cells.astype(np.int32),
         (counts / mask.size).astype(np.float32),
         (sums / np.maximum(length, 1e-12)).astype(np.float32),
-        float(mask.mean()),
-        int.from_bytes(digest.digest(), "little"),
+        np.array([mask.mean()], np.float32),
+        np.frombuffer(digest.digest(), "<u8"),
     )

@@ -75,7 +75,7 @@ class Worker(FileWorker):
         selected = next(event for event in events if isinstance(event, Selected))
         return Step1Result(
             key=task.fingerprint,
-            selected=selected.views,
+            selected=selected.selection.views,
             epochs=settings.select.step1.epochs,
             **training_cost(task.folder).model_dump(),
         )

@@ -9,8 +9,8 @@ from pathlib import Path
 from ...core.console import Console
 from ...core.settings import Settings
 from ...stages.trainer import torch_device
-from ...workers.answers import answers, warn_of_retries
-from ...workers.view_tasks import TasksFailed, worker_count
+from ...workers.processes import run_tasks
+from ...workers.view_tasks import TasksFailed, warn_of_retries, worker_count
 from .tasks import PoolTask
 
 
@@ -36,7 +36,7 @@ class WorkerPool:
         common = {"threads": self.threads, "device": self.device}
         failed: list[str] = []
         with self.console.bar(label, len(tasks), len(tasks) - len(due)) as bar:
-            for outcome in answers(
+            for outcome in run_tasks(
                 module,
                 common,
                 due,

@@ -18,12 +18,12 @@ from ...core.scene_files import split_views
 from ...core.workspace import Workspace
 from ...effects.plan import EffectPlan
 from ...effects.store import trace_config, variant_for
-from ...raytrace.tasks import BaseTask, TracerCommon, TraceTask
+from ...raytrace.tasks import BaseTask, BundleCommon, TraceTask
 from ...stages.base_images import BaseRenderer, bake_light, base_renderer
 from ...stages.raytrace import view_seed
 from ...stages.stage import Run
-from ...workers.answers import answers, warn_of_retries
-from ...workers.view_tasks import worker_count
+from ...workers.processes import run_tasks
+from ...workers.view_tasks import warn_of_retries, worker_count
 from ..cells.scenes import choose_by_pose
 from .pilot_worker import FramesTask, PilotCommon, TrainTask
 from .records import FOLDER, BasePart, FramePart, LightPart, LightPoint, Traced, TracePart, TrainingPart
@@ -62,7 +62,7 @@ class Piloting:
         warm = [self._task(self.train[0], f"warm{i}", 1) for i in range(workers)]
         tasks = [self._task(view, f"train-{view.name}", SPP) for view in self.train]
         tasks += [self._task(view, f"held-{view.name}", REFERENCE_SPP) for view in self.held_out]
-        common = TracerCommon(bundle=config["bundle"], variant=choice.variant, threads=1).model_dump(mode="json")
+        common = BundleCommon(bundle=config["bundle"], variant=choice.variant, threads=1).model_dump(mode="json")
         self._compile("dnrpipe.raytrace.tracer", common, warm[0], choice.environment)
         started = time.monotonic()
         answers = self._run(
@@ -181,7 +181,7 @@ class Piloting:
         """(task, result) of each. Raises UserError where one failed twice."""
         found = []
         with self.console.bar(label, len(tasks)) as bar:
-            for outcome in answers(
+            for outcome in run_tasks(
                 module,
                 common,
                 tasks,
