@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dnrpipe.cli import cli
-from dnrpipe.cli.failures import explain
+from dnrpipe.cli import cli, explain
 from dnrpipe.core.errors import UserError
 from dnrpipe.export import vendor
 from dnrpipe.export.browser import require_chromium
