@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,8 +35,6 @@ LOG_PAUSE = 0.5
 
 
 def _client(server: str | None, token_file: Path | None) -> Client:
-    import os
-
     from ..service.client import DEFAULT_SERVER, Client
     from ..service.config import read_token
 
@@ -133,7 +134,7 @@ def jobs(states: tuple[str, ...], limit: int, as_json: bool, **server: Any) -> N
       dnrpipe jobs --state queued --state running --json
     """
     with _client(**server) as client:
-        found = list(client.jobs(list(states), limit))  # type: ignore[arg-type]
+        found = list(islice(client.jobs(states), limit))  # type: ignore[arg-type]
     if as_json:
         click.echo(json.dumps([job.model_dump(mode="json") for job in found], indent=2))
         return
@@ -266,8 +267,6 @@ def _how(job: Job) -> str:
 
 def _plain(name: str) -> str:
     """A file's name as a name on the server."""
-    import re
-
     plain = re.sub(r"[^A-Za-z0-9_-]", "-", name).lstrip("-_")[:64]
     if not plain:
         raise UserError(f"{name!r}: no name for a workspace; give one with -w")

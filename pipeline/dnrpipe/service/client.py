@@ -10,12 +10,11 @@ with Client("http://127.0.0.1:8420") as client:
 from __future__ import annotations
 
 import functools
-import itertools
 import json
 import secrets
 import ssl
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -24,17 +23,7 @@ from pydantic import TypeAdapter
 
 from ..core.errors import UserError
 from ..stages.records import PreviewState
-from .models import (
-    Job,
-    JobEvent,
-    JobPage,
-    JobRequest,
-    LogPage,
-    Scene,
-    State,
-    WorkspaceDetail,
-    WorkspaceSummary,
-)
+from .models import Job, JobEvent, JobPage, JobRequest, LogPage, Scene, State, WorkspaceDetail, WorkspaceSummary
 
 DEFAULT_SERVER = "http://127.0.0.1:8420"
 RETRY_SECONDS = 4.0
@@ -92,11 +81,8 @@ class Client:
     def job(self, job: int) -> Job:
         return self._ask("GET", f"/jobs/{job}", Job)
 
-    def jobs(self, states: list[State] | None = None, limit: int | None = None) -> Iterator[Job]:
-        """Jobs, newest first; all of them, or ``limit``."""
-        return itertools.islice(self._all_jobs(states or []), limit)
-
-    def _all_jobs(self, states: list[State]) -> Iterator[Job]:
+    def jobs(self, states: Sequence[State] = ()) -> Iterator[Job]:
+        """All jobs, newest first; asks for further ones as they are wanted."""
         parameters: dict[str, Any] = {"state": states, "limit": 500}
         while True:
             page = self._ask("GET", "/jobs", JobPage, params=parameters)

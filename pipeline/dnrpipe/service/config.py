@@ -7,7 +7,7 @@ import re
 import stat
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from ..core.errors import UserError
 from .models import Limits
@@ -16,7 +16,7 @@ LOOPBACK = ("127.0.0.1", "::1", "localhost")
 TOKEN_PATTERN = r"[A-Za-z0-9_-]{16,256}"
 
 
-class ServerConfig(BaseModel):
+class ServerConfig(BaseModel, extra="forbid", frozen=True):
     """Limits and devices of a server; its worker processes get it as JSON.
 
     devices: one worker each, "cpu" or "cuda:<n>". rate, burst: requests per second and at once, per client address.
@@ -24,8 +24,6 @@ class ServerConfig(BaseModel):
     long without a viewer a frame process ends. keep_days, keep_jobs: the server deletes logs and events of jobs that
     ended longer ago, or before so many others. limits: upper bounds for every job.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     root: Path
     host: str = "127.0.0.1"

@@ -22,7 +22,7 @@ from typing import Any
 from ..core.errors import UserError
 from .config import ServerConfig
 from .models import FINAL, STATES, Job, JobEvent, JobRequest, State
-from .root import ServiceRoot
+from .root import ServiceRoot, UnknownName
 
 SCHEMA = 1
 DAY = 86_400.0
@@ -114,10 +114,12 @@ class Queue:
             _note_state(db, row["id"], "queued")
             return _job(row)
 
-    def get(self, job: int) -> Job | None:
-        """The job, or None."""
+    def get(self, job: int) -> Job:
+        """The job. Raises UnknownName."""
         row = self._db().execute(f"SELECT {_COLUMNS} FROM jobs WHERE id = ?", (job,)).fetchone()
-        return None if row is None else _job(row)
+        if row is None:
+            raise UnknownName(f"there is no job {job}")
+        return _job(row)
 
     def page(
         self, *, states: Sequence[State] = (), workspace: str | None = None, before: int | None = None, limit: int = 100
@@ -201,9 +203,9 @@ class Queue:
             return [row["id"] for row in rows]
 
     def cancel(self, job: int) -> Job:
-        """Cancel a queued job at once, a running one when its worker sees the request. Raises WrongState."""
+        """Cancel a queued job at once, a running one when its worker sees it. Raises UnknownName, WrongState."""
         with self._writing() as db:
-            state = db.execute("SELECT state FROM jobs WHERE id = ?", (job,)).fetchone()["state"]
+            state = self.get(job).state
             if state in FINAL:
                 raise WrongState(f"job {job} is {state}; only queued and running jobs can be cancelled")
             if state == "queued":
@@ -214,26 +216,21 @@ class Queue:
                 _note_state(db, job, "cancelled")
             else:
                 db.execute("UPDATE jobs SET cancel_requested = 1 WHERE id = ?", (job,))
-            return _job(db.execute(f"SELECT {_COLUMNS} FROM jobs WHERE id = ?", (job,)).fetchone())
+            return self.get(job)
 
     def retry(self, job: int) -> Job:
-        """Queue a failed or cancelled job again; it resumes from what it made. Raises WrongState."""
+        """Queue a failed or cancelled job again; it resumes from what it made. Raises UnknownName, WrongState."""
         with self._writing() as db:
-            state = db.execute("SELECT state FROM jobs WHERE id = ?", (job,)).fetchone()["state"]
+            state = self.get(job).state
             if state not in ("failed", "cancelled"):
                 raise WrongState(f"job {job} is {state}; only failed and cancelled jobs can be retried")
-            row = db.execute(
+            db.execute(
                 "UPDATE jobs SET state = 'queued', cancel_requested = 0, starts = 0, crashes = 0, started = NULL,"
-                f" finished = NULL, exit_code = NULL, error = NULL WHERE id = ? RETURNING {_COLUMNS}",
+                " finished = NULL, exit_code = NULL, error = NULL WHERE id = ?",
                 (job,),
-            ).fetchone()
+            )
             _note_state(db, job, "queued", "retried")
-            return _job(row)
-
-    def cancel_requested(self, job: int) -> bool:
-        """Whether somebody requested that the job be cancelled."""
-        row = self._db().execute("SELECT cancel_requested FROM jobs WHERE id = ?", (job,)).fetchone()
-        return bool(row and row[0])
+            return self.get(job)
 
     def add_events(self, job: int, events: Sequence[dict[str, Any]]) -> None:
         """Store lines of the event stream; the job keeps the last progress, too."""
@@ -255,9 +252,7 @@ class Queue:
             "SELECT id, job, time, kind, data FROM events WHERE job = ? AND id > ? ORDER BY id LIMIT ?",
             (job, after, limit),
         )
-        return [
-            JobEvent(id=r["id"], job=r["job"], time=r["time"], kind=r["kind"], data=json.loads(r["data"])) for r in rows
-        ]
+        return [JobEvent(**dict(row) | {"data": json.loads(row["data"])}) for row in rows]
 
     def prune(self, root: ServiceRoot, config: ServerConfig, now: float | None = None) -> list[int]:
         """Delete logs and events of jobs that ended more than `config.keep_days` or `config.keep_jobs` jobs ago.
@@ -335,8 +330,4 @@ def _note_state(db: sqlite3.Connection, job: int, state: str, why: str | None = 
 
 
 def _job(row: sqlite3.Row) -> Job:
-    facts = dict(row)
-    facts["request"] = JobRequest.model_validate_json(facts["request"])
-    facts["cancel_requested"] = bool(facts["cancel_requested"])
-    facts["progress"] = json.loads(facts["progress"]) if facts["progress"] else None
-    return Job(**facts)
+    return Job(**dict(row) | {key: json.loads(row[key] or "null") for key in ("request", "progress")})

@@ -81,20 +81,18 @@ def list_jobs(
 @router.get("/jobs/{job}", responses=NOT_FOUND)
 def get_job(job: JobPath, service: Shared) -> Job:
     """One job."""
-    return known_job(service, job)
+    return service.queue.get(job)
 
 
 @router.post("/jobs/{job}/cancel", responses=NOT_FOUND | CONFLICT)
 def cancel(job: JobPath, service: Shared) -> Job:
     """Cancel a queued or running job. A running one stops within seconds; what it made is kept."""
-    known_job(service, job)
     return service.queue.cancel(job)
 
 
 @router.post("/jobs/{job}/retry", responses=NOT_FOUND | CONFLICT)
 def retry(job: JobPath, service: Shared) -> Job:
     """Queue a failed or cancelled job again. It goes on from its checkpoints."""
-    known_job(service, job)
     return service.queue.retry(job)
 
 
@@ -105,7 +103,7 @@ def logs(
     offset: Annotated[int, Query(ge=-(2**40), le=2**40, description="Bytes; negative: from the end")] = 0,
 ) -> LogPage:
     """What the job's process printed: at most 256 KiB from ``offset``."""
-    known_job(service, job)
+    service.queue.get(job)
     try:
         with service.root.log(job).open("rb") as file:
             size = file.seek(0, 2)
@@ -139,7 +137,7 @@ async def events(
 
     Last-Event-ID (which wins over `after`) resumes a broken stream: nothing is lost or sent twice.
     """
-    await run_in_threadpool(known_job, service, job)
+    await run_in_threadpool(service.queue.get, job)
     if last_event_id is not None and last_event_id.isascii() and last_event_id.isdigit():
         after = min(int(last_event_id), 2**53)
     stream = service.stream()
@@ -152,7 +150,7 @@ async def events(
             yield "retry: 2000\n\n"
             while True:
                 # The state first: the events read after it include all that came before it became final.
-                ended = (await run_in_threadpool(known_job, service, job)).state in FINAL
+                ended = (await run_in_threadpool(service.queue.get, job)).state in FINAL
                 found = await run_in_threadpool(service.queue.events, job, last)
                 for event in found:
                     last = event.id
@@ -170,14 +168,6 @@ async def events(
             stream.__exit__(None, None, None)
 
     return StreamingResponse(lines(), media_type="text/event-stream")
-
-
-def known_job(service: Service, job: int) -> Job:
-    """Raises HTTPException 404."""
-    found = service.queue.get(job)
-    if found is None:
-        raise HTTPException(404, f"there is no job {job}")
-    return found
 
 
 def check_request(request: JobRequest, service: Service) -> None:

@@ -54,7 +54,7 @@ def metrics(service: Shared) -> PlainTextResponse:
     alive = service.supervisor.alive()
     gauge("worker_up", "1 where the device's worker lives.", {f'{{device="{d}"}}': int(u) for d, u in alive.items()})
     gauge("streams", "Open event streams and viewers.", {"": service.streams})
-    gauge("viewers", "Workspaces viewed live.", {"": service.live.count()})
+    gauge("viewers", "Workspaces viewed live.", {"": len(service.live.sessions)})
     gauge("scenes_megabytes", "Size of the uploaded scenes, MiB.", {"": round(folder_mb(service.root.scenes), 3)})
     return PlainTextResponse("\n".join(lines) + "\n", media_type="text/plain; version=0.0.4")
 

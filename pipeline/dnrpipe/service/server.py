@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 import uvicorn
-from filelock import AcquireReturnProxy, FileLock, Timeout
+from filelock import FileLock, Timeout
 
 from ..core.errors import UserError
 from .app import create_app
@@ -41,7 +41,11 @@ def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], Non
     root = ServiceRoot(config.root).create()
     config = config.model_copy(update={"root": root.folder})
     _log_as_json()
-    with _exclusive(root):
+    try:
+        lock = FileLock(root.private / "lock", timeout=10).acquire()  # a killed server may take a moment to end
+    except Timeout:
+        raise UserError(f"{root.folder}: another server works here; stop it or choose another --root") from None
+    with lock:
         queue = Queue(root.queue)
         queue.recover()
         supervisor = Supervisor(config, queue, root.private / "workers.log")
@@ -85,13 +89,6 @@ class _Server(uvicorn.Server):
         await super().startup(sockets)
         if self.started:
             self.ready()
-
-
-def _exclusive(root: ServiceRoot) -> AcquireReturnProxy:
-    try:
-        return FileLock(root.private / "lock", timeout=10).acquire()  # a killed server may take a moment to end
-    except Timeout:
-        raise UserError(f"{root.folder}: another server works here; stop it or choose another --root") from None
 
 
 class _JsonLines(logging.Formatter):

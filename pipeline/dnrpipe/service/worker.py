@@ -99,7 +99,7 @@ class Worker:
         while process.poll() is None:
             self.queue.add_events(job.id, events.read())
             now = time.monotonic()
-            if self.queue.cancel_requested(job.id):
+            if self.queue.get(job.id).cancel_requested:
                 ended = "cancelled"
             elif self.stopping:
                 ended = "stopping"
@@ -212,7 +212,7 @@ def folder_mb(folder: Path) -> float:
     return total / 2**20
 
 
-def end_group(process: subprocess.Popen[bytes], *, grace: float = GRACE) -> None:
+def end_group(process: subprocess.Popen[Any], *, grace: float = GRACE) -> None:
     """SIGTERM to the leader, which stops its workers itself; SIGKILL to the whole group after ``grace`` seconds."""
     if process.poll() is None:
         process.send_signal(signal.SIGTERM)
