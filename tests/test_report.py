@@ -298,8 +298,9 @@ def test_large_pictures_are_reduced_and_grey_error_maps_coloured(tmp_path: Path)
 
 
 def test_thumbnails_go_through_the_display_transform(workspace: Path) -> None:
-    from dnrpipe.report.pictures import ExrPictures
+    from dnrpipe.report.pictures import load_exr
     from dnrtrain.contract import SceneFrame
+    from dnrtrain.display import DisplayTransform
 
     frame = SceneFrame.model_validate_json((workspace / "scene" / "frame.json").read_text())
 
@@ -307,8 +308,8 @@ def test_thumbnails_go_through_the_display_transform(workspace: Path) -> None:
         import base64
         import io
 
-        exr = ExrPictures(workspace, frame.model_copy(update={"exposure": exposure}))
-        picture = exr.load("raytraced/train/0004.exr")
+        display = DisplayTransform(frame.model_copy(update={"exposure": exposure}), workspace / "scene")
+        picture = load_exr(workspace, "raytraced/train/0004.exr", display)
         assert picture is not None
         image = np.asarray(Image.open(io.BytesIO(base64.b64decode(picture.uri.split(",")[1]))).convert("RGB"))
         assert (image[0, 0] == 255).all()  # background: white

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from ..core.ledger import CostSummary
 from ..stages.records import ViewMetrics
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+class _Frozen(BaseModel, extra="forbid", frozen=True):
+    pass
 
 
 class Picture(_Frozen):
@@ -108,9 +108,9 @@ class ChosenView(_Frozen):
 
     order: int
     name: str
-    seconds: float | None
-    spp: int | None
-    noise: float | None
+    seconds: float | None = None
+    spp: int | None = None
+    noise: float | None = None
     raster: Picture | None
     traced: Picture | None
     why: str | None
@@ -206,10 +206,8 @@ class Budget(_Frozen):
     pictures: list[tuple[str, str]] = Field(repr=False)
 
 
-class ReportData(BaseModel):
+class ReportData(_Frozen):
     """Everything on the page."""
-
-    model_config = ConfigDict(extra="forbid")
 
     title: str
     workspace: str

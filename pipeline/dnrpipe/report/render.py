@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from ..core.units import count, duration, several
 from . import charts
-from .data import MetricRow, Quality, ReportData, Selection, Training
+from .data import Quality, ReportData, Selection, Training
 from .quality import METRICS
 from .sphere import AZIMUTH, ELEVATION, sphere_svg
 
@@ -53,7 +53,7 @@ def render_html(data: ReportData) -> str:
         script=Markup(script),
         script_hash=script_hash,
         eye=f"{AZIMUTH:.6f} {ELEVATION:.6f}",
-        rows=_headline_rows(quality),
+        rows=dict.fromkeys(metric[0] for metric in METRICS) | {r.key: r for r in (quality.rows if quality else ())},
         featured=_featured(quality) if quality else [],
         median=next(v for v in quality.views if v.name == quality.median_view) if quality else None,
         projections=[(n, sphere_svg(data.sphere, n)) for n in ("top", "front", "oblique")] if data.sphere else [],
@@ -63,11 +63,6 @@ def render_html(data: ReportData) -> str:
         tracing_chart=_tracing_chart(data),
         views_chart=_views_chart(selection) if selection else "",
     )
-
-
-def _headline_rows(quality: Quality | None) -> dict[str, MetricRow | None]:
-    rows: dict[str, MetricRow | None] = dict.fromkeys(metric[0] for metric in METRICS)
-    return rows | {row.key: row for row in quality.rows} if quality else rows
 
 
 def _featured(quality: Quality) -> list[tuple[str, int]]:

@@ -96,7 +96,7 @@ def get_workspace(name: NamePath, service: Shared) -> WorkspaceDetail:
         sphere=str(sphere_svg(sphere, "oblique")) if sphere else None,
         eye=(AZIMUTH, ELEVATION),
         training=[Curve(title=t.title, losses=t.losses, psnr=t.psnr) for t in known.training],
-        tests=[TestPicture(view=view, psnr=psnr) for view, psnr in known.psnr.items()],
+        tests=[TestPicture(view=v.name, psnr=v.psnr) for v in (known.metrics.views if known.metrics else ())],
         costs=CostState(
             spent={stage: part.wall_seconds for stage, part in known.costs.by_stage.items()},
             total=known.costs.total.wall_seconds,
