@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
+import torch.nn.functional as F
 
 from ..core.console import Console
 from ..core.errors import UserError
@@ -82,9 +84,6 @@ def read_baked_light(workspace: Workspace) -> np.ndarray:
 
 def _enlarged(image: np.ndarray, size: int) -> np.ndarray:
     """[n, n, 3] at size², bilinear, texel centres at half integers."""
-    import torch
-    import torch.nn.functional as F
-
     tensor = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None]
     grown = F.interpolate(tensor, (size, size), mode="bilinear", align_corners=False)
     return grown[0].permute(1, 2, 0).numpy()

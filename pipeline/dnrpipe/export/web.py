@@ -16,12 +16,16 @@ import json
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 
+from dnrtrain import onnx_export
 from dnrtrain.atomic import atomic_path, write_json, write_text
 from dnrtrain.contract import View
+from dnrtrain.metrics import psnr
+from dnrtrain.model import DNR, compose, render_views
 from dnrtrain.records import read
 
 from .. import __version__
@@ -39,9 +43,6 @@ from .surface import SurfaceMaps, read_baked_light, surface_maps
 from .vendor import FILES, runtime
 from .web_check import check_page
 from .web_model import train, web_views
-
-if TYPE_CHECKING:
-    from dnrtrain.model import DNR
 
 TRAINING = ".training"
 """Of the export's folder: the checkpoint, so that an interrupted export goes on where it stopped."""
@@ -67,8 +68,6 @@ def export_web(
         UserError: no baked light, no ray-traced views, no npm, or a folder that is not ours to write; with `check`
             also no Chromium.
     """
-    from dnrtrain import onnx_export
-
     settings = resolve_settings(workspace, {}, None)
     views = raytraced_views(workspace)
     read_baked_light(workspace)
@@ -114,11 +113,6 @@ def export_web(
 
 def held_out(workspace: Workspace, model: DNR, views: Sequence[View], maps: SurfaceMaps) -> dict[str, Any]:
     """Mean PSNR of the page's network and of its base image on the held-out views, over white, dB; by torch."""
-    import torch
-
-    from dnrtrain.metrics import psnr
-    from dnrtrain.model import compose, render_views
-
     data = web_views(workspace, views, "test", maps)
     tensors = data.tensors
     assert tensors.target is not None and tensors.base is not None and tensors.display is not None

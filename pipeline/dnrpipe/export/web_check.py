@@ -5,21 +5,23 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from dnrtrain.contract import View
+from dnrtrain.dataset import Batch, ViewSet
+from dnrtrain.metrics import psnr
+from dnrtrain.model import DNR, render_views
 
 from ..core.console import Console
 from .browser import open_page, wait_for
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page
-
-    from dnrtrain.dataset import ViewSet
-    from dnrtrain.model import DNR
 
 CHANNELS = {"uv": 2, "mask": 1, "coverage": 1, "view_dir": 3, "normal": 3, "base": 4, "rgb": 3}
 
@@ -42,11 +44,6 @@ def check_page(out: Path, views: Sequence[View], data: ViewSet, model: DNR, cons
     Raises:
         UserError: no Chromium, or the page failed in it.
     """
-    import torch
-
-    from dnrtrain.metrics import psnr
-    from dnrtrain.model import render_views
-
     assert data.tensors.target is not None
     expected = render_views(model, data)
     rows: list[dict[str, float]] = []
@@ -82,12 +79,8 @@ def probe(page: Page, view: View) -> dict[str, np.ndarray]:
     }
 
 
-def page_batch(batch: Any, drawn: dict[str, np.ndarray]) -> Any:
+def page_batch(batch: Batch, drawn: dict[str, np.ndarray]) -> Batch:
     """`batch` (one view) with the page's inputs instead of those from files."""
-    from dataclasses import replace
-
-    import torch
-
     maps = {name: torch.from_numpy(image)[None] for name, image in drawn.items()}
     mask = (maps["mask"] > 0.5).float()
     return replace(

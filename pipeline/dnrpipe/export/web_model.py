@@ -10,13 +10,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
 
+from dnrtrain.checkpoint import load_model
 from dnrtrain.contract import View
+from dnrtrain.dataset import Batch, ViewSet
+from dnrtrain.display import DisplayTransform
 from dnrtrain.events import EpochEnd, Note
+from dnrtrain.model import DNR
 from dnrtrain.settings import ModelSettings, Step2Settings
+from dnrtrain.step2 import run_step2
 
 from ..core.console import Console
 from ..core.scene_files import read_frame
@@ -24,11 +31,6 @@ from ..core.settings import PRESETS, Settings
 from ..core.workspace import Workspace, digest
 from ..stages.trainer import epochs_done, load, perceptual_weights, torch_device
 from .surface import SurfaceMaps
-
-if TYPE_CHECKING:
-    from dnrtrain.dataset import Batch, ViewSet
-    from dnrtrain.model import DNR
-
 
 STEPS = 1500
 """Training takes at least so many, whatever the number of views."""
@@ -46,20 +48,16 @@ def web_settings(settings: Settings, views: int, epochs: int | None) -> tuple[Mo
 
 def web_views(workspace: Workspace, views: Sequence[View], split: str, maps: SurfaceMaps) -> ViewSet:
     """The views with the base image that the page would draw, and ray-traced targets."""
-    from dnrtrain.display import DisplayTransform
-
     loaded = load(workspace, list(views), split, raytraced=True)
     base = base_images(loaded.tensors, maps)
     display = DisplayTransform(read_frame(workspace), workspace.scene)
     return replace(loaded, tensors=replace(loaded.tensors, base=base, display=display))
 
 
-def base_images(views: Batch, maps: SurfaceMaps) -> Any:
+def base_images(views: Batch, maps: SurfaceMaps) -> Tensor:
     """[N, 3, H, W] linear: bilinear look-ups of the side that is seen, as the page's shader makes them."""
-    import torch
-    import torch.nn.functional as F
 
-    def sampled(image: np.ndarray, mode: str) -> Any:
+    def sampled(image: np.ndarray, mode: str) -> Tensor:
         texels = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None]
         grid = views.uv.permute(0, 2, 3, 1)
         parts = [F.grid_sample(texels, g[None], mode, padding_mode="border", align_corners=False) for g in grid]
@@ -88,9 +86,6 @@ def train(
     epochs: int | None,
 ) -> DNR:
     """Train the page's network in `folder`, or resume an interrupted training; float32 for inference."""
-    from dnrtrain.checkpoint import load_model
-    from dnrtrain.step2 import run_step2
-
     model, step2 = web_settings(settings, len(views), epochs)
     data = web_views(workspace, views, "train", maps)
     weights = perceptual_weights(console)

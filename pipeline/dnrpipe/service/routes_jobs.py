@@ -11,6 +11,7 @@ from fastapi import APIRouter, Header, HTTPException, Path, Query
 from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
+from ..core.cameras import KEYWORDS
 from ..core.settings import merge, parse_assignment, resolve
 from .models import FINAL, TAKES_SCENE, Job, JobPage, JobRequest, LogPage, Name, Problem, State
 from .state import Shared
@@ -189,7 +190,5 @@ def check_request(request: JobRequest, service: Service) -> None:
         text = value if isinstance(value, str) else json.dumps(value)
         overrides = merge(overrides, parse_assignment(f"{key}={text}"))
     settings = resolve(request.preset, overrides, environment={})
-    from ..core.cameras import KEYWORDS
-
     if settings.cameras.source not in KEYWORDS:
         raise HTTPException(422, f"settings: cameras.source must be one of {', '.join(KEYWORDS)} on a server")
