@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import AsyncIterator
 from typing import Annotated, Any
 
@@ -21,24 +20,26 @@ KEEP_ALIVE = 15.0
 LOG_CHUNK = 256 * 1024
 SERVER_SETTINGS = ("device", "strict")
 """Settings that the server decides."""
-REFUSED: dict[int | str, dict[str, Any]] = {
-    code: {"model": Problem, "description": text}
-    for code, text in (
-        (400, "The request is not what HTTP wants"),
-        (401, "Wrong or missing token"),
-        (403, "A page of another origin"),
-        (413, "Too large"),
-        (421, "Not a name of this server"),
-        (422, "Not a valid request"),
-        (429, "Too many requests, or too many jobs"),
-    )
+STATUSES = {
+    400: "The request is not what HTTP wants",
+    401: "Wrong or missing token",
+    403: "A page of another origin",
+    404: "No such thing",
+    409: "The job's state forbids it",
+    413: "Too large",
+    421: "Not a name of this server",
+    422: "Not a valid request",
+    429: "Too many requests, or too many jobs",
+    503: "Too many streams",
+    507: "No space left",
 }
-NOT_FOUND: dict[int | str, dict[str, Any]] = {404: {"model": Problem, "description": "No such thing"}}
-CONFLICT: dict[int | str, dict[str, Any]] = {409: {"model": Problem, "description": "The job's state forbids it"}}
-FULL: dict[int | str, dict[str, Any]] = {
-    503: {"model": Problem, "description": "Too many streams"},
-    507: {"model": Problem, "description": "No space left"},
-}
+
+
+def refusals(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """These answers in the description of a route."""
+    return {status: {"model": Problem, "description": STATUSES[status]} for status in statuses}
+
+
 EVENT: dict[str, Any] = {
     "type": "object",
     "properties": {name: {"type": "string"} for name in ("id", "event", "data")} | {"retry": {"type": "integer"}},
@@ -46,10 +47,13 @@ EVENT: dict[str, Any] = {
 """One server-sent event, as its fields are parsed."""
 JobPath = Annotated[int, Path(ge=1, le=2**53, description="The job's number")]
 
+REFUSED = refusals(400, 401, 403, 413, 421, 422, 429)
+"""What every route may answer."""
+
 router = APIRouter(tags=["jobs"], responses=REFUSED)
 
 
-@router.post("/jobs", status_code=201, responses=NOT_FOUND | FULL)
+@router.post("/jobs", status_code=201, responses=refusals(404, 503, 507))
 def submit(
     request: JobRequest,
     service: Shared,
@@ -60,8 +64,7 @@ def submit(
     A request that repeats an Idempotency-Key gets the job that the first one made.
     """
     check_request(request, service)
-    if shutil.disk_usage(service.root.folder).free < service.config.free_disk_mb * 2**20:
-        raise HTTPException(507, f"less than {service.config.free_disk_mb} MiB of disk are free; make space")
+    service.require_space(service.root.folder)
     return service.queue.submit(request, most_queued=service.config.most_queued, token=idempotency_key)
 
 
@@ -79,25 +82,25 @@ def list_jobs(
     return JobPage(jobs=jobs[:limit], next=jobs[limit - 1].id if more else None)
 
 
-@router.get("/jobs/{job}", responses=NOT_FOUND)
+@router.get("/jobs/{job}", responses=refusals(404))
 def get_job(job: JobPath, service: Shared) -> Job:
     """One job."""
     return service.queue.get(job)
 
 
-@router.post("/jobs/{job}/cancel", responses=NOT_FOUND | CONFLICT)
+@router.post("/jobs/{job}/cancel", responses=refusals(404, 409))
 def cancel(job: JobPath, service: Shared) -> Job:
     """Cancel a queued or running job. A running one stops within seconds; what it made is kept."""
     return service.queue.cancel(job)
 
 
-@router.post("/jobs/{job}/retry", responses=NOT_FOUND | CONFLICT)
+@router.post("/jobs/{job}/retry", responses=refusals(404, 409))
 def retry(job: JobPath, service: Shared) -> Job:
     """Queue a failed or cancelled job again. It goes on from its checkpoints."""
     return service.queue.retry(job)
 
 
-@router.get("/jobs/{job}/logs", responses=NOT_FOUND)
+@router.get("/jobs/{job}/logs", responses=refusals(404))
 def logs(
     job: JobPath,
     service: Shared,
@@ -119,14 +122,14 @@ def logs(
 @router.get(
     "/jobs/{job}/events",
     response_class=StreamingResponse,
-    responses=NOT_FOUND
+    responses=refusals(404)
     | {
         200: {
             "content": {"text/event-stream": {"schema": EVENT}},
             "description": "Server-sent events: id, event (its kind), data (JSON). Ends when the job has.",
-        },
-        503: FULL[503],
-    },
+        }
+    }
+    | refusals(503),
 )
 async def events(
     job: JobPath,

@@ -10,7 +10,7 @@ from fastapi.responses import FileResponse, PlainTextResponse
 
 from .. import __version__
 from .models import Health
-from .routes_jobs import NOT_FOUND, REFUSED
+from .routes_jobs import REFUSED, refusals
 from .state import Shared
 from .worker import folder_mb
 
@@ -69,7 +69,7 @@ def icon() -> FileResponse:
     return FileResponse(STATIC / "icon.svg", media_type="image/svg+xml")
 
 
-@router.get("/static/{file}", include_in_schema=False, responses=NOT_FOUND)
+@router.get("/static/{file}", include_in_schema=False, responses=refusals(404))
 def static(file: str) -> FileResponse:
     """One of the named files; there is no listing."""
     if file not in PAGES:
