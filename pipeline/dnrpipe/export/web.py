@@ -47,8 +47,7 @@ from .gltf import glb
 from .meshes import read_meshes
 from .nerf import raytraced_views
 from .surface import SurfaceMaps, read_baked_light, surface_maps
-from .web_check import check_page
-from .web_model import train, web_views
+from .web_model import check_page, train, web_views
 
 TRAINING = ".training"
 """Of the export's folder: the checkpoint, so that an interrupted export goes on where it stopped."""
@@ -68,19 +67,11 @@ def export_web(
 ) -> dict[str, Any]:
     """Train the page's network, write the folder, and measure the network on the held-out views (by torch).
 
-    Args:
-        workspace: with baked light and ray-traced views.
-        out: the folder, new or an earlier export of the same kind.
-        console: for progress.
-        epochs: of training; None: 40, more for few views.
-        check: also open the page in a browser (`web_check`).
+    out: new, or an earlier export of the same kind. epochs: of training; None: 40, more for few views. check: also
+    open the page in a browser. Returns folder, bytes, the figures of `held_out`, with `check` those of `check_page`.
 
-    Returns:
-        folder, bytes, the figures of `held_out`, and with `check` those of `check_page`.
-
-    Raises:
-        UserError: no baked light, no ray-traced views, no npm, or a folder that is not ours to write; with `check`
-            also no Chromium.
+    Raises UserError: no baked light, no ray-traced views, no npm, or a folder that is not ours to write; with `check`
+    also no Chromium.
     """
     settings = resolve_settings(workspace, {}, None)
     views = raytraced_views(workspace)

@@ -1,4 +1,4 @@
-"""The network of the page: the default one, over a base image that a browser can draw.
+"""The network of the page: the default one, over a base image that a browser can draw. Trained, and checked there.
 
 A browser has no ray tracer, so its base image is the diffuse outgoing light of the surfaces (`surface`), looked up once
 a pixel; the network learns mirrors, glass and highlights. The workspace's own network corrects a richer base image and
@@ -7,9 +7,12 @@ would be wrong over this one, so the export trains another on the same ray-trace
 
 from __future__ import annotations
 
+import base64
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -21,7 +24,8 @@ from dnrtrain.contract import View
 from dnrtrain.dataset import Batch, ViewSet
 from dnrtrain.display import DisplayTransform
 from dnrtrain.events import EpochEnd, Note
-from dnrtrain.model import DNR
+from dnrtrain.metrics import psnr
+from dnrtrain.model import DNR, render_views
 from dnrtrain.settings import ModelSettings, Step2Settings
 from dnrtrain.step2 import run_step2
 
@@ -30,10 +34,16 @@ from ..core.scene_files import read_frame
 from ..core.settings import PRESETS, Settings
 from ..core.workspace import Workspace, digest
 from ..stages.trainer import epochs_done, load, perceptual_weights, torch_device
+from .browser import open_page, wait_for
 from .surface import SurfaceMaps
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
 
 STEPS = 1500
 """Training takes at least so many, whatever the number of views."""
+CHANNELS = {"uv": 2, "mask": 1, "coverage": 1, "view_dir": 3, "normal": 3, "base": 4, "rgb": 3}
+"""What the page draws and renders of a view, and how many channels each has."""
 
 
 def web_settings(settings: Settings, views: int, epochs: int | None) -> tuple[ModelSettings, Step2Settings]:
@@ -105,3 +115,61 @@ def train(
     found = load_model(folder)
     found.use_bfloat16 = False
     return found
+
+
+def check_page(out: Path, views: Sequence[View], data: ViewSet, model: DNR, console: Console) -> dict[str, Any]:
+    """Open ``out/index.html`` from disk in a headless Chromium (software GL) and render the views.
+
+    data: the same views by their files (`web_views`), with ray-traced targets. Returns means over the views, dB:
+    `psnr_torch`, the page's picture against torch on the inputs that the page drew; `psnr_files`, against torch on
+    Blender's G-buffers; `psnr_truth`, against the ray-traced view; also `mask_agrees`, the share of pixels whose mask
+    agrees with Blender's, and milliseconds by stage. Raises UserError: no Chromium, or the page failed in it.
+    """
+    assert data.tensors.target is not None
+    expected = render_views(model, data)
+    rows: list[dict[str, float]] = []
+    address = (out.resolve() / "index.html").as_uri()
+    with open_page(address) as (page, _), console.bar("views in Chromium", len(views)) as bar:
+        wait_for(page, "window.dnr.then(() => true)")
+        for index, view in enumerate(views):
+            drawn = probe(page, view)
+            batch = page_batch(data.batch([index]), drawn)
+            with torch.no_grad():
+                same = model(batch).rgb.clamp(0.0, 1.0)
+            shown = torch.from_numpy(drawn["rgb"])[None]
+            rows.append(
+                {
+                    "psnr_torch": float(psnr(shown, same)),
+                    "psnr_files": float(psnr(shown, expected[index : index + 1])),
+                    "psnr_truth": float(psnr(shown, data.tensors.target[index : index + 1])),
+                    "mask_agrees": float((batch.mask == data.tensors.mask[index : index + 1]).float().mean()),
+                }
+            )
+            bar.advance(note=f"{rows[-1]['psnr_torch']:.1f} dB")
+        figures = wait_for(page, "window.dnr.then(page => page.figures())")
+    means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+    return {**means, "views": len(rows), **{k: v for k, v in figures.items() if k not in ("fps", "frames")}}
+
+
+def probe(page: Page, view: View) -> dict[str, np.ndarray]:
+    """What the page draws and renders of a view: its inputs and `rgb`, float32 [C, H, W] each."""
+    answer = wait_for(page, f"window.dnr.then(page => page.probe({json.dumps(view.model_dump(mode='json'))}))")
+    return {
+        name: np.frombuffer(base64.b64decode(answer[name]), "<f4").reshape(count, view.height, view.width).copy()
+        for name, count in CHANNELS.items()
+    }
+
+
+def page_batch(batch: Batch, drawn: dict[str, np.ndarray]) -> Batch:
+    """`batch` (one view) with the page's inputs instead of those from files."""
+    maps = {name: torch.from_numpy(image)[None] for name, image in drawn.items()}
+    mask = (maps["mask"] > 0.5).float()
+    return replace(
+        batch,
+        uv=(2.0 * maps["uv"] - 1.0) * mask,
+        mask=mask,
+        coverage=maps["coverage"],
+        view_dir=maps["view_dir"],
+        normal=maps["normal"] * mask,
+        base=maps["base"][:, :3] * mask,
+    )

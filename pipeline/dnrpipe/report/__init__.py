@@ -15,11 +15,7 @@ def build_report(workspace_dir: Path, *, made_at: datetime | None = None) -> Pat
     """Write `report/report.html` and `report/report.json` (the same figures, for machines).
 
     It shows the stages that have run, and names the commands for the rest. Returns the path of the HTML file.
-    made_at: the date shown, now (UTC) when None.
-
-    Raises:
-        UserError: not a workspace, or one of its files is damaged.
-        OSError: the report folder cannot be written.
+    made_at: the date shown, now (UTC) when None. Raises UserError: not a workspace, or one of its files is damaged.
     """
     from dnrtrain.atomic import write_json, write_text
 

@@ -86,8 +86,7 @@ def outline(root: Path) -> Outline:
 def collect(root: Path, *, made_at: datetime | None = None) -> ReportData:
     """Read a workspace. Parts whose stage has not run are None and listed in ``missing``.
 
-    Raises:
-        UserError: not a workspace, or one of its files is damaged; names the file and the remedy.
+    Raises UserError: not a workspace, or one of its files is damaged; names the file and the remedy.
     """
     root = Path(root).resolve()
     manifest = _read_json(root / "manifest.json", "prepare")

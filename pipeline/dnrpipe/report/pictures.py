@@ -27,9 +27,7 @@ def load_png(root: Path, file: str, *, side: int, heat: bool = False) -> Picture
     """An image file of the workspace, reduced to ``side`` pixels if larger; None when there is no such file.
 
     heat: colour a one-channel error map with matplotlib's magma (perceptually uniform, readable in grey).
-
-    Raises:
-        UserError: the file is damaged.
+    Raises UserError: the file is damaged.
     """
     path = root / file
     try:
@@ -63,8 +61,7 @@ def encode(image: Image.Image, file: str, side: int) -> Picture:
 def load_exr(root: Path, file: str, display: DisplayTransform) -> Picture | None:
     """R G B A of an EXR (linear, premultiplied) over white as a thumbnail; None when the file or its colour is missing.
 
-    Raises:
-        UserError: the file is damaged.
+    Raises UserError: the file is damaged.
     """
     import torch
 
