@@ -142,12 +142,8 @@ def explain(error: Exception) -> tuple[str, int] | None:
         for extra, modules in _EXTRAS.items():
             if module in modules:
                 return f"{module} is not installed; run `pip install 'dnrpipe[{extra}]'`", 2
-    if isinstance(error, OSError):
-        return _explain_os(error)
-    return None
-
-
-def _explain_os(error: OSError) -> tuple[str, int] | None:
+    if not isinstance(error, OSError):
+        return None
     where = error.filename or "the workspace"
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return f"{where}: the disk is full; free some space and run the same command to go on", 2

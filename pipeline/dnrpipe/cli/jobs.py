@@ -215,46 +215,31 @@ def _act(wish: Callable[[Client], Job], as_json: bool, **server: Any) -> None:
 
 def _follow(client: Client, job: Job, console: Console) -> Job:
     """Show a job's progress as a local run would, until it has ended; returns the job as it is then."""
-    shown = _Shown(console)
-    try:
-        for event in client.events(job.id):
-            data = event.data
-            if event.kind == "progress":
-                shown.progress(data)
-            elif event.kind == "message":
-                shown.close()
-                (console.warn if data["level"] == "warning" else console.say)(data["text"])
-            elif event.kind == "state" and "why" in data and data["state"] == "queued":
-                shown.close()
-                console.say(f"job {job.id}: queued again: {data['why']}")
-    except KeyboardInterrupt:
-        console.say(f"job {job.id} goes on; `dnrpipe logs {job.id} -f` shows it, `dnrpipe cancel {job.id}` ends it")
-        raise
-    finally:
-        shown.close()
+    bar: Bar | None = None
+    with ExitStack() as bars:  # one at a time
+        try:
+            for event in client.events(job.id):
+                data = event.data
+                if event.kind == "progress":
+                    if bar is None or bar.label != data["label"]:
+                        bars.close()
+                        bar = bars.enter_context(console.bar(data["label"], data["total"], data["done"]))
+                    bar.advance(max(0, data["done"] - bar.done), data["note"])
+                elif event.kind == "message":
+                    bars.close()
+                    bar = None
+                    (console.warn if data["level"] == "warning" else console.say)(data["text"])
+                elif event.kind == "state" and "why" in data and data["state"] == "queued":
+                    bars.close()
+                    bar = None
+                    console.say(f"job {job.id}: queued again: {data['why']}")
+        except KeyboardInterrupt:
+            console.say(f"job {job.id} goes on; `dnrpipe logs {job.id} -f` shows it, `dnrpipe cancel {job.id}` ends it")
+            raise
     ended = client.job(job.id)
     if ended.state == "done":
         console.say(f"job {job.id}: done")
     return ended
-
-
-class _Shown:
-    """One progress bar at a time."""
-
-    def __init__(self, console: Console) -> None:
-        self.console = console
-        self.stack = ExitStack()
-        self.bar: Bar | None = None
-
-    def progress(self, data: dict[str, Any]) -> None:
-        if self.bar is None or self.bar.label != data["label"]:
-            self.close()
-            self.bar = self.stack.enter_context(self.console.bar(data["label"], data["total"], data["done"]))
-        self.bar.advance(max(0, data["done"] - self.bar.done), data["note"])
-
-    def close(self) -> None:
-        self.stack.close()
-        self.bar = None
 
 
 def _how(job: Job) -> str:

@@ -29,6 +29,8 @@ def load_png(root: Path, file: str, *, side: int, heat: bool = False) -> Picture
     heat: colour a one-channel error map with matplotlib's magma (perceptually uniform, readable in grey).
     Raises UserError: the file is damaged.
     """
+    from matplotlib import colormaps
+
     path = root / file
     try:
         with Image.open(path) as opened:
@@ -38,7 +40,9 @@ def load_png(root: Path, file: str, *, side: int, heat: bool = False) -> Picture
     except (OSError, UnidentifiedImageError) as error:
         raise UserError(f"{path}: damaged image ({error}); run `dnrpipe evaluate` again") from None
     if heat and image.mode in ("L", "I;16", "I", "F"):
-        image = _magma(image)
+        values = np.asarray(image, dtype=np.float32)
+        full = 255.0 if image.mode == "L" else 65535.0 if image.mode != "F" else 1.0
+        image = Image.fromarray(np.rint(colormaps["magma"](values / full)[..., :3] * 255).astype(np.uint8))
     return encode(image.convert("RGBA" if "A" in image.getbands() else "RGB"), file, side)
 
 
@@ -79,11 +83,3 @@ def load_exr(root: Path, file: str, display: DisplayTransform) -> Picture | None
     shown = display.over_white(linear, alpha)[0].clamp(0, 1)
     pixels = np.rint(shown.permute(1, 2, 0).numpy() * 255).astype(np.uint8)
     return encode(Image.fromarray(pixels), file, THUMBNAIL_SIDE)
-
-
-def _magma(image: Image.Image) -> Image.Image:
-    from matplotlib import colormaps
-
-    values = np.asarray(image, dtype=np.float32)
-    full = 255.0 if image.mode == "L" else 65535.0 if image.mode != "F" else 1.0
-    return Image.fromarray(np.rint(colormaps["magma"](values / full)[..., :3] * 255).astype(np.uint8))

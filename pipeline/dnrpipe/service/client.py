@@ -68,9 +68,6 @@ class Client:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
         self._http.close()
 
     def submit(self, request: JobRequest) -> Job:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import secrets
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, HTTPException, Path, Request, Response
@@ -183,7 +183,7 @@ async def upload(name: ScenePath, request: Request, service: Shared) -> Scene:
     checksum, size = hashlib.sha256(), 0
     try:
         with temporary.open("xb") as file:
-            async for chunk in _chunks(request):
+            async for chunk in request.stream():
                 size += len(chunk)
                 if size > limit:
                     raise HTTPException(413, f"the file is larger than {service.config.upload_mb} MiB")
@@ -194,6 +194,8 @@ async def upload(name: ScenePath, request: Request, service: Shared) -> Scene:
         if size == 0:
             raise HTTPException(422, "the body is empty; it must be the scene file")
         temporary.replace(target)
+    except ClientDisconnect:
+        raise HTTPException(400, "the connection ended before the file did") from None
     finally:
         temporary.unlink(missing_ok=True)
     return Scene(name=name, size=size, sha256=checksum.hexdigest())
@@ -212,14 +214,6 @@ def _check_space(service: State, name: str) -> None:
     if name not in stored and len(stored) >= service.config.most_scenes:
         raise HTTPException(409, f"there are {service.config.most_scenes} scenes already; remove some")
     service.require_space(service.root.scenes)
-
-
-async def _chunks(request: Request) -> AsyncIterator[bytes]:
-    try:
-        async for chunk in request.stream():
-            yield chunk
-    except ClientDisconnect:
-        raise HTTPException(400, "the connection ended before the file did") from None
 
 
 def plan_state(workspace: Workspace, settings: Settings, states: Mapping[str, str]) -> PlanState | None:

@@ -8,19 +8,17 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from fastapi import Depends, HTTPException
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import HTTPConnection
 
 from .config import ServerConfig
+from .live_pool import LivePool
 from .queue import Queue
 from .root import ServiceRoot
 from .supervisor import Supervisor
-
-if TYPE_CHECKING:
-    from .live_pool import LivePool
 
 POLL = 0.1
 
