@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..core.console import Console, clock
 from ..core.errors import UserError
 from .options import common, open_session
 
@@ -81,7 +82,6 @@ def status(workspace: str | None, as_json: bool) -> None:
       dnrpipe status
       dnrpipe status --json
     """
-    from ..core.console import clock
     from ..core.workspace import Workspace, find_workspace
     from ..stages.pipeline import status as status_of
     from ..stages.session import resolve_settings
@@ -116,7 +116,6 @@ def verify(workspace: str | None, named: str | None, repair: bool, as_json: bool
       dnrpipe verify scene.dnr --repair
       dnrpipe verify --json | jq .faults
     """
-    from ..core.console import Console
     from ..core.workspace import Workspace, find_workspace, locked
     from ..stages.verify import examine
     from ..stages.verify import repair as discard_damaged
@@ -186,8 +185,6 @@ def _costs_table(summary: CostSummary) -> str:
 
 
 def _sum_columns(part: CostSum) -> str:
-    from ..core.console import clock
-
     return f"{part.records:>6} {clock(part.wall_seconds):>8} {clock(part.cpu_seconds):>8}"
 
 

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..core.console import Bar, Console
 from ..core.errors import UserError
 from .options import options as with_options
 
 if TYPE_CHECKING:
-    from ..core.console import Bar, Console
     from ..service.client import Client
     from ..service.models import Job
 
@@ -84,7 +84,6 @@ def submit(
     """
     import pydantic
 
-    from ..core.console import Console
     from ..service.models import JobRequest, Limits, first_fault
 
     console = Console(json_mode=as_json)

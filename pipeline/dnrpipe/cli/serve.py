@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from ..core.console import Console
 from ..core.errors import UserError
 
 
@@ -49,7 +50,6 @@ def serve(
       dnrpipe serve --host 0.0.0.0 --token-file token.txt
       dnrpipe submit scene.blend             # in another terminal
     """
-    from ..core.console import Console
     from ..service.config import ServerConfig, default_devices, default_memory_mb, read_token
     from ..service.models import Limits
     from ..service.server import serve as run_server
@@ -97,7 +97,6 @@ def bench_live(workspace: str, server: str | None, size: int, seconds: float, as
       dnrpipe bench-live scene.dnr
       dnrpipe bench-live scene --server http://127.0.0.1:8420 --size 512
     """
-    from ..core.console import Console
     from ..service.live_bench import bench, lines
 
     console = Console(json_mode=as_json)

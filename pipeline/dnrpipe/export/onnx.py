@@ -14,9 +14,8 @@ import torch
 from dnrtrain import onnx_export
 from dnrtrain.atomic import atomic_path
 from dnrtrain.checkpoint import load_model
-from dnrtrain.contract import SceneFrame, View
+from dnrtrain.contract import View
 from dnrtrain.correction import to_log
-from dnrtrain.dataset import load_views
 from dnrtrain.exr import read_exr
 from dnrtrain.model import DNR
 
@@ -26,6 +25,7 @@ from ..core.errors import UserError
 from ..core.scene_files import read_frame, split_views
 from ..core.workspace import Workspace
 from ..stages.base_images import RENDERED, base_path
+from ..stages.trainer import load
 
 TOLERANCE = 1e-3
 """Largest difference from torch that passes: a quarter of an 8-bit step. Display space."""
@@ -50,7 +50,7 @@ def export_onnx(workspace: Workspace, out: Path, console: Console) -> dict[str, 
     with atomic_path(out) as temporary:
         onnx_export.export_onnx(temporary, model, frame, workspace.scene, extra)
         with console.bar("comparing with torch", len(views)) as bar:
-            found = [_compare(temporary, workspace, model, frame, view, split, bar) for view in views]
+            found = [_compare(temporary, workspace, model, view, split, bar) for view in views]
         worst = max(row["difference"] for row in found)
         if not worst <= TOLERANCE:
             raise UserError(
@@ -93,24 +93,13 @@ def _views(workspace: Workspace, base: str) -> tuple[str, list[View]]:
     raise UserError(f"{workspace.root}: no view has its files; run `dnrpipe evaluate` first")
 
 
-def _compare(
-    path: Path, workspace: Workspace, model: DNR, frame: SceneFrame, view: View, split: str, bar: Any
-) -> dict[str, Any]:
+def _compare(path: Path, workspace: Workspace, model: DNR, view: View, split: str, bar: Any) -> dict[str, Any]:
     """Largest differences of one view's picture from torch's, whole and cut to an odd size; median milliseconds."""
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     base = model.settings.base
-    batch = load_views(
-        [workspace.passes(split, view.name)],
-        None,
-        frame,
-        cameras=[view],
-        folder=workspace.scene,
-        target=False,
-        base=base,
-        base_files=[base_path(workspace, split, view.name)] if base in RENDERED else None,
-    ).batch([0])
+    batch = load(workspace, [view], split, base=base).batch([0])
     inputs = view_inputs(workspace, view, split, base, onnx_export.input_names(model.settings))
     height, width = (min(side, odd) for side, odd in zip((view.height, view.width), ODD, strict=True))
     differences, seconds = {}, []

@@ -31,6 +31,7 @@ from dnrpipe.raytrace.engine import Engine, masked, masked_channels
 from dnrpipe.raytrace.frames import Frames
 from dnrpipe.raytrace.light_worker import read_light
 from dnrpipe.stages.trainer import torch_device
+from dnrpipe.studies.frames.scene import shown
 from dnrtrain.checkpoint import load_model
 from dnrtrain.contract import RASTER_CHANNELS, SceneFrame, View, require_channels
 from dnrtrain.dataset import view_in_memory
@@ -168,8 +169,7 @@ class Worker:
 
     def _over_white(self, rgba: np.ndarray) -> np.ndarray:
         """Linear premultiplied RGBA [H, W, 4] -> display RGB over white, float32 [H, W, 3]."""
-        tensor = torch.from_numpy(np.ascontiguousarray(rgba, np.float32)).permute(2, 0, 1)[None]
-        return self.display.over_white(tensor[:, :3], tensor[:, 3:])[0].permute(1, 2, 0).numpy()
+        return shown(self.display, rgba)[0].permute(1, 2, 0).numpy()
 
 
 def encode(picture: np.ndarray, fine: bool) -> tuple[bytes, str]:
