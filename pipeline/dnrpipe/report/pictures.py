@@ -67,7 +67,7 @@ def load_exr(root: Path, file: str, display: DisplayTransform) -> Picture | None
 
     Raises UserError: the file is damaged.
     """
-    from ..studies.frames.scene import shown
+    import torch
 
     path = root / file
     if not path.is_file():
@@ -78,6 +78,7 @@ def load_exr(root: Path, file: str, display: DisplayTransform) -> Picture | None
         raise UserError(str(error)) from None
     if not set(RASTER_CHANNELS) <= set(channels):
         return None
-    rgb = shown(display, np.stack([channels[c] for c in RASTER_CHANNELS], axis=-1))[0].clamp(0, 1)
+    rgba = torch.from_numpy(np.stack([channels[c] for c in RASTER_CHANNELS]))[None]
+    rgb = display.over_white(rgba[:, :3], rgba[:, 3:])[0].clamp(0, 1)
     pixels = np.rint(rgb.permute(1, 2, 0).numpy() * 255).astype(np.uint8)
     return encode(Image.fromarray(pixels), file, THUMBNAIL_SIDE)
