@@ -25,7 +25,6 @@ from dnrpipe.report import build_report, charts
 from dnrpipe.report.collect import collect
 from dnrpipe.report.pictures import load_png
 from dnrpipe.report.render import render_html
-from dnrpipe.report.sphere import project
 
 WHEN = datetime(2026, 1, 2, 3, 4, tzinfo=UTC)
 
@@ -354,10 +353,10 @@ def test_charts_survive_degenerate_series() -> None:
 
 def test_projections_are_right_handed() -> None:
     for projection in ("top", "front", "oblique"):
-        axes = np.array([project(tuple(row), projection) for row in np.eye(3).tolist()])  # type: ignore[arg-type]
+        axes = np.array([charts.project(tuple(row), projection) for row in np.eye(3).tolist()])  # type: ignore[arg-type]
         assert np.allclose(axes @ axes.T, np.eye(3), atol=1e-9)
         assert np.linalg.det(axes) == pytest.approx(1.0)
-    assert project((0.0, -1.0, 0.0), "front")[2] == 1.0  # the front of a Blender scene looks along -Y
+    assert charts.project((0.0, -1.0, 0.0), "front")[2] == 1.0  # the front of a Blender scene looks along -Y
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from ..core.errors import UserError
 from .models import Limits
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
+"""Hosts that only this machine can reach."""
 TOKEN_PATTERN = r"[A-Za-z0-9_-]{16,256}"
 
 
@@ -42,11 +43,6 @@ class ServerConfig(BaseModel, extra="forbid", frozen=True):
     keep_jobs: int = Field(default=1000, ge=1)
     free_disk_mb: int = Field(default=1024, ge=0, description="the server refuses uploads and jobs below this")
     limits: Limits = Limits(seconds=24 * 3600.0, disk_mb=50 * 1024)
-
-    @property
-    def loopback(self) -> bool:
-        """Whether only this machine can reach the server."""
-        return self.host in LOOPBACK
 
 
 def default_devices() -> tuple[str, ...]:

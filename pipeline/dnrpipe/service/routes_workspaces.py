@@ -20,8 +20,8 @@ from ..core.errors import UserError
 from ..core.ledger import total
 from ..core.settings import Settings
 from ..core.workspace import Workspace
+from ..report.charts import AZIMUTH, ELEVATION, sphere_svg
 from ..report.collect import outline
-from ..report.sphere import AZIMUTH, ELEVATION, sphere_svg
 from ..stages.pipeline import status
 from ..stages.records import PREVIEW, PreviewState
 from ..stages.session import resolve_settings

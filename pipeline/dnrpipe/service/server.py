@@ -16,7 +16,7 @@ from filelock import FileLock, Timeout
 
 from ..core.errors import UserError
 from .app import create_app
-from .config import ServerConfig
+from .config import LOOPBACK, ServerConfig
 from .live_pool import LivePool
 from .queue import Queue
 from .root import ServiceRoot
@@ -31,7 +31,7 @@ def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], Non
 
     Raises UserError: a host that others can reach without a token, a root that another server holds, a port in use.
     """
-    if not config.loopback and token is None:
+    if config.host not in LOOPBACK and token is None:
         raise UserError(f"--host {config.host}: others can reach it, so a token is needed; give --token-file FILE")
     if not config.root.parent.is_dir():
         raise UserError(f"--root {config.root}: {config.root.parent} does not exist")
