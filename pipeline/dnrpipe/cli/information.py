@@ -6,16 +6,13 @@ import json
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from ..core.console import Console, clock
 from ..core.errors import UserError
 from .options import common, open_session
-
-if TYPE_CHECKING:
-    from ..core.ledger import CostSum, CostSummary
 
 
 @click.command()
@@ -157,7 +154,7 @@ def costs(workspace: str | None, as_json: bool) -> None:
       dnrpipe costs
       dnrpipe costs --json | jq .
     """
-    from ..core.ledger import summarise
+    from ..core.ledger import CostSum, summarise
     from ..core.workspace import Workspace, find_workspace
 
     found = Workspace.open(find_workspace(workspace))
@@ -168,24 +165,23 @@ def costs(workspace: str | None, as_json: bool) -> None:
         only={f"train/{name}" for name in raytraced.views} if raytraced else None,
         truncated_records=found.ledger.truncated_records(),
     )
-    click.echo(json.dumps(summary.model_dump(), indent=2) if as_json else _costs_table(summary))
+    if as_json:
+        click.echo(json.dumps(summary.model_dump(), indent=2))
+        return
 
+    def columns(part: CostSum) -> str:
+        return f"{part.records:>6} {clock(part.wall_seconds):>8} {clock(part.cpu_seconds):>8}"
 
-def _costs_table(summary: CostSummary) -> str:
-    lines = [f"{'stage':10} {'for':12} {'units':>6} {'wall':>8} {'cpu':>8}"]
+    click.echo(f"{'stage':10} {'for':12} {'units':>6} {'wall':>8} {'cpu':>8}")
     for stage, purposes in summary.by_stage_and_purpose.items():
-        lines += [f"{stage:10} {purpose:12} {_sum_columns(part)}" for purpose, part in purposes.items()]
-    lines.append(f"{'total':23} {_sum_columns(summary.total)}")
+        for purpose, part in purposes.items():
+            click.echo(f"{stage:10} {purpose:12} {columns(part)}")
+    click.echo(f"{'total':23} {columns(summary.total)}")
     if tracing := summary.tracing_all:
-        lines.append(
+        click.echo(
             f"ray-traced {tracing.views} of {tracing.candidates} candidates in {tracing.actual_seconds:.1f} s;"
             f" all would have cost {tracing.all_seconds:.1f} s"
         )
-    return "\n".join(lines)
-
-
-def _sum_columns(part: CostSum) -> str:
-    return f"{part.records:>6} {clock(part.wall_seconds):>8} {clock(part.cpu_seconds):>8}"
 
 
 @click.command()

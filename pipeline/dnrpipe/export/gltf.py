@@ -133,16 +133,14 @@ class _Parts:
     def vectors(self, values: np.ndarray, *, bounds: bool = False) -> int:
         values = np.ascontiguousarray(values, "<f4")
         limits = {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()} if bounds else {}
-        return self._accessor(values, ARRAY, FLOAT, len(values), f"VEC{values.shape[1]}", limits)
+        return self._accessor(values, ARRAY, FLOAT, count=len(values), type=f"VEC{values.shape[1]}", **limits)
 
     def indices(self, faces: np.ndarray) -> int:
-        return self._accessor(np.ascontiguousarray(faces, "<u4"), INDICES, UNSIGNED, faces.size, "SCALAR", {})
+        return self._accessor(np.ascontiguousarray(faces, "<u4"), INDICES, UNSIGNED, count=faces.size, type="SCALAR")
 
-    def _accessor(
-        self, values: np.ndarray, target: int, component: int, count: int, kind: str, limits: dict[str, Any]
-    ) -> int:
+    def _accessor(self, values: np.ndarray, target: int, component: int, **more: Any) -> int:
         view = self.view(values.tobytes(), target)
-        self.accessors.append({"bufferView": view, "componentType": component, "count": count, "type": kind, **limits})
+        self.accessors.append({"bufferView": view, "componentType": component, **more})
         return len(self.accessors) - 1
 
 

@@ -50,17 +50,12 @@ class Client:
     """
 
     def __init__(
-        self,
-        server: str = DEFAULT_SERVER,
-        token: str | None = None,
-        *,
-        timeout: float = 60.0,
-        retry_seconds: float = RETRY_SECONDS,
+        self, server: str = DEFAULT_SERVER, token: str | None = None, *, retry_seconds: float = RETRY_SECONDS
     ) -> None:
         self.server, self.retry_seconds = server, retry_seconds
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         try:
-            self._http = httpx.Client(base_url=server, headers=headers, timeout=timeout, verify=_trust())
+            self._http = httpx.Client(base_url=server, headers=headers, timeout=60.0, verify=_trust())
         except (httpx.InvalidURL, ValueError) as error:
             raise UserError(f"--server {server}: not an address ({error}); e.g. {DEFAULT_SERVER}") from None
 

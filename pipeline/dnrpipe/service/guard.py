@@ -15,7 +15,6 @@ import re
 import time
 from collections import OrderedDict
 from collections.abc import Iterable
-from typing import Any
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -31,7 +30,6 @@ MAX_BODY = 256 * 1024
 MAX_CLIENTS = 10_000
 REFUSALS_PER_MINUTE = 20
 OPEN_PATHS = ("/", "/healthz", "/favicon.ico")
-OPEN_PREFIX = "/static/"
 HEADERS = {
     "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:;"
     " connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -104,7 +102,8 @@ class Guard:
                     headers.setdefault(name, value)
             await send(message)
 
-        refusal = self._refusal(scope, Headers(scope=scope))
+        client = (scope.get("client") or "?")[0]
+        refusal = self._refusal(scope, Headers(scope=scope), client)
         try:
             if refusal is not None:
                 await refusal(scope, receive, sending)
@@ -112,7 +111,7 @@ class Guard:
                 await self.app(scope, self._bounded(scope, receive), sending)
         finally:
             facts = {
-                "client": _client(scope),
+                "client": client,
                 "method": scope.get("method", "WEBSOCKET"),
                 "path": scope["path"],
                 "status": status,
@@ -120,7 +119,7 @@ class Guard:
             }
             ACCESS.info("request", extra={"facts": facts})
 
-    def _refusal(self, scope: Scope, headers: Headers) -> ASGIApp | None:
+    def _refusal(self, scope: Scope, headers: Headers, client: str) -> ASGIApp | None:
         """The answer if the guard refuses the request, else None."""
 
         def refused(status: int, reason: str, **more: str) -> ASGIApp:
@@ -128,14 +127,15 @@ class Guard:
                 return WebSocketClose(1008, reason)  # before accept: 403
             return JSONResponse({"detail": reason}, status, {"connection": "close", **more})
 
-        client = _client(scope)
         host = headers.get("host", "")
         if self.hosts and _name_of(host) not in self.hosts:
             return refused(421, f"this server does not answer to the host name {host[:80]!r}")
         origin = headers.get("origin")
         if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
             return refused(403, "requests of pages from other origins are refused")
-        if self.token is not None and not _is_open(scope):
+        # The dashboard's files hold no data, and the dashboard asks for the token.
+        is_open = scope["type"] == "http" and (scope["path"] in OPEN_PATHS or scope["path"].startswith("/static/"))
+        if self.token is not None and not is_open:
             if self.refusals.empty(client):
                 return refused(429, "too many wrong tokens; wait a minute", **{"retry-after": "60"})
             if not hmac.compare_digest(_given_token(scope, headers), self.token):
@@ -165,21 +165,10 @@ class Guard:
         return receiving
 
 
-def _client(scope: Scope) -> str:
-    client: Any = scope.get("client")
-    return client[0] if client else "?"
-
-
 def _name_of(host: str) -> str:
     """``[::1]:8420`` -> ``::1``; empty where it is no host and port."""
     found = re.fullmatch(r"(?:\[([0-9a-f:]+)\]|([a-z0-9.-]+))(?::[0-9]{1,5})?", host.lower())
     return (found[1] or found[2]) if found else ""
-
-
-def _is_open(scope: Scope) -> bool:
-    """Whether the path needs no token: the dashboard's files hold no data, and the dashboard asks for the token."""
-    path = scope["path"]
-    return scope["type"] == "http" and (path in OPEN_PATHS or path.startswith(OPEN_PREFIX))
 
 
 def _is_upload(scope: Scope) -> bool:
