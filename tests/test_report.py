@@ -92,7 +92,7 @@ def test_nothing_is_loaded_from_elsewhere(page: str) -> None:
 
 
 def test_figures_agree_with_the_files(workspace: Path, page: str) -> None:
-    data = collect(workspace).figures()
+    data = collect(workspace).model_dump(mode="json")
     metrics = json.loads((workspace / "evaluation" / "metrics.json").read_text())
     values = {v["name"]: v["psnr"] for v in metrics["views"]}
     row = next(r for r in data["quality"]["rows"] if r["key"] == "psnr")
@@ -119,7 +119,7 @@ def test_figures_agree_with_the_files(workspace: Path, page: str) -> None:
 
 
 def test_reward_and_action_value_are_no_losses(workspace: Path, page: str) -> None:
-    first = collect(workspace).figures()["training"][0]
+    first = collect(workspace).model_dump(mode="json")["training"][0]
     assert list(first["losses"]) == ["dnr", "rl"]
     assert list(first["agent"]) == ["reward", "q"] and first["agent"]["q"][0][1] < 0
     assert "Reward and action value of the view selector" in page
@@ -402,7 +402,7 @@ def test_a_browser_draws_it(workspace: Path, page: str, tmp_path: Path, width: i
 def test_the_dom_holds_the_figures_and_the_script_ran(workspace: Path, page: str) -> None:
     with open_page((workspace / "report" / "report.html").as_uri()) as (drawn, _):
         dom = drawn.content()
-    data = collect(workspace).figures()
+    data = collect(workspace).model_dump(mode="json")
     text = " ".join(_parse(dom).text.split())
     mean = next(r for r in data["quality"]["rows"] if r["key"] == "psnr")["mean"]
     assert f"PSNR, held-out{mean:.2f} dB" in text

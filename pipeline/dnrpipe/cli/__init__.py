@@ -17,9 +17,8 @@ from .. import __version__
 from ..core.errors import UserError
 from . import information, stages
 from .export import export_gltf, export_nerf, export_onnx, export_web
-from .jobs import cancel, jobs, logs, retry, submit
 from .plan import frontier, plan
-from .serve import bench_live, serve
+from .service import bench_live, cancel, jobs, logs, retry, serve, submit
 from .studies import ablate, bench_select
 
 _EXTRAS = {

@@ -46,16 +46,6 @@ CHANNELS = {"uv": 2, "mask": 1, "coverage": 1, "view_dir": 3, "normal": 3, "base
 """What the page draws and renders of a view, and how many channels each has."""
 
 
-def web_settings(settings: Settings, views: int, epochs: int | None) -> tuple[ModelSettings, Step2Settings]:
-    """Draft's sizes (milliseconds count), the scene's texture size, and a base image without specular part."""
-    draft = PRESETS["draft"]
-    size = min(settings.model.texture_size, 256)
-    model = ModelSettings.model_validate({**draft["model"], "base": "raster", "texture_size": size})
-    step2 = Step2Settings.model_validate({**draft["finetune"]["step2"], "patch": 192})
-    wanted = epochs or max(step2.epochs, -(-STEPS // views))
-    return model, step2.model_copy(update={"epochs": wanted})
-
-
 def web_views(workspace: Workspace, views: Sequence[View], split: str, maps: SurfaceMaps) -> ViewSet:
     """The views with the base image that the page would draw, and ray-traced targets."""
     loaded = load(workspace, list(views), split, raytraced=True)
@@ -96,7 +86,11 @@ def train(
     epochs: int | None,
 ) -> DNR:
     """Train the page's network in `folder`, or resume an interrupted training; float32 for inference."""
-    model, step2 = web_settings(settings, len(views), epochs)
+    # Draft's sizes (milliseconds count), the scene's texture size, and a base image without specular part.
+    draft, size = PRESETS["draft"], min(settings.model.texture_size, 256)
+    model = ModelSettings.model_validate({**draft["model"], "base": "raster", "texture_size": size})
+    step2 = Step2Settings.model_validate({**draft["finetune"]["step2"], "patch": 192})
+    step2 = step2.model_copy(update={"epochs": epochs or max(step2.epochs, -(-STEPS // len(views)))})
     data = web_views(workspace, views, "train", maps)
     weights = perceptual_weights(console)
     fingerprint = digest([float(maps.radiance.sum(dtype=np.float64)), [view.model_dump(mode="json") for view in views]])

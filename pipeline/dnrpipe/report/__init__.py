@@ -25,5 +25,5 @@ def build_report(workspace_dir: Path, *, made_at: datetime | None = None) -> Pat
     data = collect(Path(workspace_dir), made_at=made_at)
     path = Path(workspace_dir) / "report" / "report.html"
     write_text(path, render_html(data))
-    write_json(path.with_suffix(".json"), data.figures())
+    write_json(path.with_suffix(".json"), data.model_dump(mode="json"))
     return path
