@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from ..core.ledger import CostSummary
 from ..stages.records import ViewMetrics
 
 
-class _Frozen(BaseModel, extra="forbid", frozen=True):
-    pass
+class _Frozen(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Picture(_Frozen):
