@@ -31,7 +31,6 @@ SERVER = [
 ]
 COMMANDS = ["run", "prepare", "select", "raytrace-selected", "finetune", "evaluate", "render", "report"]
 STATES = ["queued", "running", "done", "failed", "cancelled"]
-LOG_PAUSE = 0.5
 
 
 def _client(server: str | None, token_file: Path | None) -> Client:
@@ -266,7 +265,7 @@ def logs(job: int, follow: bool, as_json: bool, **server: Any) -> None:
                 continue
             if ended or not follow:
                 break
-            time.sleep(LOG_PAUSE)
+            time.sleep(0.5)
     if as_json:
         click.echo(json.dumps({"job": job, "text": text}))
 

@@ -47,7 +47,7 @@ from .gltf import glb
 from .meshes import read_meshes
 from .nerf import raytraced_views
 from .surface import SurfaceMaps, read_baked_light, surface_maps
-from .web_model import check_page, train, web_views
+from .web_model import check_page, half, train, web_views
 
 TRAINING = ".training"
 """Of the export's folder: the checkpoint, so that an interrupted export goes on where it stopped."""
@@ -84,7 +84,7 @@ def export_web(
     maps = surface_maps(workspace, console)
     model = train(workspace, settings, console, views["train"], maps, out / TRAINING, epochs)
     quality = held_out(workspace, model, views["test"], maps)
-    front, back = np.clip(maps.radiance, 0, 65504).astype("<f2")
+    front, back = half(maps.radiance)
     contents = {
         "scene.glb": glb(meshes, None),
         "light-front.bin": front.tobytes(),

@@ -63,7 +63,7 @@ def base_images(views: Batch, maps: SurfaceMaps) -> Tensor:
         parts = [F.grid_sample(texels, g[None], mode, padding_mode="border", align_corners=False) for g in grid]
         return torch.cat(parts)
 
-    front, back = (sampled(half(side[..., :3]), "bilinear") for side in maps.radiance)
+    front, back = (sampled(half(side[..., :3]).astype(np.float32), "bilinear") for side in maps.radiance)
     if not maps.thin:
         return front * views.mask
     # The files do not say which side of a sheet is seen: the shading normal faces the camera, the triangle's need not.
@@ -73,7 +73,7 @@ def base_images(views: Batch, maps: SurfaceMaps) -> Tensor:
 
 def half(image: np.ndarray) -> np.ndarray:
     """Round to the texture's format, 16-bit floats; clip what is brighter than their maximum."""
-    return np.clip(image, 0, 65504).astype(np.float16).astype(np.float32)
+    return np.clip(image, 0, 65504).astype("<f2")
 
 
 def train(

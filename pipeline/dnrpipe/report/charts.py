@@ -143,7 +143,7 @@ def line_chart(series: Sequence[Series], title: str, x_label: str, y_label: str,
     return canvas.svg()
 
 
-def bar_chart(bars: Sequence[Bar], title: str, *, width: float = WIDTH) -> Markup:
+def bar_chart(bars: Sequence[Bar], title: str) -> Markup:
     """Horizontal bars on a common linear scale from zero."""
     largest = max((math.fsum(s.value for s in bar.segments) for bar in bars), default=0.0)
     if largest <= 0:
@@ -151,13 +151,13 @@ def bar_chart(bars: Sequence[Bar], title: str, *, width: float = WIDTH) -> Marku
     left = 12.0 + _CHARACTER * max(len(bar.label) for bar in bars)
     right = 14.0 + _CHARACTER * max(len(bar.text) for bar in bars)
     row = 34.0
-    canvas = _Canvas(width, row * len(bars) + 6, title)
+    canvas = _Canvas(WIDTH, row * len(bars) + 6, title)
     for index, bar in enumerate(bars):
         y = index * row + 6
         canvas.text(left - 8, y + 17, bar.label, "label", "end")
         x = left
         for segment in bar.segments:
-            span = segment.value / largest * (width - left - right)
+            span = segment.value / largest * (WIDTH - left - right)
             canvas.parts.append(
                 f'<rect x="{x:.2f}" y="{y:.1f}" width="{span:.2f}" height="24" class="{segment.kind}">'
                 f"<title>{escape(segment.title)}</title></rect>"
@@ -209,12 +209,12 @@ def dot_chart(dots: Sequence[Dot], title: str, x_label: str, y_label: str, *, fr
     return canvas.svg()
 
 
-def linear_ticks(low: float, high: float, *, count: int = 5, whole: bool = False) -> list[float]:
-    """Round values (1, 2 or 5 × a power of ten) that enclose [low, high]; about ``count`` steps."""
+def linear_ticks(low: float, high: float, *, whole: bool = False) -> list[float]:
+    """Round values (1, 2 or 5 × a power of ten) that enclose [low, high]; about five steps."""
     if not high > low:
         pad = max(abs(low) * 0.1, 1.0 if whole else 1e-3)
         low, high = low - pad, high + pad
-    raw = (high - low) / count
+    raw = (high - low) / 5
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(f * power for f in (1, 2, 5, 10) if f * power >= raw * 0.999)
     step = max(step, 1.0) if whole else step

@@ -24,7 +24,6 @@ from .root import UnknownName
 from .state import State
 
 LOG = logging.getLogger("dnrpipe.pruning")
-PRUNE_INTERVAL = 3600.0
 _STATUS: dict[type[UserError], int] = {QueueFull: 429, WrongState: 409, UnknownName: 404, UserError: 422}
 
 
@@ -78,7 +77,7 @@ async def _prune_regularly(state: State) -> None:
                 LOG.info("old logs and events removed", extra={"facts": {"jobs": len(pruned)}})
         except Exception:  # a full disk, a busy queue: the server goes on and tries again
             LOG.exception("old logs and events could not be removed")
-        await asyncio.sleep(PRUNE_INTERVAL)
+        await asyncio.sleep(3600)
 
 
 async def _answer(_: Request, error: Exception) -> JSONResponse:

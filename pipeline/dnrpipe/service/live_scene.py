@@ -63,9 +63,7 @@ class LiveScene:
     def view(self, camera: Orbit, size: int) -> View:
         """The view of ``camera``, ``size``² pixels."""
         ce = math.cos(camera.elevation)
-        direction = np.array(
-            [ce * math.cos(camera.azimuth), ce * math.sin(camera.azimuth), math.sin(camera.elevation)], np.float64
-        )
+        direction = np.array([ce * math.cos(camera.azimuth), ce * math.sin(camera.azimuth), math.sin(camera.elevation)])
         target = np.asarray(camera.target, np.float64)
         settings = self.settings.cameras.model_copy(update={"width": size, "height": size})
         return look_at_view("live", target + camera.distance * direction, target, self.focal * size, settings)

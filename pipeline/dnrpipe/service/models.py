@@ -21,9 +21,7 @@ Command = Literal["run", "prepare", "select", "raytrace-selected", "finetune", "
 State = Literal["queued", "running", "done", "failed", "cancelled"]
 STATES: tuple[State, ...] = get_args(State)
 FINAL: tuple[State, ...] = ("done", "failed", "cancelled")
-TAKES_SCENE = ("run", "prepare")
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
-SceneName = Annotated[str, Field(pattern=SCENE_PATTERN)]
 
 
 def first_fault(error: ValidationError | RequestValidationError) -> str:
@@ -54,7 +52,7 @@ class JobRequest(Strict):
 
     command: Command
     workspace: Name
-    scene: SceneName | None = None
+    scene: Annotated[str, Field(pattern=SCENE_PATTERN)] | None = None
     preset: Literal["draft", "standard", "paper", "vanilla"] | None = None
     settings: dict[Annotated[str, Field(pattern=SETTING_PATTERN)], bool | int | float | str] = Field(
         default_factory=dict, max_length=64

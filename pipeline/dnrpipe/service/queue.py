@@ -225,11 +225,10 @@ class Queue:
                 if event["kind"] == "progress":
                     db.execute("UPDATE jobs SET progress = ? WHERE id = ?", (json.dumps(facts), job))
 
-    def events(self, job: int, after: int = 0, limit: int = 1000) -> list[JobEvent]:
-        """The job's events with an id above ``after``, oldest first."""
+    def events(self, job: int, after: int = 0) -> list[JobEvent]:
+        """The job's events with an id above ``after``, oldest first, 1000 at most."""
         rows = self._db().execute(
-            "SELECT id, job, time, kind, data FROM events WHERE job = ? AND id > ? ORDER BY id LIMIT ?",
-            (job, after, limit),
+            "SELECT id, job, time, kind, data FROM events WHERE job = ? AND id > ? ORDER BY id LIMIT 1000", (job, after)
         )
         return [JobEvent(**dict(row) | {"data": json.loads(row["data"])}) for row in rows]
 

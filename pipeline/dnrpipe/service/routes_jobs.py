@@ -12,7 +12,7 @@ from starlette.concurrency import run_in_threadpool
 
 from ..core.cameras import KEYWORDS
 from ..core.settings import merge, parse_assignment, resolve
-from .models import FINAL, TAKES_SCENE, Job, JobPage, JobRequest, LogPage, Name, Problem, State
+from .models import FINAL, Job, JobPage, JobRequest, LogPage, Name, Problem, State
 from .state import Shared
 from .state import State as Service
 
@@ -180,7 +180,7 @@ def check_request(request: JobRequest, service: Service) -> None:
     Raises HTTPException 422, UnknownName.
     """
     if request.scene is not None:
-        if request.command not in TAKES_SCENE:
+        if request.command not in ("run", "prepare"):
             raise HTTPException(422, f"scene: {request.command} takes none; only run and prepare do")
         service.root.scene(request.scene)
     path = service.root.workspace(request.workspace, must_exist=request.scene is None)

@@ -23,8 +23,6 @@ from .root import ServiceRoot
 from .state import Feed, State
 from .supervisor import Supervisor
 
-SHUTDOWN_SECONDS = 3
-
 
 def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], None]) -> None:
     """Serve until SIGTERM or Ctrl-C. ``ready`` is called with the address once requests are answered.
@@ -58,7 +56,7 @@ def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], Non
             log_config=None,
             access_log=False,
             server_header=False,
-            timeout_graceful_shutdown=SHUTDOWN_SECONDS,
+            timeout_graceful_shutdown=3,
             ws="websockets-sansio",
             ws_max_size=64 * 1024,
             limit_concurrency=config.streams + 1000,
