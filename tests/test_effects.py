@@ -194,7 +194,7 @@ def test_an_override_makes_stale_only_what_it_touches() -> None:
 
 
 def test_the_help_names_every_effect() -> None:
-    from dnrpipe.cli.scene import effects
+    from dnrpipe.cli.information import effects
 
     named = " ".join((effects.help or "").split()).partition("Names: ")[2].partition(".")[0]
     assert tuple(named.split(", ")) == NAMES

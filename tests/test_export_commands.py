@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from dnrpipe.cli import cli
-from dnrpipe.cli.failures import explain
+from dnrpipe.cli import cli, explain
 from dnrpipe.core.errors import UserError
-from dnrpipe.export import vendor
+from dnrpipe.export import web
 from dnrpipe.export.browser import require_chromium
 
 COMMANDS = ("export-nerf", "export-onnx", "export-gltf", "export-web")
@@ -44,9 +43,9 @@ def test_no_workspace_is_said(name: str, tmp_path: Path, monkeypatch: pytest.Mon
 
 def test_without_npm_the_runtime_is_refused_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DNRPIPE_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(vendor.shutil, "which", lambda name: None)
+    monkeypatch.setattr(web.shutil, "which", lambda name: None)
     with pytest.raises(UserError, match="npm is not installed"):
-        vendor.runtime()
+        web.runtime()
     assert not (tmp_path / "cache").exists()
 
 
@@ -57,9 +56,9 @@ def test_what_npm_delivers_is_checked(tmp_path: Path, monkeypatch: pytest.Monkey
     npm.write_text(f"#!/bin/sh\n{script}\n")
     npm.chmod(0o755)
     monkeypatch.setenv("DNRPIPE_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(vendor.shutil, "which", lambda name: str(npm))
+    monkeypatch.setattr(web.shutil, "which", lambda name: str(npm))
     with pytest.raises(UserError, match=words):
-        vendor.runtime()
+        web.runtime()
     assert not (tmp_path / "cache").exists()
 
 

@@ -155,15 +155,15 @@ def test_baked_texels_that_are_not_finite_are_counted() -> None:
 
 def test_path_tracing_in_the_live_view_counts_what_is_not_finite() -> None:
     """A NaN pixel is black in the mean that is shown, and told with the picture it was traced for."""
-    torch = pytest.importorskip("torch")
+    pytest.importorskip("torch")
     from dnrpipe.service import live_frames
 
     bad = picture().astype(np.float32)
     bad[1, 1, 0] = np.nan
     worker: Any = object.__new__(live_frames.Worker)
-    worker.torch, worker.traced, worker.repaired = torch, None, 0
+    worker.traced, worker.repaired = None, 0
     worker.display = SimpleNamespace(over_white=lambda colour, alpha: colour)
-    worker._frames = lambda view: SimpleNamespace(path=lambda *_, seed: bad if seed == 1 else picture())
+    worker.frames = lambda size: SimpleNamespace(path=lambda *_, seed: bad if seed == 1 else picture())
     eye = tuple(tuple(float(x) for x in row) for row in np.eye(4))
     view = View(name="v", width=5, height=4, fl_x=5, fl_y=5, cx=2.5, cy=2, c2w=eye)
     shown, count = worker._reference(view, 1)

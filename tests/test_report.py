@@ -25,7 +25,6 @@ from dnrpipe.report import build_report, charts
 from dnrpipe.report.collect import collect
 from dnrpipe.report.pictures import load_png
 from dnrpipe.report.render import render_html
-from dnrpipe.report.sphere import project
 
 WHEN = datetime(2026, 1, 2, 3, 4, tzinfo=UTC)
 
@@ -93,7 +92,7 @@ def test_nothing_is_loaded_from_elsewhere(page: str) -> None:
 
 
 def test_figures_agree_with_the_files(workspace: Path, page: str) -> None:
-    data = collect(workspace).figures()
+    data = collect(workspace).model_dump(mode="json")
     metrics = json.loads((workspace / "evaluation" / "metrics.json").read_text())
     values = {v["name"]: v["psnr"] for v in metrics["views"]}
     row = next(r for r in data["quality"]["rows"] if r["key"] == "psnr")
@@ -120,7 +119,7 @@ def test_figures_agree_with_the_files(workspace: Path, page: str) -> None:
 
 
 def test_reward_and_action_value_are_no_losses(workspace: Path, page: str) -> None:
-    first = collect(workspace).figures()["training"][0]
+    first = collect(workspace).model_dump(mode="json")["training"][0]
     assert list(first["losses"]) == ["dnr", "rl"]
     assert list(first["agent"]) == ["reward", "q"] and first["agent"]["q"][0][1] < 0
     assert "Reward and action value of the view selector" in page
@@ -298,8 +297,9 @@ def test_large_pictures_are_reduced_and_grey_error_maps_coloured(tmp_path: Path)
 
 
 def test_thumbnails_go_through_the_display_transform(workspace: Path) -> None:
-    from dnrpipe.report.pictures import ExrPictures
+    from dnrpipe.report.pictures import load_exr
     from dnrtrain.contract import SceneFrame
+    from dnrtrain.display import DisplayTransform
 
     frame = SceneFrame.model_validate_json((workspace / "scene" / "frame.json").read_text())
 
@@ -307,8 +307,8 @@ def test_thumbnails_go_through_the_display_transform(workspace: Path) -> None:
         import base64
         import io
 
-        exr = ExrPictures(workspace, frame.model_copy(update={"exposure": exposure}))
-        picture = exr.load("raytraced/train/0004.exr")
+        display = DisplayTransform(frame.model_copy(update={"exposure": exposure}), workspace / "scene")
+        picture = load_exr(workspace, "raytraced/train/0004.exr", display)
         assert picture is not None
         image = np.asarray(Image.open(io.BytesIO(base64.b64decode(picture.uri.split(",")[1]))).convert("RGB"))
         assert (image[0, 0] == 255).all()  # background: white
@@ -353,10 +353,10 @@ def test_charts_survive_degenerate_series() -> None:
 
 def test_projections_are_right_handed() -> None:
     for projection in ("top", "front", "oblique"):
-        axes = np.array([project(tuple(row), projection) for row in np.eye(3).tolist()])  # type: ignore[arg-type]
+        axes = np.array([charts.project(tuple(row), projection) for row in np.eye(3).tolist()])  # type: ignore[arg-type]
         assert np.allclose(axes @ axes.T, np.eye(3), atol=1e-9)
         assert np.linalg.det(axes) == pytest.approx(1.0)
-    assert project((0.0, -1.0, 0.0), "front")[2] == 1.0  # the front of a Blender scene looks along -Y
+    assert charts.project((0.0, -1.0, 0.0), "front")[2] == 1.0  # the front of a Blender scene looks along -Y
 
 
 @pytest.mark.parametrize(
@@ -402,7 +402,7 @@ def test_a_browser_draws_it(workspace: Path, page: str, tmp_path: Path, width: i
 def test_the_dom_holds_the_figures_and_the_script_ran(workspace: Path, page: str) -> None:
     with open_page((workspace / "report" / "report.html").as_uri()) as (drawn, _):
         dom = drawn.content()
-    data = collect(workspace).figures()
+    data = collect(workspace).model_dump(mode="json")
     text = " ".join(_parse(dom).text.split())
     mean = next(r for r in data["quality"]["rows"] if r["key"] == "psnr")["mean"]
     assert f"PSNR, held-out{mean:.2f} dB" in text

@@ -17,7 +17,7 @@ from e2e_harness import run
 from dnrpipe.core.errors import UserError
 from dnrpipe.export.browser import find_chromium, open_page, wait_for
 from dnrpipe.export.gltf import Y_UP
-from dnrpipe.export.vendor import runtime
+from dnrpipe.export.web import runtime
 
 pytestmark = [pytest.mark.slow, pytest.mark.e2e]
 

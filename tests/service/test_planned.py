@@ -13,7 +13,7 @@ from dnrpipe.core.ledger import CostRecord
 from dnrpipe.core.settings import resolve
 from dnrpipe.core.workspace import Source, Workspace
 from dnrpipe.service.models import PlanState
-from dnrpipe.service.planned import plan_state
+from dnrpipe.service.routes_workspaces import plan_state
 
 MADE = 1_000_000.0
 

@@ -141,7 +141,7 @@ def test_the_server_does_it(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("days", ["0", "-1", "nan", "1e9"])
 def test_nonsense_is_refused(days: str) -> None:
-    from dnrpipe.cli.serve import serve
+    from dnrpipe.cli.service import serve
 
     with pytest.raises(UserError, match="--keep-days"):
         serve.main(["--keep-days", days], standalone_mode=False)

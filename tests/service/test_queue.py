@@ -119,7 +119,7 @@ def test_cancelled_while_it_was_lost(tmp_path: Path) -> None:
     queue = Queue(tmp_path / "q.sqlite")
     job = queue.submit(_request("a")).id
     queue.claim("cpu")
-    assert queue.cancel(job).state == "running" and queue.cancel_requested(job)
+    assert queue.cancel(job).state == "running" and queue.get(job).cancel_requested
     queue.recover()
     found = queue.get(job)
     assert found is not None and found.state == "cancelled"

@@ -5,6 +5,7 @@ Exit codes: 0 done; 1 some views failed; 2 bad input (one line says what, where,
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import sys
@@ -13,13 +14,20 @@ from collections.abc import MutableMapping
 import click
 
 from .. import __version__
-from . import information, pictures, scene, stages
+from ..core.errors import UserError
+from . import information, stages
 from .export import export_gltf, export_nerf, export_onnx, export_web
-from .frontier import frontier
-from .jobs import cancel, jobs, logs, retry, submit
-from .plan import plan
-from .serve import bench_live, serve
+from .plan import frontier, plan
+from .service import bench_live, cancel, jobs, logs, retry, serve, submit
 from .studies import ablate, bench_select
+
+_EXTRAS = {
+    "train": ("torch",),
+    "render": ("bpy", "mitsuba", "drjit", "flip_evaluator", "imageio_ffmpeg", "PIL", "jinja2", "matplotlib"),
+    "export": ("onnx", "onnxruntime", "playwright"),
+    "serve": ("fastapi", "uvicorn", "websockets", "httpx"),
+}
+"""What an optional dependency belongs to."""
 
 
 class _Group(click.Group):
@@ -49,15 +57,15 @@ def cli() -> None:
 
 
 for _command in (
-    scene.inspect,
+    information.inspect,
     stages.prepare,
-    scene.effects,
+    information.effects,
     stages.select,
     stages.raytrace_selected,
     stages.finetune,
     stages.evaluate,
-    pictures.render,
-    pictures.report,
+    stages.render,
+    stages.report,
     export_nerf,
     export_onnx,
     export_gltf,
@@ -99,8 +107,6 @@ def _main(arguments: list[str] | None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # a reader such as `head` left: no noise at exit
     except Exception as error:
-        from .failures import explain
-
         explained = explain(error)
         if explained is None:
             raise
@@ -113,6 +119,42 @@ def _main(arguments: list[str] | None) -> int:
 def _fail(message: str, code: int) -> int:
     print(f"dnrpipe: error: {message}" if code != 130 else f"dnrpipe: {message}", file=sys.stderr, flush=True)
     return code
+
+
+def explain(error: Exception) -> tuple[str, int] | None:
+    """(one line, exit code) for a failure that we expect; None for a bug, which keeps its traceback."""
+    from dnrtrain.contract import ContractError
+
+    from ..workers.view_tasks import TasksFailed
+
+    if isinstance(error, UserError | ContractError):
+        return str(error), 2
+    if isinstance(error, TasksFailed):
+        return str(error), 1
+    if isinstance(error, click.UsageError):
+        command = error.ctx.command_path if error.ctx else "dnrpipe"
+        return f"{error.format_message()} See `{command} --help`.", 2
+    if isinstance(error, click.ClickException):
+        return error.format_message(), 2
+    if isinstance(error, ModuleNotFoundError):
+        module = (error.name or "").split(".")[0]
+        for extra, modules in _EXTRAS.items():
+            if module in modules:
+                return f"{module} is not installed; run `pip install 'dnrpipe[{extra}]'`", 2
+    if not isinstance(error, OSError):
+        return None
+    where = error.filename or "the workspace"
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return f"{where}: the disk is full; free some space and run the same command to go on", 2
+    if error.errno == errno.EFBIG:
+        return f"{where}: the system allows no file as large as this (`ulimit -f`); raise the limit and run again", 2
+    if error.errno == errno.EIO:
+        return f"{where}: cannot be read or written ({error.strerror or error}); check the disk", 2
+    if error.errno in (errno.EACCES, errno.EROFS, errno.EPERM):
+        return f"{where}: cannot be written (read-only or not yours); choose another folder with -w", 2
+    if error.errno in (errno.ENOTDIR, errno.EISDIR):
+        return f"{where}: {os.strerror(error.errno).lower()}", 2
+    return None
 
 
 def set_thread_waiting(environment: MutableMapping[str, str]) -> None:

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..core.console import Console
 from ..core.errors import UserError
 from .options import OUTPUT_OPTIONS
 from .options import options as with_options
 
 if TYPE_CHECKING:
-    from ..core.console import Console
     from ..core.workspace import Workspace
 
 
@@ -26,7 +26,6 @@ _common = with_options(
 
 
 def _opened(workspace: str | None, named: str | None, as_json: bool, quiet: bool) -> tuple[Workspace, Console]:
-    from ..core.console import Console
     from ..core.workspace import Workspace, find_workspace
 
     if workspace and named and workspace != named:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,12 +23,7 @@ SAMPLES_AT_ONCE = 8
 
 
 def options(options: list[Any]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        for option in reversed(options):
-            function = option(function)
-        return function
-
-    return decorate
+    return lambda function: reduce(lambda decorated, option: option(decorated), reversed(options), function)
 
 
 OUTPUT_OPTIONS = [
@@ -50,7 +46,9 @@ common = options(
     ]
 )
 """Options every stage has."""
-CAMERA_OPTIONS = [
+SCENE_OPTIONS = [
+    click.argument("scene", type=click.Path(path_type=Path), required=False),
+    click.option("--strict", is_flag=True, help="Refuse a scene with missing files or anything ignored. Remembered."),
     click.option(
         "--cameras",
         metavar="SOURCE",
@@ -61,6 +59,7 @@ CAMERA_OPTIONS = [
     click.option("--resolution", type=int, metavar="PIXELS", help="Square image size."),
     click.option("--raster", type=click.Choice(["auto", "eevee", "workbench", "cycles-direct"])),
 ]
+"""Options of commands that may start from a scene file; `scene_overrides` reads them."""
 SELECT_OPTIONS = [
     click.option("--budget", type=int, metavar="M", help="Views to ray-trace (default 25)."),
     click.option(
@@ -69,16 +68,6 @@ SELECT_OPTIONS = [
         help="How to choose them; rl-paper trains for it, the others take seconds.",
     ),
 ]
-
-
-STRICT = click.option(
-    "--strict", is_flag=True, help="Refuse a scene with missing files or anything ignored. Remembered."
-)
-
-
-def strict_override(strict: bool) -> dict[str, Any]:
-    """``--strict`` as settings."""
-    return {"strict": True} if strict else {}
 
 
 def open_session(
@@ -96,17 +85,16 @@ def open_session(
 
 
 @contextmanager
-def open_prepared(command: str, scene: Path | None, options: dict[str, Any], strict: bool) -> Iterator[Session]:
+def open_prepared(command: str, scene: Path | None, options: dict[str, Any]) -> Iterator[Session]:
     """The session of a command that takes a scene file or a workspace, once stage prepare is done."""
     if scene is not None and (scene / "manifest.json").exists():
         options["workspace"], scene = str(scene), None
-    overrides = {**camera_overrides(options), **strict_override(strict)}
-    with open_session(command, options, scene=scene, overrides=overrides) as session:
+    with open_session(command, options, scene=scene, overrides=scene_overrides(options)) as session:
         session.stages("prepare")
         yield session
 
 
-def camera_overrides(options: dict[str, Any]) -> dict[str, Any]:
+def scene_overrides(options: dict[str, Any]) -> dict[str, Any]:
     cameras: dict[str, Any] = {}
     source = options.pop("cameras")
     if source is not None:
@@ -127,6 +115,8 @@ def camera_overrides(options: dict[str, Any]) -> dict[str, Any]:
     overrides: dict[str, Any] = {"cameras": cameras} if cameras else {}
     if raster is not None:
         overrides["passes"] = {"raster": raster}
+    if options.pop("strict"):
+        overrides["strict"] = True
     return overrides
 
 

@@ -1,4 +1,4 @@
-"""`dnrpipe plan`: what a budget of time buys, or what an error costs, before it is spent."""
+"""What time buys, and what an error costs: `dnrpipe plan` before it is spent, `dnrpipe frontier` measured."""
 
 from __future__ import annotations
 
@@ -8,17 +8,15 @@ from typing import Any
 import click
 
 from ..core.errors import UserError
-from .options import CAMERA_OPTIONS, STRICT, amount, common, open_prepared, options
+from .options import SCENE_OPTIONS, amount, common, open_prepared, options
 
 
 @click.command()
-@click.argument("scene", type=click.Path(path_type=Path), required=False)
 @click.option("--time", "duration", metavar="T", help="Time to spend from here on, e.g. 90s, 15m, 2h.")
 @click.option("--target-psnr", type=float, metavar="DB", help="PSNR wanted on new views.")
 @click.option("--frames", type=int, metavar="N", help="Frames to be rendered: says whether to train at all.")
 @click.option("--apply", "carry_out", is_flag=True, help="Carry the plan out, then compare it with what happened.")
-@STRICT
-@options(CAMERA_OPTIONS)
+@options(SCENE_OPTIONS)
 @common
 def plan(
     scene: Path | None,
@@ -26,7 +24,6 @@ def plan(
     target_psnr: float | None,
     frames: int | None,
     carry_out: bool,
-    strict: bool,
     **options: Any,
 ) -> None:
     """Predict what time buys and choose views, samples and steps.
@@ -57,7 +54,7 @@ def plan(
 
     wanted = Wanted(seconds=amount("--time", duration, parse_seconds), psnr=target_psnr, frames=frames)
     force, options["force"] = options["force"], False
-    with open_prepared("plan", scene, options, strict) as session:
+    with open_prepared("plan", scene, options) as session:
         if force:
             pilot_path(session.workspace).unlink(missing_ok=True)
         made = make_plan(session.run, wanted)
@@ -70,3 +67,47 @@ def plan(
             for line in actual_lines(made):
                 session.console.say(line)
         session.console.result({"workspace": str(session.workspace.root), **made.data()})
+
+
+@click.command()
+@click.option("--budgets", metavar="A,B", help="Views to ray-trace (default 6,12 and the workspace's budget).")
+@click.option("--spp", metavar="A,B", help="Samples per pixel of training views (default 16 and the workspace's).")
+@click.option("--iterations", metavar="A,B", help="Optimiser steps (default 150,600).")
+@click.option("--frames", metavar="A,B", help="Numbers of frames to compare for (default 200,2000).")
+@click.option(
+    "--also",
+    default="random,all,paper,cycles",
+    show_default=True,
+    metavar="A,B",
+    help="Other ways to train, and Cycles as a rival; none.",
+)
+@click.option("--ladder", metavar="A,B", help="Samples of path tracing, the rival (default 1,2,4,8,16,64).")
+@click.option("--seeds", type=int, default=1, show_default=True, metavar="N", help="Every point is trained N times.")
+@click.option("--jobs", type=int, default=0, metavar="N", help="Cells side by side (default: one per core).")
+@options(SCENE_OPTIONS)
+@common
+def frontier(scene: Path | None, **options: Any) -> None:
+    """Sweep views, samples and steps, and draw quality against total seconds, rivals included.
+
+    SCENE is a scene file or a workspace. Rivals on the same test views: path tracing at 1 to 64 samples, with and
+    without Open Image Denoise; Cycles likewise; random views; all candidates; the paper's model; the base image alone.
+    Writes results.json, results.csv, report.md and a plot per number of frames into the workspace's folder frontier/.
+    Traced views, references and light are shared; what is done is not done again.
+
+    \b
+    Examples:
+      dnrpipe frontier scene.blend
+      dnrpipe frontier -w scene.dnr --budgets 5,10,25 --spp 8,64 --iterations 200,800 --frames 100,1000
+      dnrpipe frontier scene.blend --also none --ladder 1,4,16 --json
+    """
+    from ..studies.frontier.measure_frontier import run_frontier
+
+    if options["force"]:
+        raise UserError("--force: remove the workspace's folder frontier/ to measure everything anew")
+    names = ("budgets", "spp", "iterations", "frames", "also", "ladder", "seeds", "jobs")
+    wanted = {name: options.pop(name) for name in names}
+    with open_prepared("frontier", scene, options) as session:
+        results = run_frontier(session.run, **wanted)
+        folder = session.workspace.root / "frontier"
+        session.console.say(f"{len(results.points)} points: {folder / 'report.md'}, {folder / 'frontier-*.png'}")
+        session.console.result(results.data())

@@ -1,33 +1,32 @@
-"""One command per stage of the pipeline, and `run` for all of them."""
+"""One command per stage of the pipeline, `run` for all of them, and what the renderer is for: `render`, `report`."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..core.errors import UserError
 from .options import (
-    CAMERA_OPTIONS,
+    SCENE_OPTIONS,
     SELECT_OPTIONS,
-    STRICT,
-    camera_overrides,
     common,
     open_session,
     options,
+    scene_overrides,
     select_overrides,
-    strict_override,
     tracing_overrides,
 )
-from .pictures import write_report
+
+if TYPE_CHECKING:
+    from ..stages.session import Session
 
 
 @click.command()
-@click.argument("scene", type=click.Path(path_type=Path), required=False)
-@STRICT
-@options(CAMERA_OPTIONS)
+@options(SCENE_OPTIONS)
 @common
-def prepare(scene: Path | None, strict: bool, **options: Any) -> None:
+def prepare(scene: Path | None, **options: Any) -> None:
     """Convert a scene and render the cheap passes of all candidate views.
 
     SCENE is a .blend, .obj, .gltf, .glb, .fbx, .ply or .stl file. Makes ./SCENE.dnr (or -w DIR) with the
@@ -41,8 +40,7 @@ def prepare(scene: Path | None, strict: bool, **options: Any) -> None:
       dnrpipe prepare scene.blend --cameras transforms_train.json
       dnrpipe prepare scene.blend --strict
     """
-    overrides = {**camera_overrides(options), **strict_override(strict)}
-    with open_session("prepare", options, scene=scene, overrides=overrides) as session:
+    with open_session("prepare", options, scene=scene, overrides=scene_overrides(options)) as session:
         session.stages("prepare")
 
 
@@ -127,11 +125,9 @@ def evaluate(**options: Any) -> None:
 
 
 @click.command()
-@click.argument("scene", type=click.Path(path_type=Path), required=False)
-@STRICT
-@options([*CAMERA_OPTIONS, *SELECT_OPTIONS])
+@options([*SCENE_OPTIONS, *SELECT_OPTIONS])
 @common
-def run(scene: Path | None, strict: bool, **options: Any) -> None:
+def run(scene: Path | None, **options: Any) -> None:
     """All stages: prepare, select, raytrace-selected, finetune, evaluate, report.
 
     Does only what is missing or out of date.
@@ -141,10 +137,84 @@ def run(scene: Path | None, strict: bool, **options: Any) -> None:
       dnrpipe run scene.blend --budget 25
       dnrpipe run scene.blend --preset paper
     """
-    from ..core.settings import merge
-
-    overrides = merge(camera_overrides(options), select_overrides(options))
-    overrides |= strict_override(strict)
+    overrides = scene_overrides(options) | select_overrides(options)
     with open_session("run", options, scene=scene, overrides=overrides) as session:
         session.stages("prepare", "select", "raytrace", "finetune", "evaluate")
         write_report(session)
+
+
+@click.command()
+@click.option("--orbit", type=click.IntRange(1, 100_000), metavar="N", help="N frames of a turntable (default 60).")
+@click.option("--elevation", type=click.FloatRange(-89, 89), default=25.0, show_default=True, metavar="DEGREES")
+@click.option("--cameras", "camera_file", type=click.Path(path_type=Path), help="A NeRF transforms.json instead.")
+@click.option("--frames", type=click.Choice(["png", "exr", "both"]), default="png", show_default=True)
+@click.option("--movie", type=click.Choice(["mp4", "webp", "none"]), default="mp4", show_default=True)
+@click.option(
+    "--resolution", type=click.IntRange(8, 16384), metavar="PIXELS", help="Square size of the orbit's frames."
+)
+@common
+def render(
+    orbit: int | None,
+    elevation: float,
+    camera_file: Path | None,
+    frames: str,
+    movie: str,
+    resolution: int | None,
+    **options: Any,
+) -> None:
+    """Render novel views with the neural renderer: frames and a movie in renders/.
+
+    \b
+    Examples:
+      dnrpipe render --orbit 60
+      dnrpipe render --orbit 120 --movie webp --frames both
+      dnrpipe render --cameras transforms_path.json
+    """
+    if orbit is not None and camera_file is not None:
+        raise UserError("render: give --orbit or --cameras, not both")
+    from dnrtrain.contract import parse_transforms
+
+    from ..core.cameras import orbit_views
+    from ..core.scene_files import read_summary
+    from ..stages.pipeline import STAGES, require_inputs
+    from ..stages.render import render_novel
+
+    with open_session("render", options) as session:
+        require_inputs(STAGES["evaluate"], session.workspace, session.settings)
+        cameras = session.settings.cameras
+        if camera_file is not None:
+            views = parse_transforms(camera_file, (cameras.width, cameras.height))
+            name = camera_file.stem
+        else:
+            if resolution is not None:
+                cameras = cameras.model_copy(update={"width": resolution, "height": resolution})
+            views = orbit_views(read_summary(session.workspace.scene), cameras, orbit or 60, elevation)
+            name = f"orbit-{orbit or 60}"
+        answer = render_novel(session.run.for_stage("render"), views, name=name, frames=frames, movie=movie)
+        session.console.say(f"{answer['frames']} frames, {answer['neural_ms']:.1f} ms each for the network")
+        session.console.say(answer["movie"] or answer["folder"])
+        session.console.result(answer)
+
+
+@click.command()
+@common
+def report(**options: Any) -> None:
+    """Write one self-contained HTML report: pictures, quality, and what it cost in time.
+
+    \b
+    Examples:
+      dnrpipe report
+      dnrpipe report -w scene.dnr --json
+    """
+    with open_session("report", options) as session:
+        write_report(session)
+
+
+def write_report(session: Session) -> None:
+    """Write the report of the session's workspace; the answers of its stages go into ``--json``."""
+    from ..report import build_report
+
+    root = session.workspace.root
+    path = build_report(root)
+    session.console.say(f"report: {path}")
+    session.console.result({"workspace": str(root), **session.answers, "report": str(path)})

@@ -21,7 +21,6 @@ TIMEOUT = 120_000
 
 
 def find_chromium() -> str | None:
-    """Path of an installed Chromium, or None."""
     return next((path for name in NAMES if (path := shutil.which(name))), None)
 
 
@@ -41,18 +40,11 @@ def open_page(
 ) -> Iterator[tuple[Page, list[str]]]:
     """Start a Chromium with a profile of its own, load a page, and end Chromium afterwards.
 
-    Args:
-        address: of the page; file:// is allowed.
-        width: of the viewport, CSS pixels.
-        height: of the viewport, CSS pixels.
-        color_scheme: what the page's media query sees.
+    Yields the page, and a list that grows with its errors: exceptions, refused resources, console.error.
+    width, height: of the viewport, CSS pixels. color_scheme: what the page's media query sees.
 
-    Yields:
-        The page, and a list that grows with its errors: exceptions, refused resources, console.error.
-
-    Raises:
-        UserError: there is no Chromium, or a call failed: the page threw, was not found, or took too long.
-        ModuleNotFoundError: playwright is not installed.
+    Raises UserError: there is no Chromium, or a call failed: the page threw, was not found, or took too long;
+    ModuleNotFoundError: playwright is not installed.
     """
     chromium = require_chromium()
     from playwright.sync_api import Error, sync_playwright

@@ -15,12 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from dnrtrain.atomic import atomic_path
 
 from .. import __version__
 from ..core.console import Console
 from ..core.errors import UserError
+from ..core.scene_files import read_frame
 from ..core.workspace import Workspace
 from .meshes import BundleMesh, read_meshes
 
@@ -57,7 +59,6 @@ def light_picture(workspace: Workspace, console: Console) -> np.ndarray:
 
     from dnrtrain.display import DisplayTransform
 
-    from ..core.scene_files import read_frame
     from .surface import surface_maps
 
     radiance = torch.from_numpy(surface_maps(workspace, console).radiance[0, ..., :3].copy()).permute(2, 0, 1)
@@ -98,8 +99,10 @@ def glb(meshes: Sequence[BundleMesh], picture: np.ndarray | None) -> bytes:
             document["scenes"][0]["nodes"].append(len(document["nodes"]))
             document["nodes"].append(node)
     if picture is not None:
+        png = io.BytesIO()
+        Image.fromarray(picture).save(png, "PNG")
         document["extensionsUsed"] = ["KHR_materials_unlit"]
-        document["images"] = [{"name": "light", "mimeType": "image/png", "bufferView": parts.view(_png(picture))}]
+        document["images"] = [{"name": "light", "mimeType": "image/png", "bufferView": parts.view(png.getvalue())}]
         document["samplers"] = [{"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}]
         document["textures"] = [{"sampler": 0, "source": 0}]
     document |= {"accessors": parts.accessors, "bufferViews": parts.views}
@@ -130,16 +133,14 @@ class _Parts:
     def vectors(self, values: np.ndarray, *, bounds: bool = False) -> int:
         values = np.ascontiguousarray(values, "<f4")
         limits = {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()} if bounds else {}
-        return self._accessor(values, ARRAY, FLOAT, len(values), f"VEC{values.shape[1]}", limits)
+        return self._accessor(values, ARRAY, FLOAT, count=len(values), type=f"VEC{values.shape[1]}", **limits)
 
     def indices(self, faces: np.ndarray) -> int:
-        return self._accessor(np.ascontiguousarray(faces, "<u4"), INDICES, UNSIGNED, faces.size, "SCALAR", {})
+        return self._accessor(np.ascontiguousarray(faces, "<u4"), INDICES, UNSIGNED, count=faces.size, type="SCALAR")
 
-    def _accessor(
-        self, values: np.ndarray, target: int, component: int, count: int, kind: str, limits: dict[str, Any]
-    ) -> int:
+    def _accessor(self, values: np.ndarray, target: int, component: int, **more: Any) -> int:
         view = self.view(values.tobytes(), target)
-        self.accessors.append({"bufferView": view, "componentType": component, "count": count, "type": kind, **limits})
+        self.accessors.append({"bufferView": view, "componentType": component, **more})
         return len(self.accessors) - 1
 
 
@@ -162,11 +163,3 @@ def _unit(normals: np.ndarray) -> np.ndarray:
 
 def _flipped(uv: np.ndarray) -> np.ndarray:
     return np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1)
-
-
-def _png(picture: np.ndarray) -> bytes:
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, "PNG")
-    return buffer.getvalue()

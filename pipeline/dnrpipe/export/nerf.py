@@ -18,9 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from PIL import Image
 
 from dnrtrain.atomic import atomic_path, write_json
-from dnrtrain.contract import RASTER_CHANNELS, SceneFrame, View, require_channels
+from dnrtrain.contract import RASTER_CHANNELS, View, require_channels
+from dnrtrain.display import ALPHA_FLOOR, DisplayTransform
 from dnrtrain.exr import read_exr
 
 from ..core.console import Console
@@ -44,6 +47,7 @@ def export_nerf(workspace: Workspace, out: Path, console: Console, *, normalise:
     """
     views = raytraced_views(workspace)
     frame = read_frame(workspace)
+    display = DisplayTransform(frame, workspace.scene)
     claim(out, "nerf")
     scale, shift = (1.0 / frame.radius, -np.asarray(frame.center)) if normalise else (1.0, np.zeros(3))
     files: list[Path] = []
@@ -51,10 +55,10 @@ def export_nerf(workspace: Workspace, out: Path, console: Console, *, normalise:
         for split in SPLITS:
             for view in views[split]:
                 path = out / "images" / split / f"{view.name}.png"
-                write_rgba(path, workspace.raytraced(split, view.name), frame, workspace.scene)
+                write_rgba(path, workspace.raytraced(split, view.name), display)
                 files.append(path)
                 bar.advance()
-    points, colours = _points(workspace, views["train"], frame)
+    points, colours = _points(workspace, views["train"], display)
     cloud = out / "points3d.ply"
     write_points(cloud, (points + shift) * scale, colours)
     moved = {split: [_moved(view, scale, shift) for view in members] for split, members in views.items()}
@@ -81,21 +85,19 @@ def export_nerf(workspace: Workspace, out: Path, console: Console, *, normalise:
     }
 
 
-def write_rgba(path: Path, image: Path, frame: SceneFrame, folder: Path) -> None:
+def write_rgba(path: Path, image: Path, display: DisplayTransform) -> None:
     """A ray-traced EXR as 8-bit PNG: display RGB of the un-premultiplied colour, straight alpha."""
-    import torch
-    from PIL import Image
-
-    from dnrtrain.display import ALPHA_FLOOR, DisplayTransform
-
     channels, _ = read_exr(image)
     require_channels(image, channels, RASTER_CHANNELS, "run `dnrpipe raytrace-selected` again")
-    colour = torch.from_numpy(np.stack([channels[c] for c in "RGB"]))
     alpha = torch.from_numpy(channels["A"]).clamp(0.0, 1.0)
-    shown = DisplayTransform(frame, folder)(colour / alpha.clamp_min(ALPHA_FLOOR)) * (alpha > 0)
-    rgba = torch.cat([shown, alpha[None]]).permute(1, 2, 0).numpy()
+    rgba = torch.cat([_shown(channels, alpha, display) * (alpha > 0), alpha[None]]).permute(1, 2, 0).numpy()
     with atomic_path(path) as temporary:
         Image.fromarray((rgba * 255 + 0.5).astype(np.uint8), "RGBA").save(temporary)
+
+
+def _shown(channels: dict[str, np.ndarray], alpha: torch.Tensor, display: DisplayTransform) -> torch.Tensor:
+    """Display RGB [3, H, W] of the un-premultiplied colour."""
+    return display(torch.from_numpy(np.stack([channels[c] for c in "RGB"])) / alpha.clamp_min(ALPHA_FLOOR))
 
 
 def write_points(path: Path, points: np.ndarray, colours: np.ndarray) -> None:
@@ -177,22 +179,16 @@ def _nerfstudio(views: dict[str, list[View]], shared: dict[str, float] | None, e
     }
 
 
-def _points(workspace: Workspace, views: Sequence[View], frame: SceneFrame) -> tuple[np.ndarray, np.ndarray]:
+def _points(workspace: Workspace, views: Sequence[View], display: DisplayTransform) -> tuple[np.ndarray, np.ndarray]:
     """Positions [P, 3] (world) of the pixels of the training views that see a surface, and their display colours."""
-    import torch
-
-    from dnrtrain.display import ALPHA_FLOOR, DisplayTransform
-
-    display = DisplayTransform(frame, workspace.scene)
     points, colours = [], []
     for view in views:
         surface, _ = read_exr(workspace.passes("train", view.name))
         image, _ = read_exr(workspace.raytraced("train", view.name))
         inside = (surface["mask"] > 0.5) & (image["A"] > 0.5)
         points.append(np.stack([surface[f"position.{c}"][inside] for c in "XYZ"], axis=1))
-        alpha = torch.from_numpy(image["A"]).clamp_min(ALPHA_FLOOR)
-        colour = torch.from_numpy(np.stack([image[c] for c in "RGB"])) / alpha
-        colours.append((display(colour).permute(1, 2, 0).numpy()[inside] * 255 + 0.5).astype(np.uint8))
+        shown = _shown(image, torch.from_numpy(image["A"]), display).permute(1, 2, 0).numpy()
+        colours.append((shown[inside] * 255 + 0.5).astype(np.uint8))
     place, colour = np.concatenate(points), np.concatenate(colours)
     if len(place) > POINTS:
         kept = np.random.default_rng(0).choice(len(place), POINTS, replace=False)

@@ -5,13 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import onnxruntime
+import torch
 
+from dnrtrain import onnx_export
 from dnrtrain.atomic import atomic_path
+from dnrtrain.checkpoint import load_model
 from dnrtrain.contract import View
+from dnrtrain.correction import to_log
 from dnrtrain.exr import read_exr
+from dnrtrain.model import DNR
 
 from .. import __version__
 from ..core.console import Console
@@ -19,10 +25,7 @@ from ..core.errors import UserError
 from ..core.scene_files import read_frame, split_views
 from ..core.workspace import Workspace
 from ..stages.base_images import RENDERED, base_path
-
-if TYPE_CHECKING:
-    from dnrtrain.contract import SceneFrame
-    from dnrtrain.model import DNR
+from ..stages.trainer import load
 
 TOLERANCE = 1e-3
 """Largest difference from torch that passes: a quarter of an 8-bit step. Display space."""
@@ -37,9 +40,6 @@ def export_onnx(workspace: Workspace, out: Path, console: Console) -> dict[str, 
     Raises UserError: no model, views without files, or the two differ by more than TOLERANCE; then `out` is not
     written.
     """
-    from dnrtrain import onnx_export
-    from dnrtrain.checkpoint import load_model
-
     if out.suffix != ".onnx" or out.is_dir():
         raise UserError(f"--out {out}: name a file that ends in .onnx")
     model = load_model(workspace.checkpoints("step2"))
@@ -50,7 +50,7 @@ def export_onnx(workspace: Workspace, out: Path, console: Console) -> dict[str, 
     with atomic_path(out) as temporary:
         onnx_export.export_onnx(temporary, model, frame, workspace.scene, extra)
         with console.bar("comparing with torch", len(views)) as bar:
-            found = [_compare(temporary, workspace, model, frame, view, split, bar) for view in views]
+            found = [_compare(temporary, workspace, model, view, split, bar) for view in views]
         worst = max(row["difference"] for row in found)
         if not worst <= TOLERANCE:
             raise UserError(
@@ -69,15 +69,13 @@ def export_onnx(workspace: Workspace, out: Path, console: Console) -> dict[str, 
 
 def view_inputs(workspace: Workspace, view: View, split: str, base: str, names: Sequence[str]) -> dict[str, np.ndarray]:
     """A view's files as the graph's inputs."""
-    from dnrtrain.onnx_export import graph_inputs
-
     channels, _ = read_exr(workspace.passes(split, view.name))
     if base in RENDERED:
         more, _ = read_exr(base_path(workspace, split, view.name))
         channels |= {name: image for name, image in more.items() if name not in channels}
     elif base == "raster":
         channels |= {f"base.{c}": channels[c] for c in "RGBA"}
-    return graph_inputs(channels, -view.ray_directions(), list(names))
+    return onnx_export.graph_inputs(channels, -view.ray_directions(), list(names))
 
 
 def _views(workspace: Workspace, base: str) -> tuple[str, list[View]]:
@@ -95,32 +93,14 @@ def _views(workspace: Workspace, base: str) -> tuple[str, list[View]]:
     raise UserError(f"{workspace.root}: no view has its files; run `dnrpipe evaluate` first")
 
 
-def _compare(
-    path: Path, workspace: Workspace, model: DNR, frame: SceneFrame, view: View, split: str, bar: Any
-) -> dict[str, Any]:
+def _compare(path: Path, workspace: Workspace, model: DNR, view: View, split: str, bar: Any) -> dict[str, Any]:
     """Largest differences of one view's picture from torch's, whole and cut to an odd size; median milliseconds."""
-    import onnxruntime
-    import torch
-
-    from dnrtrain.correction import to_log
-    from dnrtrain.dataset import load_views
-    from dnrtrain.onnx_export import input_names
-
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     base = model.settings.base
-    batch = load_views(
-        [workspace.passes(split, view.name)],
-        None,
-        frame,
-        cameras=[view],
-        folder=workspace.scene,
-        target=False,
-        base=base,
-        base_files=[base_path(workspace, split, view.name)] if base in RENDERED else None,
-    ).batch([0])
-    inputs = view_inputs(workspace, view, split, base, input_names(model.settings))
+    batch = load(workspace, [view], split, base=base).batch([0])
+    inputs = view_inputs(workspace, view, split, base, onnx_export.input_names(model.settings))
     height, width = (min(side, odd) for side, odd in zip((view.height, view.width), ODD, strict=True))
     differences, seconds = {}, []
     for name, rows, columns in (("whole", view.height, view.width), ("cut", height, width)):

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
+import torch.nn.functional as F
 
 from ..core.console import Console
 from ..core.errors import UserError
@@ -58,7 +60,8 @@ def surface_maps(workspace: Workspace, console: Console) -> SurfaceMaps:
         bar.advance(note=f"{size}² texels")
         with np.load(task["output"], allow_pickle=False) as data:
             maps = {name: data[name] for name in data.files}
-    lit = np.stack([_enlarged(side, size) for side in light[0]])
+    sides = torch.from_numpy(light[0]).permute(0, 3, 1, 2)
+    lit = F.interpolate(sides, (size, size), mode="bilinear", align_corners=False).permute(0, 2, 3, 1).numpy()
     radiance = np.zeros((2, size, size, 4), np.float32)
     radiance[..., :3] = maps["albedo"] * lit + maps["emission"]
     radiance[..., 3] = maps["opacity"]
@@ -78,13 +81,3 @@ def read_baked_light(workspace: Workspace) -> np.ndarray:
     if light.ndim != 5 or light.shape[:2] != (2, 2) or light.shape[2] != light.shape[3]:
         raise UserError(f"{path}: was baked by an older dnrpipe; run `dnrpipe raytrace-selected` again")
     return light
-
-
-def _enlarged(image: np.ndarray, size: int) -> np.ndarray:
-    """[n, n, 3] at size², bilinear, texel centres at half integers."""
-    import torch
-    import torch.nn.functional as F
-
-    tensor = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None]
-    grown = F.interpolate(tensor, (size, size), mode="bilinear", align_corners=False)
-    return grown[0].permute(1, 2, 0).numpy()

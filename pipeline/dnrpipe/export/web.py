@@ -12,20 +12,31 @@ offline.js              all of the above once more as text: pages opened from di
 from __future__ import annotations
 
 import base64
+import hashlib
 import json
+import os
+import shutil
+import subprocess
+import tarfile
+import tempfile
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import torch
 
+from dnrtrain import onnx_export
 from dnrtrain.atomic import atomic_path, write_json, write_text
 from dnrtrain.contract import View
+from dnrtrain.metrics import psnr
+from dnrtrain.model import DNR, compose, render_views
 from dnrtrain.records import read
 
 from .. import __version__
 from ..core.console import Console
+from ..core.errors import UserError
 from ..core.scene_files import read_frame, read_selection
 from ..core.workspace import Workspace
 from ..stages.records import METRICS, Metrics
@@ -36,16 +47,19 @@ from .gltf import glb
 from .meshes import read_meshes
 from .nerf import raytraced_views
 from .surface import SurfaceMaps, read_baked_light, surface_maps
-from .vendor import FILES, runtime
-from .web_check import check_page
-from .web_model import train, web_views
-
-if TYPE_CHECKING:
-    from dnrtrain.model import DNR
+from .web_model import check_page, half, train, web_views
 
 TRAINING = ".training"
 """Of the export's folder: the checkpoint, so that an interrupted export goes on where it stopped."""
 EMBEDDED = ("scene.glb", "light-front.bin", "light-back.bin", "model.onnx")
+ORT_VERSION = "1.30.0"
+ORT_SHA256 = "d2228df7e4616bc3348bf504ee888f3bec43789a273f0a63f3e68d203ce3bf71"
+ORT_FILES = (
+    "ort.wasm.bundle.min.mjs",
+    "ort-wasm-simd-threaded.wasm",
+    "ort.webgpu.bundle.min.mjs",
+    "ort-wasm-simd-threaded.asyncify.wasm",
+)
 
 
 def export_web(
@@ -53,22 +67,12 @@ def export_web(
 ) -> dict[str, Any]:
     """Train the page's network, write the folder, and measure the network on the held-out views (by torch).
 
-    Args:
-        workspace: with baked light and ray-traced views.
-        out: the folder, new or an earlier export of the same kind.
-        console: for progress.
-        epochs: of training; None: 40, more for few views.
-        check: also open the page in a browser (`web_check`).
+    out: new, or an earlier export of the same kind. epochs: of training; None: 40, more for few views. check: also
+    open the page in a browser. Returns folder, bytes, the figures of `held_out`, with `check` those of `check_page`.
 
-    Returns:
-        folder, bytes, the figures of `held_out`, and with `check` those of `check_page`.
-
-    Raises:
-        UserError: no baked light, no ray-traced views, no npm, or a folder that is not ours to write; with `check`
-            also no Chromium.
+    Raises UserError: no baked light, no ray-traced views, no npm, or a folder that is not ours to write; with `check`
+    also no Chromium.
     """
-    from dnrtrain import onnx_export
-
     settings = resolve_settings(workspace, {}, None)
     views = raytraced_views(workspace)
     read_baked_light(workspace)
@@ -80,30 +84,24 @@ def export_web(
     maps = surface_maps(workspace, console)
     model = train(workspace, settings, console, views["train"], maps, out / TRAINING, epochs)
     quality = held_out(workspace, model, views["test"], maps)
-    with atomic_path(out / "scene.glb") as temporary:
-        temporary.write_bytes(glb(meshes, None))
-    for name, side in zip(("front", "back"), maps.radiance, strict=True):
-        with atomic_path(out / f"light-{name}.bin") as temporary:
-            texels = np.clip(side, 0, 65504).astype("<f2")
-            temporary.write_bytes(texels.tobytes() if name == "front" or maps.thin else b"")
-    frame = read_frame(workspace)
-    onnx_export.export_onnx(out / "model.onnx", model, frame, workspace.scene, {"dnrpipe": __version__})
-    write_json(out / "scene.json", _scene(workspace, views, maps, quality))
-    for name in ("index.html", "viewer.js"):
-        write_text(out / name, (files("dnrpipe.export") / "page" / name).read_text(encoding="utf-8"))
-    for name in (*FILES, "LICENSE"):
-        with atomic_path(out / "ort" / name) as temporary:
-            temporary.write_bytes((vendored / name).read_bytes())
-    embedded = (*EMBEDDED, *(f"ort/{name}" for name in FILES[:2]))
-    offline = {
-        "scene": json.loads((out / "scene.json").read_text(encoding="utf-8")),
-        "files": {name: base64.b64encode((out / name).read_bytes()).decode("ascii") for name in embedded},
+    front, back = half(maps.radiance)
+    contents = {
+        "scene.glb": glb(meshes, None),
+        "light-front.bin": front.tobytes(),
+        "light-back.bin": back.tobytes() if maps.thin else b"",
+        **{name: (files("dnrpipe.export") / "page" / name).read_bytes() for name in ("index.html", "viewer.js")},
+        **{f"ort/{name}": (vendored / name).read_bytes() for name in (*ORT_FILES, "LICENSE")},
     }
-    write_text(out / "offline.js", f"window.DNR_OFFLINE = {json.dumps(offline)};\n")
-    written = [
-        *(out / name for name in (*EMBEDDED, "scene.json", "index.html", "viewer.js", "offline.js")),
-        *(out / "ort" / name for name in (*FILES, "LICENSE")),
-    ]
+    for name, content in contents.items():
+        with atomic_path(out / name) as temporary:
+            temporary.write_bytes(content)
+    frame, scene = read_frame(workspace), _scene(workspace, views, maps, quality)
+    onnx_export.export_onnx(out / "model.onnx", model, frame, workspace.scene, {"dnrpipe": __version__})
+    write_json(out / "scene.json", scene)
+    embedded = (*EMBEDDED, *(f"ort/{name}" for name in ORT_FILES[:2]))
+    encoded = {name: base64.b64encode((out / name).read_bytes()).decode("ascii") for name in embedded}
+    write_text(out / "offline.js", f"window.DNR_OFFLINE = {json.dumps({'scene': scene, 'files': encoded})};\n")
+    written = [out / name for name in (*contents, "model.onnx", "scene.json", "offline.js")]
     finish(out, "web", written)
     answer = {"folder": str(out), "bytes": sum(path.stat().st_size for path in written), **quality}
     if check:
@@ -114,11 +112,6 @@ def export_web(
 
 def held_out(workspace: Workspace, model: DNR, views: Sequence[View], maps: SurfaceMaps) -> dict[str, Any]:
     """Mean PSNR of the page's network and of its base image on the held-out views, over white, dB; by torch."""
-    import torch
-
-    from dnrtrain.metrics import psnr
-    from dnrtrain.model import compose, render_views
-
     data = web_views(workspace, views, "test", maps)
     tensors = data.tensors
     assert tensors.target is not None and tensors.base is not None and tensors.display is not None
@@ -150,3 +143,36 @@ def _scene(workspace: Workspace, views: dict[str, list[View]], maps: SurfaceMaps
         "distance": float(np.median([np.linalg.norm(view.position - frame.center) for view in views["train"]])),
         "trained_on": len(read_selection(workspace).views),
     }
+
+
+def runtime() -> Path:
+    """The folder of onnxruntime-web (ORT_FILES, ``LICENSE``) in the cache; fetched by npm the first time, and checked.
+
+    Raises UserError: no npm, no network, or other bytes than expected.
+    """
+    cache = Path(os.environ.get("DNRPIPE_CACHE") or Path.home() / ".cache" / "dnrpipe")
+    folder = cache / f"onnxruntime-web-{ORT_VERSION}"
+    if all((folder / name).is_file() for name in (*ORT_FILES, "LICENSE")):
+        return folder
+    npm = shutil.which("npm")
+    if npm is None:
+        raise UserError("npm is not installed: the page needs onnxruntime-web from it, once; install Node.js")
+    with tempfile.TemporaryDirectory(prefix="dnrpipe-") as scratch:
+        command = [npm, "pack", f"onnxruntime-web@{ORT_VERSION}", "--silent"]
+        done = subprocess.run(command, cwd=scratch, capture_output=True, text=True, timeout=600, check=False)
+        (archive,) = [*Path(scratch).glob("*.tgz")] or [None]
+        if done.returncode != 0 or archive is None:
+            reason = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
+            raise UserError(f"npm did not deliver onnxruntime-web {ORT_VERSION} ({reason}); try again with a network")
+        found = hashlib.sha256(archive.read_bytes()).hexdigest()
+        if found != ORT_SHA256:
+            raise UserError(f"onnxruntime-web {ORT_VERSION} from npm has other bytes than expected (sha256 {found})")
+        with tarfile.open(archive) as content:
+            for name in ORT_FILES:
+                member = content.extractfile(f"package/dist/{name}")
+                assert member is not None
+                with atomic_path(folder / name) as temporary:
+                    temporary.write_bytes(member.read())
+    licence = files("dnrpipe.export") / "page" / "onnxruntime-LICENSE"
+    write_text(folder / "LICENSE", licence.read_text(encoding="utf-8").format(version=ORT_VERSION))
+    return folder

@@ -1,4 +1,4 @@
-"""The network of the page: the default one, over a base image that a browser can draw.
+"""The network of the page: the default one, over a base image that a browser can draw. Trained, and checked there.
 
 A browser has no ray tracer, so its base image is the diffuse outgoing light of the surfaces (`surface`), looked up once
 a pixel; the network learns mirrors, glass and highlights. The workspace's own network corrects a richer base image and
@@ -7,65 +7,63 @@ would be wrong over this one, so the export trains another on the same ray-trace
 
 from __future__ import annotations
 
+import base64
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
 
+from dnrtrain.checkpoint import load_model
 from dnrtrain.contract import View
+from dnrtrain.dataset import Batch, ViewSet
+from dnrtrain.display import DisplayTransform
 from dnrtrain.events import EpochEnd, Note
+from dnrtrain.metrics import psnr
+from dnrtrain.model import DNR, render_views
 from dnrtrain.settings import ModelSettings, Step2Settings
+from dnrtrain.step2 import run_step2
 
 from ..core.console import Console
 from ..core.scene_files import read_frame
 from ..core.settings import PRESETS, Settings
 from ..core.workspace import Workspace, digest
 from ..stages.trainer import epochs_done, load, perceptual_weights, torch_device
+from .browser import open_page, wait_for
 from .surface import SurfaceMaps
 
 if TYPE_CHECKING:
-    from dnrtrain.dataset import Batch, ViewSet
-    from dnrtrain.model import DNR
-
+    from playwright.sync_api import Page
 
 STEPS = 1500
 """Training takes at least so many, whatever the number of views."""
-
-
-def web_settings(settings: Settings, views: int, epochs: int | None) -> tuple[ModelSettings, Step2Settings]:
-    """Draft's sizes (milliseconds count), the scene's texture size, and a base image without specular part."""
-    draft = PRESETS["draft"]
-    size = min(settings.model.texture_size, 256)
-    model = ModelSettings.model_validate({**draft["model"], "base": "raster", "texture_size": size})
-    step2 = Step2Settings.model_validate({**draft["finetune"]["step2"], "patch": 192})
-    wanted = epochs or max(step2.epochs, -(-STEPS // views))
-    return model, step2.model_copy(update={"epochs": wanted})
+CHANNELS = {"uv": 2, "mask": 1, "coverage": 1, "view_dir": 3, "normal": 3, "base": 4, "rgb": 3}
+"""What the page draws and renders of a view, and how many channels each has."""
 
 
 def web_views(workspace: Workspace, views: Sequence[View], split: str, maps: SurfaceMaps) -> ViewSet:
     """The views with the base image that the page would draw, and ray-traced targets."""
-    from dnrtrain.display import DisplayTransform
-
     loaded = load(workspace, list(views), split, raytraced=True)
     base = base_images(loaded.tensors, maps)
     display = DisplayTransform(read_frame(workspace), workspace.scene)
     return replace(loaded, tensors=replace(loaded.tensors, base=base, display=display))
 
 
-def base_images(views: Batch, maps: SurfaceMaps) -> Any:
+def base_images(views: Batch, maps: SurfaceMaps) -> Tensor:
     """[N, 3, H, W] linear: bilinear look-ups of the side that is seen, as the page's shader makes them."""
-    import torch
-    import torch.nn.functional as F
 
-    def sampled(image: np.ndarray, mode: str) -> Any:
+    def sampled(image: np.ndarray, mode: str) -> Tensor:
         texels = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None]
         grid = views.uv.permute(0, 2, 3, 1)
         parts = [F.grid_sample(texels, g[None], mode, padding_mode="border", align_corners=False) for g in grid]
         return torch.cat(parts)
 
-    front, back = (sampled(half(side[..., :3]), "bilinear") for side in maps.radiance)
+    front, back = (sampled(half(side[..., :3]).astype(np.float32), "bilinear") for side in maps.radiance)
     if not maps.thin:
         return front * views.mask
     # The files do not say which side of a sheet is seen: the shading normal faces the camera, the triangle's need not.
@@ -75,7 +73,7 @@ def base_images(views: Batch, maps: SurfaceMaps) -> Any:
 
 def half(image: np.ndarray) -> np.ndarray:
     """Round to the texture's format, 16-bit floats; clip what is brighter than their maximum."""
-    return np.clip(image, 0, 65504).astype(np.float16).astype(np.float32)
+    return np.clip(image, 0, 65504).astype("<f2")
 
 
 def train(
@@ -88,10 +86,11 @@ def train(
     epochs: int | None,
 ) -> DNR:
     """Train the page's network in `folder`, or resume an interrupted training; float32 for inference."""
-    from dnrtrain.checkpoint import load_model
-    from dnrtrain.step2 import run_step2
-
-    model, step2 = web_settings(settings, len(views), epochs)
+    # Draft's sizes (milliseconds count), the scene's texture size, and a base image without specular part.
+    draft, size = PRESETS["draft"], min(settings.model.texture_size, 256)
+    model = ModelSettings.model_validate({**draft["model"], "base": "raster", "texture_size": size})
+    step2 = Step2Settings.model_validate({**draft["finetune"]["step2"], "patch": 192})
+    step2 = step2.model_copy(update={"epochs": epochs or max(step2.epochs, -(-STEPS // len(views)))})
     data = web_views(workspace, views, "train", maps)
     weights = perceptual_weights(console)
     fingerprint = digest([float(maps.radiance.sum(dtype=np.float64)), [view.model_dump(mode="json") for view in views]])
@@ -110,3 +109,61 @@ def train(
     found = load_model(folder)
     found.use_bfloat16 = False
     return found
+
+
+def check_page(out: Path, views: Sequence[View], data: ViewSet, model: DNR, console: Console) -> dict[str, Any]:
+    """Open ``out/index.html`` from disk in a headless Chromium (software GL) and render the views.
+
+    data: the same views by their files (`web_views`), with ray-traced targets. Returns means over the views, dB:
+    `psnr_torch`, the page's picture against torch on the inputs that the page drew; `psnr_files`, against torch on
+    Blender's G-buffers; `psnr_truth`, against the ray-traced view; also `mask_agrees`, the share of pixels whose mask
+    agrees with Blender's, and milliseconds by stage. Raises UserError: no Chromium, or the page failed in it.
+    """
+    assert data.tensors.target is not None
+    expected = render_views(model, data)
+    rows: list[dict[str, float]] = []
+    address = (out.resolve() / "index.html").as_uri()
+    with open_page(address) as (page, _), console.bar("views in Chromium", len(views)) as bar:
+        wait_for(page, "window.dnr.then(() => true)")
+        for index, view in enumerate(views):
+            drawn = probe(page, view)
+            batch = page_batch(data.batch([index]), drawn)
+            with torch.no_grad():
+                same = model(batch).rgb.clamp(0.0, 1.0)
+            shown = torch.from_numpy(drawn["rgb"])[None]
+            rows.append(
+                {
+                    "psnr_torch": float(psnr(shown, same)),
+                    "psnr_files": float(psnr(shown, expected[index : index + 1])),
+                    "psnr_truth": float(psnr(shown, data.tensors.target[index : index + 1])),
+                    "mask_agrees": float((batch.mask == data.tensors.mask[index : index + 1]).float().mean()),
+                }
+            )
+            bar.advance(note=f"{rows[-1]['psnr_torch']:.1f} dB")
+        figures = wait_for(page, "window.dnr.then(page => page.figures())")
+    means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+    return {**means, "views": len(rows), **{k: v for k, v in figures.items() if k not in ("fps", "frames")}}
+
+
+def probe(page: Page, view: View) -> dict[str, np.ndarray]:
+    """What the page draws and renders of a view: its inputs and `rgb`, float32 [C, H, W] each."""
+    answer = wait_for(page, f"window.dnr.then(page => page.probe({json.dumps(view.model_dump(mode='json'))}))")
+    return {
+        name: np.frombuffer(base64.b64decode(answer[name]), "<f4").reshape(count, view.height, view.width).copy()
+        for name, count in CHANNELS.items()
+    }
+
+
+def page_batch(batch: Batch, drawn: dict[str, np.ndarray]) -> Batch:
+    """`batch` (one view) with the page's inputs instead of those from files."""
+    maps = {name: torch.from_numpy(image)[None] for name, image in drawn.items()}
+    mask = (maps["mask"] > 0.5).float()
+    return replace(
+        batch,
+        uv=(2.0 * maps["uv"] - 1.0) * mask,
+        mask=mask,
+        coverage=maps["coverage"],
+        view_dir=maps["view_dir"],
+        normal=maps["normal"] * mask,
+        base=maps["base"][:, :3] * mask,
+    )

@@ -15,11 +15,7 @@ def build_report(workspace_dir: Path, *, made_at: datetime | None = None) -> Pat
     """Write `report/report.html` and `report/report.json` (the same figures, for machines).
 
     It shows the stages that have run, and names the commands for the rest. Returns the path of the HTML file.
-    made_at: the date shown, now (UTC) when None.
-
-    Raises:
-        UserError: not a workspace, or one of its files is damaged.
-        OSError: the report folder cannot be written.
+    made_at: the date shown, now (UTC) when None. Raises UserError: not a workspace, or one of its files is damaged.
     """
     from dnrtrain.atomic import write_json, write_text
 
@@ -29,5 +25,5 @@ def build_report(workspace_dir: Path, *, made_at: datetime | None = None) -> Pat
     data = collect(Path(workspace_dir), made_at=made_at)
     path = Path(workspace_dir) / "report" / "report.html"
     write_text(path, render_html(data))
-    write_json(path.with_suffix(".json"), data.figures())
+    write_json(path.with_suffix(".json"), data.model_dump(mode="json"))
     return path

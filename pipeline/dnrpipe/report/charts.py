@@ -1,7 +1,10 @@
-"""Small charts as inline SVG: real text, the page's own colours (so light and dark both fit), no script.
+"""Small charts, and the cameras around the scene, as inline SVG: real text, the page's own colours, no script.
 
 Series differ by colour *and* dash, bars by colour *and* hatching, so a grey print still tells them apart.
-Colours are CSS classes ``c0`` .. ``c6`` (Okabe & Ito 2008, tuned per theme in the template).
+Colours are CSS classes ``c0`` .. ``c6`` (Okabe & Ito 2008, tuned per theme in the template: light and dark both fit).
+
+Cameras: axes are the world's (Z up). Shape and colour both tell roles apart: ring = candidate, numbered disc = chosen
+(number: order of selection), triangle = held-out test view.
 """
 
 from __future__ import annotations
@@ -9,10 +12,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 from markupsafe import Markup, escape
 
+from .data import Sphere, SphereView
+
 WIDTH = 480
+SPHERE_SIZE = 360
+_UNIT = SPHERE_SIZE / 2 - 34  # px: the sphere's radius; a margin for the names of the axes
+Projection = Literal["top", "front", "oblique"]
+PROJECTIONS: dict[Projection, str] = {
+    "top": "Cameras seen from above",
+    "front": "Cameras seen from the front",
+    "oblique": "Cameras seen obliquely",
+}
+AZIMUTH, ELEVATION = math.radians(-60.0), math.radians(25.0)  # of the oblique view; the script starts there
 _LINE = 14.0  # px between two labels
 _CHARACTER = 8.0  # px: a wide character at the larger size that phones get
 
@@ -128,7 +143,7 @@ def line_chart(series: Sequence[Series], title: str, x_label: str, y_label: str,
     return canvas.svg()
 
 
-def bar_chart(bars: Sequence[Bar], title: str, *, width: float = WIDTH) -> Markup:
+def bar_chart(bars: Sequence[Bar], title: str) -> Markup:
     """Horizontal bars on a common linear scale from zero."""
     largest = max((math.fsum(s.value for s in bar.segments) for bar in bars), default=0.0)
     if largest <= 0:
@@ -136,13 +151,13 @@ def bar_chart(bars: Sequence[Bar], title: str, *, width: float = WIDTH) -> Marku
     left = 12.0 + _CHARACTER * max(len(bar.label) for bar in bars)
     right = 14.0 + _CHARACTER * max(len(bar.text) for bar in bars)
     row = 34.0
-    canvas = _Canvas(width, row * len(bars) + 6, title)
+    canvas = _Canvas(WIDTH, row * len(bars) + 6, title)
     for index, bar in enumerate(bars):
         y = index * row + 6
         canvas.text(left - 8, y + 17, bar.label, "label", "end")
         x = left
         for segment in bar.segments:
-            span = segment.value / largest * (width - left - right)
+            span = segment.value / largest * (WIDTH - left - right)
             canvas.parts.append(
                 f'<rect x="{x:.2f}" y="{y:.1f}" width="{span:.2f}" height="24" class="{segment.kind}">'
                 f"<title>{escape(segment.title)}</title></rect>"
@@ -194,12 +209,12 @@ def dot_chart(dots: Sequence[Dot], title: str, x_label: str, y_label: str, *, fr
     return canvas.svg()
 
 
-def linear_ticks(low: float, high: float, *, count: int = 5, whole: bool = False) -> list[float]:
-    """Round values (1, 2 or 5 × a power of ten) that enclose [low, high]; about ``count`` steps."""
+def linear_ticks(low: float, high: float, *, whole: bool = False) -> list[float]:
+    """Round values (1, 2 or 5 × a power of ten) that enclose [low, high]; about five steps."""
     if not high > low:
         pad = max(abs(low) * 0.1, 1.0 if whole else 1e-3)
         low, high = low - pad, high + pad
-    raw = (high - low) / count
+    raw = (high - low) / 5
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(f * power for f in (1, 2, 5, 10) if f * power >= raw * 0.999)
     step = max(step, 1.0) if whole else step
@@ -241,3 +256,63 @@ def short_number(value: float) -> str:
         return text if text not in ("-0", "") else "0"
     exponent = math.floor(math.log10(abs(value)) + 1e-9)
     return f"{value / 10.0**exponent:.3g}e{exponent}"
+
+
+def sphere_svg(sphere: Sphere, projection: Projection) -> Markup:
+    """One projection of all cameras. Marks far from the eye are paler and drawn first."""
+    half = SPHERE_SIZE / 2
+    parts = [
+        f'<circle cx="{half}" cy="{half}" r="{_UNIT:.1f}" class="globe"/>',
+        f'<circle cx="{half}" cy="{half}" r="{max(2.0, sphere.radius * _UNIT):.1f}" class="scene">'
+        "<title>bounding sphere of the scene</title></circle>",
+    ]
+    for name, vector in (("X", (1.0, 0.0, 0.0)), ("Y", (0.0, 1.0, 0.0)), ("Z", (0.0, 0.0, 1.0))):
+        x, y, _ = project(vector, projection)
+        if math.hypot(x, y) < 0.1:  # this axis points at the eye
+            continue
+        data = f'data-p="{vector[0]:.0f} {vector[1]:.0f} {vector[2]:.0f}"'
+        parts.append(
+            f'<g class="axis3" {data}><line x1="{half}" y1="{half}" x2="{half + x * _UNIT:.1f}" '
+            f'y2="{half - y * _UNIT:.1f}" class="frame"/><text x="{half + x * (_UNIT + 16):.1f}" '
+            f'y="{half - y * (_UNIT + 16) + 4:.1f}" text-anchor="middle" class="axis">{name}</text></g>'
+        )
+    placed = [(project(view.position, projection), view) for view in sphere.views]
+    rank = {"candidate": 0, "test": 1, "chosen": 2}
+    for (x, y, depth), view in sorted(placed, key=lambda p: (p[0][2] >= 0, rank[p[1].role], p[0][2])):
+        parts.append(_mark(view, half + x * _UNIT, half - y * _UNIT, depth))
+    turn = ' data-turn=""' if projection == "oblique" else ""
+    return Markup(
+        f'<svg class="sphere" viewBox="0 0 {SPHERE_SIZE} {SPHERE_SIZE}" role="img"{turn} '
+        f'aria-label="{PROJECTIONS[projection]}">{"".join(parts)}</svg>'
+    )
+
+
+def project(position: tuple[float, float, float], projection: Projection) -> tuple[float, float, float]:
+    """World -> (right, up, towards the eye), all in units of the sphere's scale."""
+    x, y, z = position
+    if projection == "top":
+        return x, y, z
+    if projection == "front":  # the eye stands at -Y, as Blender's front view
+        return x, z, -y
+    # The eye's direction is (cos el cos az, cos el sin az, sin el).
+    ca, sa = math.cos(AZIMUTH), math.sin(AZIMUTH)
+    ce, se = math.cos(ELEVATION), math.sin(ELEVATION)
+    return -sa * x + ca * y, -se * (ca * x + sa * y) + ce * z, ce * (ca * x + sa * y) + se * z
+
+
+def _mark(view: SphereView, x: float, y: float, depth: float) -> str:
+    px, py, pz = view.position
+    psnr = f", {view.psnr:.1f} dB" if view.psnr is not None else ""
+    role = {"candidate": "candidate", "test": "test view", "chosen": f"chosen as number {view.order}"}[view.role]
+    title = escape(f"{view.name}: {role}{psnr}")
+    if view.role == "chosen":
+        shape = f'<circle r="9.5" class="chosen"/><text y="3.7" text-anchor="middle" class="order">{view.order}</text>'
+    elif view.role == "test":
+        shape = '<path d="M0 -5.2L4.8 3.6L-4.8 3.6Z" class="test"/>'
+    else:
+        shape = '<circle r="3.4" class="candidate"/>'
+    far = " far" if depth < 0 else ""
+    return (
+        f'<g class="view{far}" transform="translate({x:.1f} {y:.1f})" '
+        f'data-p="{px:.4f} {py:.4f} {pz:.4f}"><title>{title}</title>{shape}</g>'
+    )

@@ -6,6 +6,7 @@ import json
 import math
 import statistics
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
@@ -25,7 +26,7 @@ from .advice import missing, notes, verdict
 from .budget import build_budget
 from .coverage import coverage_maps
 from .data import ChosenView, FindingGroup, ReportData, Selection, Sphere, SphereView, Training
-from .pictures import ExrPictures
+from .pictures import load_exr
 from .quality import build_quality
 
 KINDS: dict[FindingKind, tuple[str, bool]] = {
@@ -45,58 +46,61 @@ Model = TypeVar("Model", bound=BaseModel)
 R = TypeVar("R")
 
 
-class Outline(BaseModel):
+@dataclass(frozen=True)
+class Outline:
     """A workspace's figures without pictures: quick enough to read while a stage runs.
 
-    psnr: dB by test view, in the order of the evaluation.
+    cameras: train and test. selected: the chosen views by their names in the ledger; None before there are any.
     """
 
+    cameras: dict[str, list[View]]
+    metrics: Metrics | None
+    chosen: SelectionRecord | None
+    selected: set[str] | None
     sphere: Sphere | None
     training: list[Training]
-    psnr: dict[str, float | None]
+    records: list[CostRecord]
     costs: CostSummary
 
 
 def outline(root: Path) -> Outline:
     """Read a workspace's figures. Raises UserError: a file is damaged."""
-    views = {split: _read_views(root, split) for split in ("train", "test")}
+    cameras = {split: _read_views(root, split) for split in ("train", "test")}
     metrics = _read_model(root / "evaluation" / METRICS, Metrics, "evaluate")
     chosen = _read_model(root / "selection.json", SelectionRecord, "select")
     selected = {f"train/{name}" for name in chosen.views} if chosen else None
+    ledger = Ledger(root / "costs.jsonl")
+    records, candidates, truncated = ledger.read(), len(cameras["train"]) or None, ledger.truncated_records()
     return Outline(
-        sphere=_sphere(root, views, chosen, metrics),
+        cameras=cameras,
+        metrics=metrics,
+        chosen=chosen,
+        selected=selected,
+        sphere=_sphere(root, cameras, chosen, metrics),
         training=[t for t in (_training(root, step) for step in (1, 2)) if t],
-        psnr={view.name: view.psnr for view in metrics.views} if metrics else {},
-        costs=summarise(Ledger(root / "costs.jsonl").read(), n_candidates=len(views["train"]) or None, only=selected),
+        records=records,
+        costs=summarise(records, n_candidates=candidates, only=selected, truncated_records=truncated),
     )
 
 
 def collect(root: Path, *, made_at: datetime | None = None) -> ReportData:
     """Read a workspace. Parts whose stage has not run are None and listed in ``missing``.
 
-    Raises:
-        UserError: not a workspace, or one of its files is damaged; names the file and the remedy.
+    Raises UserError: not a workspace, or one of its files is damaged; names the file and the remedy.
     """
     root = Path(root).resolve()
     manifest = _read_json(root / "manifest.json", "prepare")
     if manifest is None:
         raise UserError(f"{root}: not a dnrpipe workspace; make one with `dnrpipe prepare SCENE`")
-    cameras = {split: _read_views(root, split) for split in ("train", "val", "test")}
-    metrics = _read_model(root / "evaluation" / METRICS, Metrics, "evaluate")
-    chosen = _read_model(root / "selection.json", SelectionRecord, "select")
-    ledger = Ledger(root / "costs.jsonl")
-    records = ledger.read()
-    selected = {f"train/{name}" for name in chosen.views} if chosen else None
-    candidates, truncated = len(cameras["train"]) or None, ledger.truncated_records()
-    summary = summarise(records, n_candidates=candidates, only=selected, truncated_records=truncated)
-    quality = build_quality(root, metrics, records) if metrics else None
-    selection = _selection(root, chosen, records, cameras["train"]) if chosen else None
-    training = [t for t in (_training(root, step) for step in (1, 2)) if t]
-    upfront = upfront_seconds(records, selected) if records else None
+    known = outline(root)
+    records, training, cameras = known.records, known.training, known.cameras
+    quality = build_quality(root, known.metrics, records) if known.metrics else None
+    selection = _selection(root, known.chosen, records, cameras["train"]) if known.chosen else None
+    upfront = upfront_seconds(records, known.selected) if records else None
     break_even = None
     if quality and upfront and quality.traced_seconds and quality.frame_seconds:
         break_even = break_even_frames(upfront, quality.traced_seconds, quality.frame_seconds)
-    sizes = {(v.width, v.height) for views in cameras.values() for v in views}
+    sizes = {(v.width, v.height) for views in (*cameras.values(), _read_views(root, "val")) for v in views}
     source = manifest.get("source", {})
     source_name = Path(str(source.get("path", ""))).name or root.stem
     return ReportData(
@@ -108,13 +112,13 @@ def collect(root: Path, *, made_at: datetime | None = None) -> ReportData:
         resolution=" and ".join(f"{w} × {h}" for w, h in sorted(sizes)) or None,
         made_at=(made_at or datetime.now(UTC)).strftime("%Y-%m-%d %H:%M UTC"),
         verdict=verdict(quality, selection),
-        notes=notes(quality, selection, training, summary, manifest, upfront, break_even),
+        notes=notes(quality, selection, training, known.costs, manifest, upfront, break_even),
         missing=missing(root, cameras, selection, training, quality),
         quality=quality,
         selection=selection,
-        sphere=_sphere(root, cameras, chosen, metrics),
+        sphere=known.sphere,
         training=training,
-        costs=summary if records else None,
+        costs=known.costs if records else None,
         budget=build_budget(root, quality, upfront),
         break_even=break_even,
         upfront_seconds=upfront,
@@ -172,9 +176,11 @@ def _read_views(root: Path, split: str) -> list[View]:
 def _selection(
     root: Path, chosen: SelectionRecord, records: Sequence[CostRecord], candidates: Sequence[View]
 ) -> Selection:
+    from dnrtrain.display import DisplayTransform
+
     frame = _read_model(root / "scene" / "frame.json", SceneFrame, "prepare")
     try:
-        exr = ExrPictures(root, frame) if frame else None
+        display = DisplayTransform(frame, root / "scene") if frame else None
     except ContractError as error:
         raise UserError(str(error)) from None
     tracing = {r.name: r for r in traced_views(records, "training")}
@@ -185,18 +191,14 @@ def _selection(
             ChosenView(
                 order=order,
                 name=name,
-                seconds=record.seconds if record else None,
-                spp=record.spp if record else None,
-                noise=record.noise if record else None,
-                raster=exr.load(f"passes/train/{name}.exr") if exr else None,
-                traced=exr.load(f"raytraced/train/{name}.exr") if exr else None,
+                **(record.model_dump(include={"seconds", "spp", "noise"}) if record else {}),
+                raster=load_exr(root, f"passes/train/{name}.exr", display) if display else None,
+                traced=load_exr(root, f"raytraced/train/{name}.exr", display) if display else None,
                 why=chosen.why[order - 1] if order <= len(chosen.why) else None,
             )
         )
     return Selection(
-        policy=chosen.policy,
-        seed=chosen.seed,
-        budget=chosen.budget,
+        **chosen.model_dump(include={"policy", "seed", "budget"}),
         views=views,
         traced=sum((root / "raytraced" / "train" / f"{name}.exr").is_file() for name in chosen.views),
         candidates=len(candidates),

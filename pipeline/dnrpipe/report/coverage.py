@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from dnrtrain.contract import ContractError, View
 from dnrtrain.selector.explain import NOT_SEEN, nearest_cosines
@@ -82,7 +83,6 @@ def _cells(visibility: SurfaceVisibility, chosen: int) -> tuple[np.ndarray, np.n
 def _picture(values: np.ndarray, there: np.ndarray, unseen: np.ndarray, what: str) -> Picture:
     """Values [G, G] in [0, 1], V up -> an opaque-where-``there`` picture with V upwards."""
     from matplotlib import colormaps
-    from PIL import Image
 
     rgba = np.zeros((*values.shape, 4), np.uint8)
     rgba[..., :3] = np.rint(colormaps["viridis"](values)[..., :3] * 255)

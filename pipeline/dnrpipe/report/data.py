@@ -6,7 +6,7 @@ Lengths are in scene units, times in seconds (wall unless said), image metrics i
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -21,7 +21,7 @@ class _Frozen(BaseModel):
 class Picture(_Frozen):
     """An image as a data URI. ``file``: where the full-size original lies, relative to the workspace."""
 
-    uri: str = Field(repr=False)
+    uri: str = Field(repr=False, exclude=True)
     width: int
     height: int
     file: str
@@ -108,9 +108,9 @@ class ChosenView(_Frozen):
 
     order: int
     name: str
-    seconds: float | None
-    spp: int | None
-    noise: float | None
+    seconds: float | None = None
+    spp: int | None = None
+    noise: float | None = None
     raster: Picture | None
     traced: Picture | None
     why: str | None
@@ -203,13 +203,11 @@ class Budget(_Frozen):
     rows: list[PlannedRow]
     why: list[str]
     routes: list[str]
-    pictures: list[tuple[str, str]] = Field(repr=False)
+    pictures: list[tuple[str, str]] = Field(repr=False, exclude=True)
 
 
-class ReportData(BaseModel):
-    """Everything on the page."""
-
-    model_config = ConfigDict(extra="forbid")
+class ReportData(_Frozen):
+    """Everything on the page. `model_dump` leaves out the bytes of the pictures."""
 
     title: str
     workspace: str
@@ -233,15 +231,3 @@ class ReportData(BaseModel):
     summary: list[tuple[str, str]]
     settings: list[tuple[str, str, bool]]
     versions: list[tuple[str, str]]
-
-    def figures(self) -> dict[str, Any]:
-        """The data as JSON-able values, without the bytes of the pictures."""
-        return _without_uris(self.model_dump(mode="json"))
-
-
-def _without_uris(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_uris(item) for key, item in value.items() if key not in ("uri", "pictures")}
-    if isinstance(value, list):
-        return [_without_uris(item) for item in value]
-    return value

@@ -5,15 +5,19 @@ from __future__ import annotations
 import base64
 import io
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from dnrtrain.contract import RASTER_CHANNELS, ContractError, SceneFrame
+from dnrtrain.contract import RASTER_CHANNELS, ContractError
 from dnrtrain.exr import read_exr
 
 from ..core.errors import UserError
 from .data import Picture
+
+if TYPE_CHECKING:
+    from dnrtrain.display import DisplayTransform
 
 FEATURED_SIDE = 800  # the paper's resolution, pixel for pixel
 THUMBNAIL_SIDE = 192
@@ -23,10 +27,10 @@ def load_png(root: Path, file: str, *, side: int, heat: bool = False) -> Picture
     """An image file of the workspace, reduced to ``side`` pixels if larger; None when there is no such file.
 
     heat: colour a one-channel error map with matplotlib's magma (perceptually uniform, readable in grey).
-
-    Raises:
-        UserError: the file is damaged.
+    Raises UserError: the file is damaged.
     """
+    from matplotlib import colormaps
+
     path = root / file
     try:
         with Image.open(path) as opened:
@@ -36,7 +40,9 @@ def load_png(root: Path, file: str, *, side: int, heat: bool = False) -> Picture
     except (OSError, UnidentifiedImageError) as error:
         raise UserError(f"{path}: damaged image ({error}); run `dnrpipe evaluate` again") from None
     if heat and image.mode in ("L", "I;16", "I", "F"):
-        image = _magma(image)
+        values = np.asarray(image, dtype=np.float32)
+        full = 255.0 if image.mode == "L" else 65535.0 if image.mode != "F" else 1.0
+        image = Image.fromarray(np.rint(colormaps["magma"](values / full)[..., :3] * 255).astype(np.uint8))
     return encode(image.convert("RGBA" if "A" in image.getbands() else "RGB"), file, side)
 
 
@@ -56,45 +62,23 @@ def encode(image: Image.Image, file: str, side: int) -> Picture:
     return Picture(uri=f"data:image/{kind};base64,{data}", width=size[0], height=size[1], file=file)
 
 
-class ExrPictures:
-    """EXR files in display space over white, through the scene's one display transform.
+def load_exr(root: Path, file: str, display: DisplayTransform) -> Picture | None:
+    """R G B A of an EXR (linear, premultiplied) over white as a thumbnail; None when the file or its colour is missing.
 
-    Made from ``scene/frame.json``; torch is imported only when the first picture is asked for.
+    Raises UserError: the file is damaged.
     """
+    import torch
 
-    def __init__(self, root: Path, frame: SceneFrame) -> None:
-        from dnrtrain.display import DisplayTransform
-
-        self.root = root
-        self.transform = DisplayTransform(frame, root / "scene")
-
-    def load(self, file: str) -> Picture | None:
-        """R G B A of an EXR (linear, premultiplied) as a thumbnail; None when the file or its colour is missing.
-
-        Raises:
-            UserError: the file is damaged.
-        """
-        import torch
-
-        path = self.root / file
-        if not path.is_file():
-            return None
-        try:
-            channels, _ = read_exr(path)
-        except ContractError as error:
-            raise UserError(str(error)) from None
-        if not set(RASTER_CHANNELS) <= set(channels):
-            return None
-        linear = torch.from_numpy(np.stack([channels[c] for c in "RGB"]))[None]
-        alpha = torch.from_numpy(channels["A"])[None, None]
-        display = self.transform.over_white(linear, alpha)[0].clamp(0, 1)
-        pixels = np.rint(display.permute(1, 2, 0).numpy() * 255).astype(np.uint8)
-        return encode(Image.fromarray(pixels), file, THUMBNAIL_SIDE)
-
-
-def _magma(image: Image.Image) -> Image.Image:
-    from matplotlib import colormaps
-
-    values = np.asarray(image, dtype=np.float32)
-    full = 255.0 if image.mode == "L" else 65535.0 if image.mode != "F" else 1.0
-    return Image.fromarray(np.rint(colormaps["magma"](values / full)[..., :3] * 255).astype(np.uint8))
+    path = root / file
+    if not path.is_file():
+        return None
+    try:
+        channels, _ = read_exr(path)
+    except ContractError as error:
+        raise UserError(str(error)) from None
+    if not set(RASTER_CHANNELS) <= set(channels):
+        return None
+    rgba = torch.from_numpy(np.stack([channels[c] for c in RASTER_CHANNELS]))[None]
+    rgb = display.over_white(rgba[:, :3], rgba[:, 3:])[0].clamp(0, 1)
+    pixels = np.rint(rgb.permute(1, 2, 0).numpy() * 255).astype(np.uint8)
+    return encode(Image.fromarray(pixels), file, THUMBNAIL_SIDE)

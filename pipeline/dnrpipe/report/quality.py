@@ -13,7 +13,7 @@ from ..stages.records import Metrics, ViewMetrics
 from .data import MetricRow, Quality, TestView
 from .pictures import FEATURED_SIDE, THUMBNAIL_SIDE, load_png
 
-# key, label, unit, digits, higher is better
+# The first fields of a `MetricRow`.
 METRICS: tuple[tuple[str, str, str, int, bool], ...] = (
     ("psnr", "PSNR over white", "dB", 2, True),
     ("psnr_mask", "PSNR inside the mask", "dB", 2, True),
@@ -51,7 +51,7 @@ def build_quality(root: Path, metrics: Metrics, records: Sequence[CostRecord]) -
     trained = metrics.trained_with_perceptual
     return Quality(
         views=views,
-        rows=[row for metric in METRICS if (row := _row(views, *metric))],
+        rows=[row for metric in METRICS if (row := _row(views, metric))],
         median_view=views[middle].name,
         perceptual=metrics.perceptual,
         trained_with_perceptual=metrics.perceptual if trained is None else trained,
@@ -94,20 +94,15 @@ def _view(root: Path, view: ViewMetrics, side: int) -> TestView:
     )
 
 
-def _row(
-    views: Sequence[TestView], key: str, label: str, unit: str, digits: int, higher_is_better: bool
-) -> MetricRow | None:
-    found = [(value, v.name) for v in views if (value := getattr(v, key)) is not None]
+def _row(views: Sequence[TestView], metric: tuple[str, str, str, int, bool]) -> MetricRow | None:
+    facts: dict[str, Any] = dict(zip(MetricRow.model_fields, metric, strict=False))
+    found = [(value, v.name) for v in views if (value := getattr(v, facts["key"])) is not None]
     if not found:
         return None
     values = [value for value, _ in found]
-    ranked = sorted(found, reverse=not higher_is_better)
+    ranked = sorted(found, reverse=not facts["higher_is_better"])
     return MetricRow(
-        key=key,
-        label=label,
-        unit=unit,
-        digits=digits,
-        higher_is_better=higher_is_better,
+        **facts,
         count=len(values),
         mean=statistics.fmean(values),
         median=statistics.median(values),

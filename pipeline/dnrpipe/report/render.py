@@ -11,9 +11,8 @@ from markupsafe import Markup
 
 from ..core.units import count, duration, several
 from . import charts
-from .data import MetricRow, Quality, ReportData, Selection, Training
+from .data import Quality, ReportData, Selection, Training
 from .quality import METRICS
-from .sphere import AZIMUTH, ELEVATION, sphere_svg
 
 TEMPLATE = "template.html.j2"
 TOTAL_STYLE = 6  # the sum of all terms is drawn in ink, whatever its place in the list
@@ -52,22 +51,17 @@ def render_html(data: ReportData) -> str:
         css=Markup((files / "report.css").read_text(encoding="utf-8")),
         script=Markup(script),
         script_hash=script_hash,
-        eye=f"{AZIMUTH:.6f} {ELEVATION:.6f}",
-        rows=_headline_rows(quality),
+        eye=f"{charts.AZIMUTH:.6f} {charts.ELEVATION:.6f}",
+        rows=dict.fromkeys(metric[0] for metric in METRICS) | {r.key: r for r in (quality.rows if quality else ())},
         featured=_featured(quality) if quality else [],
         median=next(v for v in quality.views if v.name == quality.median_view) if quality else None,
-        projections=[(n, sphere_svg(data.sphere, n)) for n in ("top", "front", "oblique")] if data.sphere else [],
+        projections=[(n, charts.sphere_svg(data.sphere, n)) for n in charts.PROJECTIONS] if data.sphere else [],
         quality_chart=_quality_chart(quality) if quality else "",
         loss_charts=[(t, [_loss_chart(t), _psnr_chart(t), _agent_chart(t)]) for t in data.training],
         stage_chart=_stage_chart(data),
         tracing_chart=_tracing_chart(data),
         views_chart=_views_chart(selection) if selection else "",
     )
-
-
-def _headline_rows(quality: Quality | None) -> dict[str, MetricRow | None]:
-    rows: dict[str, MetricRow | None] = dict.fromkeys(metric[0] for metric in METRICS)
-    return rows | {row.key: row for row in quality.rows} if quality else rows
 
 
 def _featured(quality: Quality) -> list[tuple[str, int]]:

@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import AsyncIterator
-from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -25,7 +24,6 @@ from .root import UnknownName
 from .state import State
 
 LOG = logging.getLogger("dnrpipe.pruning")
-PRUNE_INTERVAL = 3600.0
 _STATUS: dict[type[UserError], int] = {QueueFull: 429, WrongState: 409, UnknownName: 404, UserError: 422}
 
 
@@ -58,13 +56,15 @@ def create_app(state: State, token: str | None) -> FastAPI:
         app.add_exception_handler(kind, _answer)
     app.add_middleware(
         Guard,
-        hosts=LOOPBACK if state.config.loopback else (),
+        hosts=LOOPBACK if state.config.host in LOOPBACK else (),
         token=token,
         rate=state.config.rate,
         burst=state.config.burst,
     )
     if token is not None:
-        _describe_token(app)
+        schema = app.openapi()  # made once, and kept
+        schema.setdefault("components", {})["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
+        schema["security"] = [{"token": []}]
     return app
 
 
@@ -77,7 +77,7 @@ async def _prune_regularly(state: State) -> None:
                 LOG.info("old logs and events removed", extra={"facts": {"jobs": len(pruned)}})
         except Exception:  # a full disk, a busy queue: the server goes on and tries again
             LOG.exception("old logs and events could not be removed")
-        await asyncio.sleep(PRUNE_INTERVAL)
+        await asyncio.sleep(3600)
 
 
 async def _answer(_: Request, error: Exception) -> JSONResponse:
@@ -88,17 +88,3 @@ async def _answer(_: Request, error: Exception) -> JSONResponse:
         return JSONResponse({"detail": first_fault(error)}, 422)
     status = next(status for kind, status in _STATUS.items() if isinstance(error, kind))
     return JSONResponse({"detail": " ".join(str(error).split())}, status)
-
-
-def _describe_token(app: FastAPI) -> None:
-    """Add the token to the description."""
-    plain = app.openapi
-
-    def described() -> dict[str, Any]:
-        schema = plain()
-        schemes = schema.setdefault("components", {}).setdefault("securitySchemes", {})
-        schemes["token"] = {"type": "http", "scheme": "bearer"}
-        schema["security"] = [{"token": []}]
-        return schema
-
-    app.openapi = described  # type: ignore[method-assign]

@@ -10,12 +10,11 @@ with Client("http://127.0.0.1:8420") as client:
 from __future__ import annotations
 
 import functools
-import itertools
 import json
 import secrets
 import ssl
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -24,17 +23,7 @@ from pydantic import TypeAdapter
 
 from ..core.errors import UserError
 from ..stages.records import PreviewState
-from .models import (
-    Job,
-    JobEvent,
-    JobPage,
-    JobRequest,
-    LogPage,
-    Scene,
-    State,
-    WorkspaceDetail,
-    WorkspaceSummary,
-)
+from .models import Job, JobEvent, JobPage, JobRequest, LogPage, Scene, State, WorkspaceDetail, WorkspaceSummary
 
 DEFAULT_SERVER = "http://127.0.0.1:8420"
 RETRY_SECONDS = 4.0
@@ -61,17 +50,12 @@ class Client:
     """
 
     def __init__(
-        self,
-        server: str = DEFAULT_SERVER,
-        token: str | None = None,
-        *,
-        timeout: float = 60.0,
-        retry_seconds: float = RETRY_SECONDS,
+        self, server: str = DEFAULT_SERVER, token: str | None = None, *, retry_seconds: float = RETRY_SECONDS
     ) -> None:
         self.server, self.retry_seconds = server, retry_seconds
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         try:
-            self._http = httpx.Client(base_url=server, headers=headers, timeout=timeout, verify=_trust())
+            self._http = httpx.Client(base_url=server, headers=headers, timeout=60.0, verify=_trust())
         except (httpx.InvalidURL, ValueError) as error:
             raise UserError(f"--server {server}: not an address ({error}); e.g. {DEFAULT_SERVER}") from None
 
@@ -79,9 +63,6 @@ class Client:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
         self._http.close()
 
     def submit(self, request: JobRequest) -> Job:
@@ -92,11 +73,8 @@ class Client:
     def job(self, job: int) -> Job:
         return self._ask("GET", f"/jobs/{job}", Job)
 
-    def jobs(self, states: list[State] | None = None, limit: int | None = None) -> Iterator[Job]:
-        """Jobs, newest first; all of them, or ``limit``."""
-        return itertools.islice(self._all_jobs(states or []), limit)
-
-    def _all_jobs(self, states: list[State]) -> Iterator[Job]:
+    def jobs(self, states: Sequence[State] = ()) -> Iterator[Job]:
+        """All jobs, newest first; asks for further ones as they are wanted."""
         parameters: dict[str, Any] = {"state": states, "limit": 500}
         while True:
             page = self._ask("GET", "/jobs", JobPage, params=parameters)

@@ -7,16 +7,17 @@ import re
 import stat
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from ..core.errors import UserError
 from .models import Limits
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
+"""Hosts that only this machine can reach."""
 TOKEN_PATTERN = r"[A-Za-z0-9_-]{16,256}"
 
 
-class ServerConfig(BaseModel):
+class ServerConfig(BaseModel, extra="forbid", frozen=True):
     """Limits and devices of a server; its worker processes get it as JSON.
 
     devices: one worker each, "cpu" or "cuda:<n>". rate, burst: requests per second and at once, per client address.
@@ -24,8 +25,6 @@ class ServerConfig(BaseModel):
     long without a viewer a frame process ends. keep_days, keep_jobs: the server deletes logs and events of jobs that
     ended longer ago, or before so many others. limits: upper bounds for every job.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     root: Path
     host: str = "127.0.0.1"
@@ -44,11 +43,6 @@ class ServerConfig(BaseModel):
     keep_jobs: int = Field(default=1000, ge=1)
     free_disk_mb: int = Field(default=1024, ge=0, description="the server refuses uploads and jobs below this")
     limits: Limits = Limits(seconds=24 * 3600.0, disk_mb=50 * 1024)
-
-    @property
-    def loopback(self) -> bool:
-        """Whether only this machine can reach the server."""
-        return self.host in LOOPBACK
 
 
 def default_devices() -> tuple[str, ...]:

@@ -9,17 +9,18 @@ pages that the user visits can neither read nor send anything (DNS rebinding, cr
 from __future__ import annotations
 
 import hmac
-import json
 import logging
 import math
 import re
 import time
 from collections import OrderedDict
 from collections.abc import Iterable
-from typing import Any
 from urllib.parse import urlsplit
 
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.websockets import WebSocketClose
 
 ACCESS = logging.getLogger("dnrpipe.access")
 SUBPROTOCOL = "dnrpipe.live"
@@ -29,7 +30,6 @@ MAX_BODY = 256 * 1024
 MAX_CLIENTS = 10_000
 REFUSALS_PER_MINUTE = 20
 OPEN_PATHS = ("/", "/healthz", "/favicon.ico")
-OPEN_PREFIX = "/static/"
 HEADERS = {
     "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:;"
     " connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -90,7 +90,6 @@ class Guard:
         if scope["type"] not in ("http", "websocket"):
             await self.app(scope, receive, send)
             return
-        headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
         started = time.monotonic()
         status = 0
 
@@ -98,22 +97,21 @@ class Guard:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
-                own = {name.lower() for name, _ in message["headers"]}
-                message["headers"] = [
-                    *message["headers"],
-                    *((k.encode(), v.encode()) for k, v in HEADERS.items() if k.encode() not in own),
-                ]
+                headers = MutableHeaders(scope=message)
+                for name, value in HEADERS.items():
+                    headers.setdefault(name, value)
             await send(message)
 
-        refusal = self._refusal(scope, headers)
+        client = (scope.get("client") or "?")[0]
+        refusal = self._refusal(scope, Headers(scope=scope), client)
         try:
             if refusal is not None:
-                await _refuse(scope, sending, *refusal)
+                await refusal(scope, receive, sending)
             else:
                 await self.app(scope, self._bounded(scope, receive), sending)
         finally:
             facts = {
-                "client": _client(scope),
+                "client": client,
                 "method": scope.get("method", "WEBSOCKET"),
                 "path": scope["path"],
                 "status": status,
@@ -121,28 +119,35 @@ class Guard:
             }
             ACCESS.info("request", extra={"facts": facts})
 
-    def _refusal(self, scope: Scope, headers: dict[str, str]) -> tuple[int, str, dict[str, str]] | None:
-        """(status, one line, headers) if the guard refuses the request, else None."""
-        client = _client(scope)
+    def _refusal(self, scope: Scope, headers: Headers, client: str) -> ASGIApp | None:
+        """The answer if the guard refuses the request, else None."""
+
+        def refused(status: int, reason: str, **more: str) -> ASGIApp:
+            if scope["type"] == "websocket":
+                return WebSocketClose(1008, reason)  # before accept: 403
+            return JSONResponse({"detail": reason}, status, {"connection": "close", **more})
+
         host = headers.get("host", "")
         if self.hosts and _name_of(host) not in self.hosts:
-            return 421, f"this server does not answer to the host name {host[:80]!r}", {}
+            return refused(421, f"this server does not answer to the host name {host[:80]!r}")
         origin = headers.get("origin")
         if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
-            return 403, "requests of pages from other origins are refused", {}
-        if self.token is not None and not _is_open(scope):
+            return refused(403, "requests of pages from other origins are refused")
+        # The dashboard's files hold no data, and the dashboard asks for the token.
+        is_open = scope["type"] == "http" and (scope["path"] in OPEN_PATHS or scope["path"].startswith("/static/"))
+        if self.token is not None and not is_open:
             if self.refusals.empty(client):
-                return 429, "too many wrong tokens; wait a minute", {"retry-after": "60"}
+                return refused(429, "too many wrong tokens; wait a minute", **{"retry-after": "60"})
             if not hmac.compare_digest(_given_token(scope, headers), self.token):
                 self.refusals.take(client)
                 reason = "wrong or missing token; send it as Authorization: Bearer TOKEN"
-                return 401, reason, {"www-authenticate": "Bearer"}
+                return refused(401, reason, **{"www-authenticate": "Bearer"})
         wait = self.rates.take(client)
         if wait > 0:
-            return 429, "too many requests; slow down", {"retry-after": str(max(1, math.ceil(wait)))}
+            return refused(429, "too many requests; slow down", **{"retry-after": str(max(1, math.ceil(wait)))})
         length = headers.get("content-length", "0")
         if not _is_upload(scope) and length.isascii() and length.isdigit() and int(length) > MAX_BODY:
-            return 413, f"the request is larger than {MAX_BODY} bytes", {}
+            return refused(413, f"the request is larger than {MAX_BODY} bytes")
         return None
 
     def _bounded(self, scope: Scope, receive: Receive) -> Receive:
@@ -160,39 +165,17 @@ class Guard:
         return receiving
 
 
-async def _refuse(scope: Scope, send: Send, status: int, reason: str, headers: dict[str, str]) -> None:
-    if scope["type"] == "websocket":
-        await send({"type": "websocket.close", "code": 1008, "reason": reason})  # before accept: 403
-        return
-    body = json.dumps({"detail": reason}).encode()
-    fields = {"content-type": "application/json", "content-length": str(len(body)), "connection": "close", **headers}
-    encoded = [(name.encode(), value.encode()) for name, value in fields.items()]
-    await send({"type": "http.response.start", "status": status, "headers": encoded})
-    await send({"type": "http.response.body", "body": body})
-
-
-def _client(scope: Scope) -> str:
-    client: Any = scope.get("client")
-    return client[0] if client else "?"
-
-
 def _name_of(host: str) -> str:
     """``[::1]:8420`` -> ``::1``; empty where it is no host and port."""
     found = re.fullmatch(r"(?:\[([0-9a-f:]+)\]|([a-z0-9.-]+))(?::[0-9]{1,5})?", host.lower())
     return (found[1] or found[2]) if found else ""
 
 
-def _is_open(scope: Scope) -> bool:
-    """Whether the path needs no token: the dashboard's files hold no data, and the dashboard asks for the token."""
-    path = scope["path"]
-    return scope["type"] == "http" and (path in OPEN_PATHS or path.startswith(OPEN_PREFIX))
-
-
 def _is_upload(scope: Scope) -> bool:
     return scope["type"] == "http" and scope["method"] == "PUT" and scope["path"].startswith("/scenes/")
 
 
-def _given_token(scope: Scope, headers: dict[str, str]) -> bytes:
+def _given_token(scope: Scope, headers: Headers) -> bytes:
     scheme, _, value = headers.get("authorization", "").partition(" ")
     if scheme.lower() == "bearer":
         return value.strip().encode("utf-8", "replace")

@@ -12,12 +12,14 @@ A worker of `dnrpipe.workers.processes`. What it renders (`mode`):
 from __future__ import annotations
 
 import base64
+import functools
 import io
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from PIL import Image
 
 from dnrpipe.core.errors import UserError
@@ -29,6 +31,7 @@ from dnrpipe.raytrace.engine import Engine, masked, masked_channels
 from dnrpipe.raytrace.frames import Frames
 from dnrpipe.raytrace.light_worker import read_light
 from dnrpipe.stages.trainer import torch_device
+from dnrpipe.studies.frames.scene import shown
 from dnrtrain.checkpoint import load_model
 from dnrtrain.contract import RASTER_CHANNELS, SceneFrame, View, require_channels
 from dnrtrain.dataset import view_in_memory
@@ -49,9 +52,6 @@ class Worker:
     """
 
     def __init__(self, common: dict[str, Any]) -> None:
-        import torch
-
-        self.torch = torch
         self.common = common
         self.kind = common["kind"]
         self.bundle = Path(common["bundle"])
@@ -63,7 +63,10 @@ class Worker:
             raise UserError("the live view needs a jit variant of Mitsuba (LLVM or CUDA; see `dnrpipe doctor`)")
         self.device = torch_device(Settings(device=common["device"]))
         self.model = load_model(Path(common["checkpoint"]), self.device)
-        self.kernels: dict[tuple[int, int], Frames] = {}
+        tracing = (common["integrator"], int(common["max_depth"]))
+        self.frames = functools.cache(
+            functools.partial(Frames, self.engine, self.bundle, *tracing)
+        )  # by (width, height)
         self.renderers: dict[int, BaseRenderer] = {}
         self.traced: tuple[str, np.ndarray, int] | None = None
         self.repaired = 0  # pixels of the current picture that were not finite
@@ -108,7 +111,7 @@ class Worker:
     def _channels(self, view: View, samples: int | None) -> dict[str, np.ndarray]:
         """Base image and G-buffer, or the G-buffer alone."""
         if self.base is None:
-            channels, lost = masked_channels(self._frames(view).gbuffer(view))
+            channels, lost = masked_channels(self.frames((view.width, view.height)).gbuffer(view))
             self.repaired += lost
             return channels
         self.base.repaired = self.base.masked = 0
@@ -126,7 +129,7 @@ class Worker:
     def _neural(self, view: View, channels: dict[str, np.ndarray]) -> np.ndarray:
         """Display RGB over white, float32 [H, W, 3] in [0, 1]."""
         data = view_in_memory(channels, self.frame, view, display=self.display, base=self.kind)
-        with self.torch.inference_mode():
+        with torch.inference_mode():
             output = self.model(data.tensors.to(self.device))
             return output.rgb[0].float().clamp(0, 1).permute(1, 2, 0).cpu().numpy()
 
@@ -153,19 +156,11 @@ class Worker:
         key = view.model_copy(update={"name": "reference"}).model_dump_json()
         known = self.traced if self.traced is not None and self.traced[0] == key else None
         total, count = (known[1], known[2]) if known else (np.zeros((view.height, view.width, 4), np.float64), 0)
-        sample, lost = masked(self._frames(view).path(view, spp, seed=1 + count))
+        sample, lost = masked(self.frames((view.width, view.height)).path(view, spp, seed=1 + count))
         self.repaired += lost
         total, count = total + np.asarray(sample, np.float64) * spp, count + spp
         self.traced = (key, total, count)
         return self._over_white((total / count).astype(np.float32)), count
-
-    def _frames(self, view: View) -> Frames:
-        size = (view.width, view.height)
-        if size not in self.kernels:
-            self.kernels[size] = Frames(
-                self.engine, self.bundle, self.common["integrator"], int(self.common["max_depth"]), size
-            )
-        return self.kernels[size]
 
     def _file(self, path: Path) -> np.ndarray:
         channels, _ = read_exr(path)
@@ -174,8 +169,7 @@ class Worker:
 
     def _over_white(self, rgba: np.ndarray) -> np.ndarray:
         """Linear premultiplied RGBA [H, W, 4] -> display RGB over white, float32 [H, W, 3]."""
-        tensor = self.torch.from_numpy(np.ascontiguousarray(rgba, np.float32)).permute(2, 0, 1)[None]
-        return self.display.over_white(tensor[:, :3], tensor[:, 3:])[0].permute(1, 2, 0).numpy()
+        return shown(self.display, rgba)[0].permute(1, 2, 0).numpy()
 
 
 def encode(picture: np.ndarray, fine: bool) -> tuple[bytes, str]:

@@ -140,11 +140,8 @@ class LivePool:
 
     def __init__(self, config: ServerConfig, root: ServiceRoot) -> None:
         self.config, self.root = config, root
-        self._sessions: dict[str, LiveSession] = {}
+        self.sessions: dict[str, LiveSession] = {}
         self._lock = asyncio.Lock()
-
-    def count(self) -> int:
-        return len(self._sessions)
 
     @contextlib.asynccontextmanager
     async def session(self, name: str) -> AsyncIterator[LiveSession]:
@@ -152,13 +149,13 @@ class LivePool:
         path = self.root.workspace(name)
         scene = await asyncio.to_thread(open_scene, path)
         async with self._lock:
-            found = self._sessions.get(name)
+            found = self.sessions.get(name)
             if found is not None and found.scene.fingerprint != scene.fingerprint and found.viewers == 0:
                 await self._end(name)
                 found = None
             if found is None:
                 await self._make_room()
-                found = self._sessions[name] = LiveSession(scene)
+                found = self.sessions[name] = LiveSession(scene)
             found.viewers += 1
         try:
             yield found
@@ -171,22 +168,22 @@ class LivePool:
         while True:
             await asyncio.sleep(IDLE_CHECK)
             async with self._lock:
-                for name, session in list(self._sessions.items()):
+                for name, session in list(self.sessions.items()):
                     if session.viewers == 0 and time.monotonic() - session.used > self.config.idle_seconds:
                         await self._end(name)
 
     async def close(self) -> None:
         async with self._lock:
-            for name in list(self._sessions):
+            for name in list(self.sessions):
                 await self._end(name)
 
     async def _make_room(self) -> None:
-        if len(self._sessions) < self.config.viewers:
+        if len(self.sessions) < self.config.viewers:
             return
-        idle = [(session.used, name) for name, session in self._sessions.items() if session.viewers == 0]
+        idle = [(session.used, name) for name, session in self.sessions.items() if session.viewers == 0]
         if not idle:
-            raise UserError(f"{len(self._sessions)} workspaces are being viewed, which is the limit; close one")
+            raise UserError(f"{len(self.sessions)} workspaces are being viewed, which is the limit; close one")
         await self._end(min(idle)[1])
 
     async def _end(self, name: str) -> None:
-        await self._sessions.pop(name).close()
+        await self.sessions.pop(name).close()

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from dnrtrain.contract import View, read_cameras
+from dnrtrain.settings import Strict
 
 from ..core.cameras import framing, look_at_view
 from ..core.errors import UserError
@@ -27,10 +28,8 @@ STEEPEST = math.radians(89.0)
 Mode = Literal["neural", "base", "reference", "error", "normal", "depth", "uv", "albedo", "coverage", "nearest"]
 
 
-class Orbit(BaseModel):
+class Orbit(Strict):
     """A camera that looks at ``target``, upright. Angles in radians, lengths in scene units, Z up."""
-
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     azimuth: float = Field(ge=-1e3, le=1e3)
     elevation: float = Field(ge=-STEEPEST, le=STEEPEST)
@@ -38,10 +37,8 @@ class Orbit(BaseModel):
     target: tuple[float, float, float]
 
 
-class LiveRequest(BaseModel):
+class LiveRequest(Strict):
     """A viewer's request. size: pixels of the side at rest; moving: quick is better than fine."""
-
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     camera: Orbit
     size: int = Field(ge=SIZES[0], le=SIZES[1])
@@ -66,9 +63,7 @@ class LiveScene:
     def view(self, camera: Orbit, size: int) -> View:
         """The view of ``camera``, ``size``² pixels."""
         ce = math.cos(camera.elevation)
-        direction = np.array(
-            [ce * math.cos(camera.azimuth), ce * math.sin(camera.azimuth), math.sin(camera.elevation)], np.float64
-        )
+        direction = np.array([ce * math.cos(camera.azimuth), ce * math.sin(camera.azimuth), math.sin(camera.elevation)])
         target = np.asarray(camera.target, np.float64)
         settings = self.settings.cameras.model_copy(update={"width": size, "height": size})
         return look_at_view("live", target + camera.distance * direction, target, self.focal * size, settings)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
+
+from dnrtrain.settings import Strict
 
 from ..report.data import SphereView
 
@@ -19,10 +21,7 @@ Command = Literal["run", "prepare", "select", "raytrace-selected", "finetune", "
 State = Literal["queued", "running", "done", "failed", "cancelled"]
 STATES: tuple[State, ...] = get_args(State)
 FINAL: tuple[State, ...] = ("done", "failed", "cancelled")
-TAKES_SCENE = ("run", "prepare")
-JobId = Annotated[int, Field(ge=1, le=2**53)]
 Name = Annotated[str, Field(pattern=NAME_PATTERN)]
-SceneName = Annotated[str, Field(pattern=SCENE_PATTERN)]
 
 
 def first_fault(error: ValidationError | RequestValidationError) -> str:
@@ -31,11 +30,7 @@ def first_fault(error: ValidationError | RequestValidationError) -> str:
     return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
 
 
-class _Wire(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-
-
-class Limits(_Wire):
+class Limits(Strict):
     """Limits at which the worker stops a job; None is the server's own limit.
 
     seconds: wall time of one attempt. memory_mb: resident memory of the job's processes together, MiB.
@@ -47,7 +42,7 @@ class Limits(_Wire):
     disk_mb: int | None = Field(default=None, ge=1, le=2**28)
 
 
-class JobRequest(_Wire):
+class JobRequest(Strict):
     """A stage, or all of them (``run``), on a workspace of the server.
 
     workspace: its name; the folder is ``<root>/<name>.dnr``. scene: an uploaded scene file, for ``run`` and ``prepare``
@@ -57,7 +52,7 @@ class JobRequest(_Wire):
 
     command: Command
     workspace: Name
-    scene: SceneName | None = None
+    scene: Annotated[str, Field(pattern=SCENE_PATTERN)] | None = None
     preset: Literal["draft", "standard", "paper", "vanilla"] | None = None
     settings: dict[Annotated[str, Field(pattern=SETTING_PATTERN)], bool | int | float | str] = Field(
         default_factory=dict, max_length=64
@@ -68,14 +63,14 @@ class JobRequest(_Wire):
     limits: Limits = Limits()
 
 
-class Job(_Wire):
+class Job(Strict):
     """A job in the queue. Times are unix seconds; None: not yet.
 
     starts: how many processes were started for it; crashes: how many of those ended by a signal, a limit aside.
     exit_code: of the last process, negative for a signal. error: why it failed, one line. progress: the last report.
     """
 
-    id: JobId
+    id: int = Field(ge=1, le=2**53)
     state: State
     request: JobRequest
     created: float
@@ -90,14 +85,14 @@ class Job(_Wire):
     progress: dict[str, Any] | None = None
 
 
-class JobPage(_Wire):
+class JobPage(Strict):
     """Jobs by descending id. next: pass as ``before`` for the page after this one; None: there is none."""
 
     jobs: list[Job]
     next: int | None
 
 
-class JobEvent(_Wire):
+class JobEvent(Strict):
     """One event of a job: those of the event stream (dnrpipe.core.event_stream), and ``state`` with its new state."""
 
     id: int
@@ -107,7 +102,7 @@ class JobEvent(_Wire):
     data: dict[str, Any]
 
 
-class LogPage(_Wire):
+class LogPage(Strict):
     """Part of a job's log. offset: of its first byte; next: offset to go on from; size: of the log, bytes."""
 
     text: str
@@ -116,7 +111,7 @@ class LogPage(_Wire):
     size: int
 
 
-class Scene(_Wire):
+class Scene(Strict):
     """An uploaded scene file. size in bytes."""
 
     name: str
@@ -124,7 +119,7 @@ class Scene(_Wire):
     sha256: str | None = None
 
 
-class StageState(_Wire):
+class StageState(Strict):
     """One row of ``dnrpipe status``."""
 
     stage: str
@@ -135,7 +130,7 @@ class StageState(_Wire):
     seconds: float | None
 
 
-class WorkspaceSummary(_Wire):
+class WorkspaceSummary(Strict):
     """A workspace under the root. problem: why it cannot be read, if so."""
 
     name: str
@@ -145,7 +140,7 @@ class WorkspaceSummary(_Wire):
     problem: str | None = None
 
 
-class Curve(_Wire):
+class Curve(Strict):
     """History of a training step: points are (epoch, value)."""
 
     title: str
@@ -153,7 +148,7 @@ class Curve(_Wire):
     psnr: list[tuple[int, float]]
 
 
-class TestPicture(_Wire):
+class TestPicture(Strict):
     """A held-out view with pictures of the evaluation."""
 
     __test__ = False  # not a pytest class
@@ -162,7 +157,7 @@ class TestPicture(_Wire):
     psnr: float | None
 
 
-class CostState(_Wire):
+class CostState(Strict):
     """Wall seconds spent so far by stage, and what tracing all candidates would have cost (None: unknown)."""
 
     spent: dict[str, float]
@@ -173,7 +168,7 @@ class CostState(_Wire):
     tracing_all_seconds: float | None
 
 
-class PlannedStage(_Wire):
+class PlannedStage(Strict):
     """A stage's wall seconds: predicted by `dnrpipe plan`, and spent since then (None: it was done before)."""
 
     stage: str
@@ -182,7 +177,7 @@ class PlannedStage(_Wire):
     done: bool
 
 
-class PlanState(_Wire):
+class PlanState(Strict):
     """The last plan against what its stages have cost since.
 
     views, spp, epochs: what the plan assumes; fits: whether the settings in force are the same. total, low, high:
@@ -202,7 +197,7 @@ class PlanState(_Wire):
     spent: float
 
 
-class WorkspaceDetail(_Wire):
+class WorkspaceDetail(Strict):
     """What the dashboard shows of a workspace.
 
     sphere: the cameras as SVG, seen from ``eye`` (azimuth, elevation in radians); None before there are any.
@@ -222,7 +217,7 @@ class WorkspaceDetail(_Wire):
     report: bool
 
 
-class Health(_Wire):
+class Health(Strict):
     """workers: live worker processes by device. queued, running: jobs."""
 
     status: Literal["ok", "degraded"]
@@ -232,7 +227,7 @@ class Health(_Wire):
     running: int
 
 
-class Problem(_Wire):
+class Problem(Strict):
     """Body of every refusal: what, where and what to do, in one line."""
 
     detail: str

@@ -22,7 +22,7 @@ from typing import Any
 from ..core.errors import UserError
 from .config import ServerConfig
 from .models import FINAL, STATES, Job, JobEvent, JobRequest, State
-from .root import ServiceRoot
+from .root import ServiceRoot, UnknownName
 
 SCHEMA = 1
 DAY = 86_400.0
@@ -108,16 +108,18 @@ class Queue:
                     raise QueueFull(f"{waiting} jobs wait already, which is the limit; try again when some are done")
             row = db.execute(
                 "INSERT INTO jobs (state, workspace, priority, request, created, token)"
-                f" VALUES ('queued', ?, ?, ?, ?, ?) RETURNING {_COLUMNS}",
+                " VALUES ('queued', ?, ?, ?, ?, ?) RETURNING id",
                 (request.workspace, request.priority, request.model_dump_json(), time.time(), token),
             ).fetchone()
-            _note_state(db, row["id"], "queued")
-            return _job(row)
+            _change(db, row["id"], "queued")
+            return self.get(row["id"])
 
-    def get(self, job: int) -> Job | None:
-        """The job, or None."""
+    def get(self, job: int) -> Job:
+        """The job. Raises UnknownName."""
         row = self._db().execute(f"SELECT {_COLUMNS} FROM jobs WHERE id = ?", (job,)).fetchone()
-        return None if row is None else _job(row)
+        if row is None:
+            raise UnknownName(f"there is no job {job}")
+        return _job(row)
 
     def page(
         self, *, states: Sequence[State] = (), workspace: str | None = None, before: int | None = None, limit: int = 100
@@ -145,37 +147,28 @@ class Queue:
         """Take the next job: the highest priority, then the oldest, whose workspace no job is working on."""
         with self._writing() as db:
             row = db.execute(
-                "UPDATE jobs SET state = 'running', device = ?, started = ?, finished = NULL, exit_code = NULL,"
-                " error = NULL, starts = starts + 1 WHERE id = (SELECT id FROM jobs WHERE state = 'queued' AND"
-                " workspace NOT IN (SELECT workspace FROM jobs WHERE state = 'running')"
-                f" ORDER BY priority DESC, id LIMIT 1) RETURNING {_COLUMNS}",
-                (device, time.time()),
+                "SELECT id, starts FROM jobs WHERE state = 'queued' AND workspace NOT IN"
+                " (SELECT workspace FROM jobs WHERE state = 'running') ORDER BY priority DESC, id LIMIT 1"
             ).fetchone()
             if row is None:
                 return None
-            _note_state(db, row["id"], "running")
-            return _job(row)
+            news = {"device": device, "started": time.time(), "starts": row["starts"] + 1}
+            _change(db, row["id"], "running", **news, finished=None, exit_code=None, error=None)
+            return self.get(row["id"])
 
     def finish(self, job: int, state: State, *, exit_code: int | None = None, error: str | None = None) -> None:
         """Record how a running job ended. Does nothing when it is not running any more."""
         assert state in FINAL
         with self._writing() as db:
-            changed = db.execute(
-                "UPDATE jobs SET state = ?, finished = ?, exit_code = ?, error = ? WHERE id = ? AND state = 'running'",
-                (state, time.time(), exit_code, error, job),
-            )
-            if changed.rowcount:
-                _note_state(db, job, state, error)
+            if self.get(job).state == "running":
+                _change(db, job, state, error, finished=time.time(), exit_code=exit_code, error=error)
 
     def requeue(self, job: int, *, crashed: bool, why: str) -> None:
         """Queue a running job again; it resumes from its checkpoints when it is claimed."""
         with self._writing() as db:
-            changed = db.execute(
-                "UPDATE jobs SET state = 'queued', crashes = crashes + ? WHERE id = ? AND state = 'running'",
-                (int(crashed), job),
-            )
-            if changed.rowcount:
-                _note_state(db, job, "queued", why)
+            found = self.get(job)
+            if found.state == "running":
+                _change(db, job, "queued", why, crashes=found.crashes + crashed)
 
     def recover(self, device: str | None = None) -> list[int]:
         """After a crash of server or worker, queue again what was running (on `device`), or cancel it if that was
@@ -193,47 +186,30 @@ class Queue:
                 else:
                     state, error = "queued", None
                 finished = None if state == "queued" else time.time()
-                db.execute(
-                    "UPDATE jobs SET state = ?, error = ?, finished = ? WHERE id = ?",
-                    (state, error, finished, row["id"]),
-                )
-                _note_state(db, row["id"], state, error or "its worker was lost")
+                _change(db, row["id"], state, error or "its worker was lost", error=error, finished=finished)
             return [row["id"] for row in rows]
 
     def cancel(self, job: int) -> Job:
-        """Cancel a queued job at once, a running one when its worker sees the request. Raises WrongState."""
+        """Cancel a queued job at once, a running one when its worker sees it. Raises UnknownName, WrongState."""
         with self._writing() as db:
-            state = db.execute("SELECT state FROM jobs WHERE id = ?", (job,)).fetchone()["state"]
+            state = self.get(job).state
             if state in FINAL:
                 raise WrongState(f"job {job} is {state}; only queued and running jobs can be cancelled")
             if state == "queued":
-                db.execute(
-                    "UPDATE jobs SET state = 'cancelled', finished = ?, cancel_requested = 1 WHERE id = ?",
-                    (time.time(), job),
-                )
-                _note_state(db, job, "cancelled")
+                _change(db, job, "cancelled", finished=time.time(), cancel_requested=True)
             else:
                 db.execute("UPDATE jobs SET cancel_requested = 1 WHERE id = ?", (job,))
-            return _job(db.execute(f"SELECT {_COLUMNS} FROM jobs WHERE id = ?", (job,)).fetchone())
+            return self.get(job)
 
     def retry(self, job: int) -> Job:
-        """Queue a failed or cancelled job again; it resumes from what it made. Raises WrongState."""
+        """Queue a failed or cancelled job again; it resumes from what it made. Raises UnknownName, WrongState."""
         with self._writing() as db:
-            state = db.execute("SELECT state FROM jobs WHERE id = ?", (job,)).fetchone()["state"]
+            state = self.get(job).state
             if state not in ("failed", "cancelled"):
                 raise WrongState(f"job {job} is {state}; only failed and cancelled jobs can be retried")
-            row = db.execute(
-                "UPDATE jobs SET state = 'queued', cancel_requested = 0, starts = 0, crashes = 0, started = NULL,"
-                f" finished = NULL, exit_code = NULL, error = NULL WHERE id = ? RETURNING {_COLUMNS}",
-                (job,),
-            ).fetchone()
-            _note_state(db, job, "queued", "retried")
-            return _job(row)
-
-    def cancel_requested(self, job: int) -> bool:
-        """Whether somebody requested that the job be cancelled."""
-        row = self._db().execute("SELECT cancel_requested FROM jobs WHERE id = ?", (job,)).fetchone()
-        return bool(row and row[0])
+            blank = dict.fromkeys(("started", "finished", "exit_code", "error"))
+            _change(db, job, "queued", "retried", cancel_requested=False, starts=0, crashes=0, **blank)
+            return self.get(job)
 
     def add_events(self, job: int, events: Sequence[dict[str, Any]]) -> None:
         """Store lines of the event stream; the job keeps the last progress, too."""
@@ -249,15 +225,12 @@ class Queue:
                 if event["kind"] == "progress":
                     db.execute("UPDATE jobs SET progress = ? WHERE id = ?", (json.dumps(facts), job))
 
-    def events(self, job: int, after: int = 0, limit: int = 1000) -> list[JobEvent]:
-        """The job's events with an id above ``after``, oldest first."""
+    def events(self, job: int, after: int = 0) -> list[JobEvent]:
+        """The job's events with an id above ``after``, oldest first, 1000 at most."""
         rows = self._db().execute(
-            "SELECT id, job, time, kind, data FROM events WHERE job = ? AND id > ? ORDER BY id LIMIT ?",
-            (job, after, limit),
+            "SELECT id, job, time, kind, data FROM events WHERE job = ? AND id > ? ORDER BY id LIMIT 1000", (job, after)
         )
-        return [
-            JobEvent(id=r["id"], job=r["job"], time=r["time"], kind=r["kind"], data=json.loads(r["data"])) for r in rows
-        ]
+        return [JobEvent(**dict(row) | {"data": json.loads(row["data"])}) for row in rows]
 
     def prune(self, root: ServiceRoot, config: ServerConfig, now: float | None = None) -> list[int]:
         """Delete logs and events of jobs that ended more than `config.keep_days` or `config.keep_jobs` jobs ago.
@@ -272,8 +245,7 @@ class Queue:
         for batch in self._prunable_jobs(before, config.keep_jobs, has_files):
             with self._writing() as db:
                 for job in batch:
-                    row = db.execute("SELECT state FROM jobs WHERE id = ?", (job,)).fetchone()
-                    if row["state"] in FINAL:  # still
+                    if self.get(job).state in FINAL:  # still
                         db.execute("DELETE FROM events WHERE job = ? AND kind != 'state'", (job,))
                         for path in (root.log(job), root.events(job)):
                             path.unlink(missing_ok=True)
@@ -329,14 +301,13 @@ class Queue:
         db.execute("COMMIT")
 
 
-def _note_state(db: sqlite3.Connection, job: int, state: str, why: str | None = None) -> None:
+def _change(db: sqlite3.Connection, job: int, state: str, why: str | None = None, **columns: Any) -> None:
+    """Set a job's state and other columns, and note the state as an event."""
+    names = ", ".join(f"{name} = ?" for name in ("state", *columns))
+    db.execute(f"UPDATE jobs SET {names} WHERE id = ?", (state, *columns.values(), job))
     data = json.dumps({"state": state} | ({"why": why} if why else {}))
     db.execute("INSERT INTO events (job, time, kind, data) VALUES (?, ?, 'state', ?)", (job, time.time(), data))
 
 
 def _job(row: sqlite3.Row) -> Job:
-    facts = dict(row)
-    facts["request"] = JobRequest.model_validate_json(facts["request"])
-    facts["cancel_requested"] = bool(facts["cancel_requested"])
-    facts["progress"] = json.loads(facts["progress"]) if facts["progress"] else None
-    return Job(**facts)
+    return Job(**dict(row) | {key: json.loads(row[key] or "null") for key in ("request", "progress")})

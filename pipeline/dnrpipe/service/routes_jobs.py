@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import AsyncIterator
 from typing import Annotated, Any
 
@@ -11,8 +10,9 @@ from fastapi import APIRouter, Header, HTTPException, Path, Query
 from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
+from ..core.cameras import KEYWORDS
 from ..core.settings import merge, parse_assignment, resolve
-from .models import FINAL, TAKES_SCENE, Job, JobPage, JobRequest, LogPage, Name, Problem, State
+from .models import FINAL, Job, JobPage, JobRequest, LogPage, Name, Problem, State
 from .state import Shared
 from .state import State as Service
 
@@ -20,24 +20,26 @@ KEEP_ALIVE = 15.0
 LOG_CHUNK = 256 * 1024
 SERVER_SETTINGS = ("device", "strict")
 """Settings that the server decides."""
-REFUSED: dict[int | str, dict[str, Any]] = {
-    code: {"model": Problem, "description": text}
-    for code, text in (
-        (400, "The request is not what HTTP wants"),
-        (401, "Wrong or missing token"),
-        (403, "A page of another origin"),
-        (413, "Too large"),
-        (421, "Not a name of this server"),
-        (422, "Not a valid request"),
-        (429, "Too many requests, or too many jobs"),
-    )
+STATUSES = {
+    400: "The request is not what HTTP wants",
+    401: "Wrong or missing token",
+    403: "A page of another origin",
+    404: "No such thing",
+    409: "The job's state forbids it",
+    413: "Too large",
+    421: "Not a name of this server",
+    422: "Not a valid request",
+    429: "Too many requests, or too many jobs",
+    503: "Too many streams",
+    507: "No space left",
 }
-NOT_FOUND: dict[int | str, dict[str, Any]] = {404: {"model": Problem, "description": "No such thing"}}
-CONFLICT: dict[int | str, dict[str, Any]] = {409: {"model": Problem, "description": "The job's state forbids it"}}
-FULL: dict[int | str, dict[str, Any]] = {
-    503: {"model": Problem, "description": "Too many streams"},
-    507: {"model": Problem, "description": "No space left"},
-}
+
+
+def refusals(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """These answers in the description of a route."""
+    return {status: {"model": Problem, "description": STATUSES[status]} for status in statuses}
+
+
 EVENT: dict[str, Any] = {
     "type": "object",
     "properties": {name: {"type": "string"} for name in ("id", "event", "data")} | {"retry": {"type": "integer"}},
@@ -45,10 +47,13 @@ EVENT: dict[str, Any] = {
 """One server-sent event, as its fields are parsed."""
 JobPath = Annotated[int, Path(ge=1, le=2**53, description="The job's number")]
 
+REFUSED = refusals(400, 401, 403, 413, 421, 422, 429)
+"""What every route may answer."""
+
 router = APIRouter(tags=["jobs"], responses=REFUSED)
 
 
-@router.post("/jobs", status_code=201, responses=NOT_FOUND | FULL)
+@router.post("/jobs", status_code=201, responses=refusals(404, 503, 507))
 def submit(
     request: JobRequest,
     service: Shared,
@@ -59,8 +64,7 @@ def submit(
     A request that repeats an Idempotency-Key gets the job that the first one made.
     """
     check_request(request, service)
-    if shutil.disk_usage(service.root.folder).free < service.config.free_disk_mb * 2**20:
-        raise HTTPException(507, f"less than {service.config.free_disk_mb} MiB of disk are free; make space")
+    service.require_space(service.root.folder)
     return service.queue.submit(request, most_queued=service.config.most_queued, token=idempotency_key)
 
 
@@ -78,34 +82,32 @@ def list_jobs(
     return JobPage(jobs=jobs[:limit], next=jobs[limit - 1].id if more else None)
 
 
-@router.get("/jobs/{job}", responses=NOT_FOUND)
+@router.get("/jobs/{job}", responses=refusals(404))
 def get_job(job: JobPath, service: Shared) -> Job:
     """One job."""
-    return known_job(service, job)
+    return service.queue.get(job)
 
 
-@router.post("/jobs/{job}/cancel", responses=NOT_FOUND | CONFLICT)
+@router.post("/jobs/{job}/cancel", responses=refusals(404, 409))
 def cancel(job: JobPath, service: Shared) -> Job:
     """Cancel a queued or running job. A running one stops within seconds; what it made is kept."""
-    known_job(service, job)
     return service.queue.cancel(job)
 
 
-@router.post("/jobs/{job}/retry", responses=NOT_FOUND | CONFLICT)
+@router.post("/jobs/{job}/retry", responses=refusals(404, 409))
 def retry(job: JobPath, service: Shared) -> Job:
     """Queue a failed or cancelled job again. It goes on from its checkpoints."""
-    known_job(service, job)
     return service.queue.retry(job)
 
 
-@router.get("/jobs/{job}/logs", responses=NOT_FOUND)
+@router.get("/jobs/{job}/logs", responses=refusals(404))
 def logs(
     job: JobPath,
     service: Shared,
     offset: Annotated[int, Query(ge=-(2**40), le=2**40, description="Bytes; negative: from the end")] = 0,
 ) -> LogPage:
     """What the job's process printed: at most 256 KiB from ``offset``."""
-    known_job(service, job)
+    service.queue.get(job)
     try:
         with service.root.log(job).open("rb") as file:
             size = file.seek(0, 2)
@@ -120,14 +122,14 @@ def logs(
 @router.get(
     "/jobs/{job}/events",
     response_class=StreamingResponse,
-    responses=NOT_FOUND
+    responses=refusals(404)
     | {
         200: {
             "content": {"text/event-stream": {"schema": EVENT}},
             "description": "Server-sent events: id, event (its kind), data (JSON). Ends when the job has.",
-        },
-        503: FULL[503],
-    },
+        }
+    }
+    | refusals(503),
 )
 async def events(
     job: JobPath,
@@ -139,7 +141,7 @@ async def events(
 
     Last-Event-ID (which wins over `after`) resumes a broken stream: nothing is lost or sent twice.
     """
-    await run_in_threadpool(known_job, service, job)
+    await run_in_threadpool(service.queue.get, job)
     if last_event_id is not None and last_event_id.isascii() and last_event_id.isdigit():
         after = min(int(last_event_id), 2**53)
     stream = service.stream()
@@ -152,7 +154,7 @@ async def events(
             yield "retry: 2000\n\n"
             while True:
                 # The state first: the events read after it include all that came before it became final.
-                ended = (await run_in_threadpool(known_job, service, job)).state in FINAL
+                ended = (await run_in_threadpool(service.queue.get, job)).state in FINAL
                 found = await run_in_threadpool(service.queue.events, job, last)
                 for event in found:
                     last = event.id
@@ -172,21 +174,13 @@ async def events(
     return StreamingResponse(lines(), media_type="text/event-stream")
 
 
-def known_job(service: Service, job: int) -> Job:
-    """Raises HTTPException 404."""
-    found = service.queue.get(job)
-    if found is None:
-        raise HTTPException(404, f"there is no job {job}")
-    return found
-
-
 def check_request(request: JobRequest, service: Service) -> None:
     """Refuse what the job's command would refuse later: unknown settings, scenes, workspaces.
 
     Raises HTTPException 422, UnknownName.
     """
     if request.scene is not None:
-        if request.command not in TAKES_SCENE:
+        if request.command not in ("run", "prepare"):
             raise HTTPException(422, f"scene: {request.command} takes none; only run and prepare do")
         service.root.scene(request.scene)
     path = service.root.workspace(request.workspace, must_exist=request.scene is None)
@@ -199,7 +193,5 @@ def check_request(request: JobRequest, service: Service) -> None:
         text = value if isinstance(value, str) else json.dumps(value)
         overrides = merge(overrides, parse_assignment(f"{key}={text}"))
     settings = resolve(request.preset, overrides, environment={})
-    from ..core.cameras import KEYWORDS
-
     if settings.cameras.source not in KEYWORDS:
         raise HTTPException(422, f"settings: cameras.source must be one of {', '.join(KEYWORDS)} on a server")

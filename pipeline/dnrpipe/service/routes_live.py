@@ -37,29 +37,8 @@ REFUSED = 1008
 router = APIRouter()
 
 
-class LatestRequest:
-    """The newest request of a viewer; it replaces older ones."""
-
-    def __init__(self) -> None:
-        self._newest: LiveRequest | None = None
-        self._news = asyncio.Event()
-        self.closed = False
-
-    def put(self, request: LiveRequest) -> None:
-        self._newest = request
-        self._news.set()
-
-    def close(self) -> None:
-        self.closed = True
-        self._news.set()
-
-    async def take(self, seconds: float | None) -> LiveRequest | None:
-        """The newest request; None when there was none for ``seconds``, or the viewer has gone."""
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._news.wait(), seconds)
-        self._news.clear()
-        request, self._newest = self._newest, None
-        return request
+Latest = asyncio.Queue[LiveRequest | None]
+"""Holds one: a viewer's newest request; None when the viewer has gone."""
 
 
 @router.websocket("/workspaces/{name}/live")
@@ -72,7 +51,7 @@ async def live(socket: WebSocket, name: Annotated[str, Path(pattern=NAME_PATTERN
         with service.stream():
             async with service.live.session(name) as session:
                 await socket.send_json({"kind": "hello", **session.scene.hello})
-                latest = LatestRequest()
+                latest = Latest(1)
                 reading = asyncio.create_task(_read(socket, latest))
                 try:
                     await _answer(socket, session, latest)
@@ -88,32 +67,35 @@ async def live(socket: WebSocket, name: Annotated[str, Path(pattern=NAME_PATTERN
             await socket.close(REFUSED)
 
 
-async def _read(socket: WebSocket, latest: LatestRequest) -> None:
+async def _read(socket: WebSocket, latest: Latest) -> None:
+    def put(request: LiveRequest | None) -> None:
+        if latest.full():
+            latest.get_nowait()
+        latest.put_nowait(request)
+
     try:
         while True:
             text = await socket.receive_text()
             try:
-                latest.put(LiveRequest.model_validate_json(text))
+                put(LiveRequest.model_validate_json(text))
             except ValidationError as error:
                 await socket.send_json({"kind": "problem", "detail": first_fault(error)})
     except (WebSocketDisconnect, RuntimeError, KeyError):  # gone, or sent bytes where text is wanted
-        latest.close()
+        put(None)
 
 
-async def _answer(socket: WebSocket, session: LiveSession, latest: LatestRequest) -> None:
+async def _answer(socket: WebSocket, session: LiveSession, latest: Latest) -> None:
     current: LiveRequest | None = None
     unsettled = refining = False
-    while not latest.closed:
-        wait = 0.0 if refining else SETTLED if unsettled else None
-        request = await latest.take(wait)
-        if latest.closed:
+    while True:
+        try:
+            async with asyncio.timeout(0.0 if refining else SETTLED if unsettled else None):
+                current = await latest.get()
+        except TimeoutError:
+            if unsettled and current is not None:
+                current = current.model_copy(update={"moving": False})
+        if current is None:
             return
-        if request is not None:
-            current = request
-        elif current is None or not (unsettled or refining):
-            continue
-        elif unsettled:
-            current = current.model_copy(update={"moving": False})
         try:
             answer = await session.frame(current)
         except UserError as error:

@@ -10,7 +10,7 @@ from fastapi.responses import FileResponse, PlainTextResponse
 
 from .. import __version__
 from .models import Health
-from .routes_jobs import NOT_FOUND, REFUSED
+from .routes_jobs import REFUSED, refusals
 from .state import Shared
 from .worker import folder_mb
 
@@ -54,7 +54,7 @@ def metrics(service: Shared) -> PlainTextResponse:
     alive = service.supervisor.alive()
     gauge("worker_up", "1 where the device's worker lives.", {f'{{device="{d}"}}': int(u) for d, u in alive.items()})
     gauge("streams", "Open event streams and viewers.", {"": service.streams})
-    gauge("viewers", "Workspaces viewed live.", {"": service.live.count()})
+    gauge("viewers", "Workspaces viewed live.", {"": len(service.live.sessions)})
     gauge("scenes_megabytes", "Size of the uploaded scenes, MiB.", {"": round(folder_mb(service.root.scenes), 3)})
     return PlainTextResponse("\n".join(lines) + "\n", media_type="text/plain; version=0.0.4")
 
@@ -69,7 +69,7 @@ def icon() -> FileResponse:
     return FileResponse(STATIC / "icon.svg", media_type="image/svg+xml")
 
 
-@router.get("/static/{file}", include_in_schema=False, responses=NOT_FOUND)
+@router.get("/static/{file}", include_in_schema=False, responses=refusals(404))
 def static(file: str) -> FileResponse:
     """One of the named files; there is no listing."""
     if file not in PAGES:

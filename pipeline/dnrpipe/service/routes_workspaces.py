@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import secrets
-from collections.abc import AsyncIterator
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, HTTPException, Path, Request, Response
@@ -17,25 +17,29 @@ from dnrtrain.contract import DamagedFile
 from dnrtrain.records import read
 
 from ..core.errors import UserError
+from ..core.ledger import total
+from ..core.settings import Settings
 from ..core.workspace import Workspace
+from ..report.charts import AZIMUTH, ELEVATION, sphere_svg
 from ..report.collect import outline
-from ..report.sphere import AZIMUTH, ELEVATION, sphere_svg
 from ..stages.pipeline import status
 from ..stages.records import PREVIEW, PreviewState
 from ..stages.session import resolve_settings
+from ..studies.planning.records import RENDERER_STAGES, Choice, read_plan
 from .models import (
     NAME_PATTERN,
     SCENE_PATTERN,
     CostState,
     Curve,
+    PlannedStage,
+    PlanState,
     Scene,
     StageState,
     TestPicture,
     WorkspaceDetail,
     WorkspaceSummary,
 )
-from .planned import plan_state
-from .routes_jobs import CONFLICT, FULL, NOT_FOUND, REFUSED
+from .routes_jobs import REFUSED, refusals
 from .state import Shared, State
 
 NamePath = Annotated[str, Path(pattern=NAME_PATTERN)]
@@ -75,7 +79,7 @@ def list_workspaces(service: Shared) -> list[WorkspaceSummary]:
     return found
 
 
-@router.get("/workspaces/{name}", responses=NOT_FOUND | CONFLICT)
+@router.get("/workspaces/{name}", responses=refusals(404, 409))
 def get_workspace(name: NamePath, service: Shared) -> WorkspaceDetail:
     """Stages, cameras, histories of training, held-out views and costs. 409: a file of it is damaged."""
     path = service.root.workspace(name)
@@ -96,7 +100,7 @@ def get_workspace(name: NamePath, service: Shared) -> WorkspaceDetail:
         sphere=str(sphere_svg(sphere, "oblique")) if sphere else None,
         eye=(AZIMUTH, ELEVATION),
         training=[Curve(title=t.title, losses=t.losses, psnr=t.psnr) for t in known.training],
-        tests=[TestPicture(view=view, psnr=psnr) for view, psnr in known.psnr.items()],
+        tests=[TestPicture(view=v.name, psnr=v.psnr) for v in (known.metrics.views if known.metrics else ())],
         costs=CostState(
             spent={stage: part.wall_seconds for stage, part in known.costs.by_stage.items()},
             total=known.costs.total.wall_seconds,
@@ -111,7 +115,7 @@ def get_workspace(name: NamePath, service: Shared) -> WorkspaceDetail:
     )
 
 
-@router.get("/workspaces/{name}/preview", responses=NOT_FOUND | CONFLICT)
+@router.get("/workspaces/{name}/preview", responses=refusals(404, 409))
 def preview(name: NamePath, service: Shared) -> PreviewState:
     """What the last picture of fine-tuning shows. 409: its file is damaged."""
     path = service.root.workspace(name) / "preview" / PREVIEW
@@ -123,14 +127,14 @@ def preview(name: NamePath, service: Shared) -> PreviewState:
         raise HTTPException(409, f"{name}: preview.json is damaged; the next training replaces it") from None
 
 
-@router.get("/workspaces/{name}/preview/{kind}", response_class=FileResponse, responses=NOT_FOUND | PNG)
+@router.get("/workspaces/{name}/preview/{kind}", response_class=FileResponse, responses=refusals(404) | PNG)
 def preview_picture(name: NamePath, kind: Literal["truth", "prediction"], service: Shared) -> FileResponse:
     """The view as fine-tuning last rendered it, or its ray-traced reference."""
     path = service.root.result(name, f"preview/{kind}.png", f"{name} has no picture {kind} of a training")
     return FileResponse(path, media_type="image/png")
 
 
-@router.get("/workspaces/{name}/pictures/{view}/{kind}", response_class=FileResponse, responses=NOT_FOUND | PNG)
+@router.get("/workspaces/{name}/pictures/{view}/{kind}", response_class=FileResponse, responses=refusals(404) | PNG)
 def picture(
     name: NamePath, view: ViewPath, kind: Literal["truth", "prediction", "flip"], service: Shared
 ) -> FileResponse:
@@ -139,7 +143,7 @@ def picture(
     return FileResponse(path, media_type="image/png")
 
 
-@router.get("/workspaces/{name}/report", response_class=FileResponse, responses=NOT_FOUND | HTML)
+@router.get("/workspaces/{name}/report", response_class=FileResponse, responses=refusals(404) | HTML)
 def report(name: NamePath, service: Shared) -> FileResponse:
     """The report of the last `run` or `report`."""
     path = service.root.result(name, "report/report.html", f"{name} has no report yet; submit a job report")
@@ -156,7 +160,7 @@ def list_scenes(service: Shared) -> list[Scene]:
 @router.put(
     "/scenes/{name}",
     status_code=201,
-    responses=CONFLICT | {507: FULL[507]},
+    responses=refusals(409, 507),
     openapi_extra={
         "requestBody": {
             "required": True,
@@ -179,7 +183,7 @@ async def upload(name: ScenePath, request: Request, service: Shared) -> Scene:
     checksum, size = hashlib.sha256(), 0
     try:
         with temporary.open("xb") as file:
-            async for chunk in _chunks(request):
+            async for chunk in request.stream():
                 size += len(chunk)
                 if size > limit:
                     raise HTTPException(413, f"the file is larger than {service.config.upload_mb} MiB")
@@ -190,12 +194,14 @@ async def upload(name: ScenePath, request: Request, service: Shared) -> Scene:
         if size == 0:
             raise HTTPException(422, "the body is empty; it must be the scene file")
         temporary.replace(target)
+    except ClientDisconnect:
+        raise HTTPException(400, "the connection ended before the file did") from None
     finally:
         temporary.unlink(missing_ok=True)
     return Scene(name=name, size=size, sha256=checksum.hexdigest())
 
 
-@router.delete("/scenes/{name}", status_code=204, responses=NOT_FOUND)
+@router.delete("/scenes/{name}", status_code=204, responses=refusals(404))
 def remove(name: ScenePath, service: Shared) -> Response:
     """Remove a scene file. Workspaces made from it stay as they are."""
     service.root.scene(name).unlink(missing_ok=True)
@@ -207,14 +213,46 @@ def _check_space(service: State, name: str) -> None:
     stored = {path.name for path in service.root.scenes.iterdir()}
     if name not in stored and len(stored) >= service.config.most_scenes:
         raise HTTPException(409, f"there are {service.config.most_scenes} scenes already; remove some")
-    stat = os.statvfs(service.root.scenes)
-    if stat.f_bavail * stat.f_frsize < service.config.free_disk_mb * 2**20:
-        raise HTTPException(507, f"less than {service.config.free_disk_mb} MiB of disk are free; make space")
+    service.require_space(service.root.scenes)
 
 
-async def _chunks(request: Request) -> AsyncIterator[bytes]:
-    try:
-        async for chunk in request.stream():
-            yield chunk
-    except ClientDisconnect:
-        raise HTTPException(400, "the connection ended before the file did") from None
+def plan_state(workspace: Workspace, settings: Settings, states: Mapping[str, str]) -> PlanState | None:
+    """The last plan's prediction and the seconds spent since; None without a plan. states: of the stages, by name.
+
+    The prediction for ``settings`` comes first. A finished stage counts the wall seconds of its last run, or, if that
+    was interrupted, the ledger's records of its parts. A running stage counts the records so far, which leave out the
+    start of processes. Raises UserError: the plan's file is damaged.
+    """
+    plan = read_plan(workspace.root)
+    if plan is None:
+        return None
+    known = [found for found in (plan.carried_out, plan.chosen, plan.settings_default) if found is not None]
+    prediction = next((found for found in known if _fits(found.choice, settings)), known[0])
+    seconds, choice = prediction.seconds, prediction.choice
+    since = [record for record in workspace.ledger.read() if record.time >= plan.made]
+    stages = []
+    for stage in (*RENDERER_STAGES, "evaluate"):
+        record = workspace.manifest.stages.get(stage)
+        done = states.get(stage) == "done"
+        spent: float | None = total(r for r in since if r.stage == stage).wall_seconds
+        if record is not None and record.finished >= plan.made:
+            spent = max(spent, record.seconds)
+        elif done and not spent:
+            spent = None
+        stages.append(PlannedStage(stage=stage, predicted=getattr(seconds, stage), spent=spent, done=done))
+    return PlanState(
+        made=plan.made,
+        **choice.model_dump(include={"views", "spp", "epochs"}),
+        fits=_fits(choice, settings),
+        stages=stages,
+        total=seconds.total.expected,
+        low=seconds.total.low,
+        high=seconds.total.high,
+        spent=sum(stage.spent or 0.0 for stage in stages if stage.stage in RENDERER_STAGES),
+    )
+
+
+def _fits(choice: Choice, settings: Settings) -> bool:
+    wanted: tuple[Any, ...] = (settings.select.budget, settings.raytrace.spp, settings.finetune.step2.epochs)
+    targets = settings.raytrace.noise is not None or settings.raytrace.time is not None
+    return not targets and wanted == (choice.views, choice.spp, choice.epochs)

@@ -12,18 +12,16 @@ from collections.abc import Callable
 from typing import Any
 
 import uvicorn
-from filelock import AcquireReturnProxy, FileLock, Timeout
+from filelock import FileLock, Timeout
 
 from ..core.errors import UserError
 from .app import create_app
-from .config import ServerConfig
+from .config import LOOPBACK, ServerConfig
 from .live_pool import LivePool
 from .queue import Queue
 from .root import ServiceRoot
 from .state import Feed, State
 from .supervisor import Supervisor
-
-SHUTDOWN_SECONDS = 3
 
 
 def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], None]) -> None:
@@ -31,7 +29,7 @@ def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], Non
 
     Raises UserError: a host that others can reach without a token, a root that another server holds, a port in use.
     """
-    if not config.loopback and token is None:
+    if config.host not in LOOPBACK and token is None:
         raise UserError(f"--host {config.host}: others can reach it, so a token is needed; give --token-file FILE")
     if not config.root.parent.is_dir():
         raise UserError(f"--root {config.root}: {config.root.parent} does not exist")
@@ -41,7 +39,11 @@ def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], Non
     root = ServiceRoot(config.root).create()
     config = config.model_copy(update={"root": root.folder})
     _log_as_json()
-    with _exclusive(root):
+    try:
+        lock = FileLock(root.private / "lock", timeout=10).acquire()  # a killed server may take a moment to end
+    except Timeout:
+        raise UserError(f"{root.folder}: another server works here; stop it or choose another --root") from None
+    with lock:
         queue = Queue(root.queue)
         queue.recover()
         supervisor = Supervisor(config, queue, root.private / "workers.log")
@@ -54,7 +56,7 @@ def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], Non
             log_config=None,
             access_log=False,
             server_header=False,
-            timeout_graceful_shutdown=SHUTDOWN_SECONDS,
+            timeout_graceful_shutdown=3,
             ws="websockets-sansio",
             ws_max_size=64 * 1024,
             limit_concurrency=config.streams + 1000,
@@ -85,13 +87,6 @@ class _Server(uvicorn.Server):
         await super().startup(sockets)
         if self.started:
             self.ready()
-
-
-def _exclusive(root: ServiceRoot) -> AcquireReturnProxy:
-    try:
-        return FileLock(root.private / "lock", timeout=10).acquire()  # a killed server may take a moment to end
-    except Timeout:
-        raise UserError(f"{root.folder}: another server works here; stop it or choose another --root") from None
 
 
 class _JsonLines(logging.Formatter):

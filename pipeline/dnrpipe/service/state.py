@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import Annotated
 
 from fastapi import Depends, HTTPException
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import HTTPConnection
 
 from .config import ServerConfig
+from .live_pool import LivePool
 from .queue import Queue
 from .root import ServiceRoot
 from .supervisor import Supervisor
-
-if TYPE_CHECKING:
-    from .live_pool import LivePool
 
 POLL = 0.1
 
@@ -46,11 +46,9 @@ class Feed:
 
     async def wait(self, seconds: float) -> bool:
         """Wait for an event of any job. Returns False after `seconds` without one."""
-        try:
-            await asyncio.wait_for(self._news.wait(), seconds)
-        except TimeoutError:
-            return False
-        return True
+        with contextlib.suppress(TimeoutError):
+            return await asyncio.wait_for(self._news.wait(), seconds)
+        return False
 
 
 @dataclass
@@ -64,6 +62,11 @@ class State:
     live: LivePool
     feed: Feed
     streams: int = 0
+
+    def require_space(self, folder: Path) -> None:
+        """Raises HTTPException 507: too little of the folder's disk is free."""
+        if shutil.disk_usage(folder).free < self.config.free_disk_mb * 2**20:
+            raise HTTPException(507, f"less than {self.config.free_disk_mb} MiB of disk are free; make space")
 
     @contextlib.contextmanager
     def stream(self) -> Iterator[None]:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from .config import ServerConfig
 from .queue import Queue
-from .worker import GRACE
+from .worker import GRACE, end_group
 
 LOG = logging.getLogger("dnrpipe.workers")
 POLL = 0.3
@@ -69,11 +69,7 @@ class Supervisor:
         for process in self.processes.values():
             process.terminate()
         for process in self.processes.values():
-            try:
-                process.wait(timeout=GRACE + 5)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+            end_group(process, grace=GRACE + 5)
         self.queue.close()
 
     def _spawn(self, device: str) -> subprocess.Popen[str]:

@@ -69,7 +69,9 @@ class Worker:
     def _run_job(self, job: Job) -> None:
         workspace = self.root.workspace(job.request.workspace, must_exist=False)
         command = job_command(job, self.root)
-        _await_lock(workspace)
+        if workspace.is_dir():  # if somebody else holds it, the command says so
+            with contextlib.suppress(Timeout), FileLock(workspace / LOCK_FILES[0], timeout=UNLOCK_SECONDS):
+                pass
         events = self.root.events(job.id)
         events.write_bytes(b"")  # the queue already has the events of earlier attempts
         with self.root.log(job.id).open("ab") as log:
@@ -98,7 +100,7 @@ class Worker:
         while process.poll() is None:
             self.queue.add_events(job.id, events.read())
             now = time.monotonic()
-            if self.queue.cancel_requested(job.id):
+            if self.queue.get(job.id).cancel_requested:
                 ended = "cancelled"
             elif self.stopping:
                 ended = "stopping"
@@ -211,7 +213,7 @@ def folder_mb(folder: Path) -> float:
     return total / 2**20
 
 
-def end_group(process: subprocess.Popen[bytes], *, grace: float = GRACE) -> None:
+def end_group(process: subprocess.Popen[Any], *, grace: float = GRACE) -> None:
     """SIGTERM to the leader, which stops its workers itself; SIGKILL to the whole group after ``grace`` seconds."""
     if process.poll() is None:
         process.send_signal(signal.SIGTERM)
@@ -220,13 +222,6 @@ def end_group(process: subprocess.Popen[bytes], *, grace: float = GRACE) -> None
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-
-
-def _await_lock(workspace: Path) -> None:
-    """Give the processes of a killed worker time to end. If somebody else holds the workspace, the command says so."""
-    if workspace.is_dir():
-        with contextlib.suppress(Timeout), FileLock(workspace / LOCK_FILES[0], timeout=UNLOCK_SECONDS):
-            pass
 
 
 def _reason(log: Path, code: int) -> str:
