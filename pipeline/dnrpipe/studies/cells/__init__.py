@@ -1,6 +1,7 @@
 """What studies share: train and measure one (scene, variant, seed).
 
 cell          the worker: one cell
+study         a study's run: its tasks and results
 request       what a command line asks for, and names
 worker_pool   how many workers, on how many threads
 tasks         what workers are asked, and what their files hold

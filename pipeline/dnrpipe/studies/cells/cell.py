@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from dnrtrain.dataset import ViewSet
     from dnrtrain.records import Epoch, ModelRecord
 
-CELL_VERSION = 1  # raise when training or measuring changes what a cell holds
+CELL_VERSION = 2  # raise when training or measuring changes what a cell holds, or what fingerprints hash
 STEP1_SHARE = 1 / 3
 """Share of the training time that step 1 may take where all rows train equally long."""
 KEPT_SETS = 8
@@ -66,7 +66,6 @@ class Worker(FileWorker):
         """The coarse model on rasterised candidates, and the views its policy chooses."""
         settings = task.settings
         if task.seconds is not None:
-            assert task.pace is not None
             short = _with_epochs(settings, step1=2)
             pace = self._pace(task.pace, task.folder, lambda folder: self._train_step1(task, short, folder))
             limit = max(1, int(task.seconds / pace))

@@ -1,4 +1,4 @@
-"""What the command lines of `ablate` and `bench-select` ask for, and what results say of it."""
+"""What the command lines of `ablate` and `bench-select` ask for."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 
 from ...core.errors import UserError
 from ...core.settings import Settings, merge, parse_assignment
-from .provenance import made_by
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,20 +33,6 @@ class StudyRequest:
             raise UserError(f"--seeds {self.seeds} --jobs {self.jobs}: at least 1 seed; jobs from 0 (one per core)")
         if self.out.exists() and not self.out.is_dir():
             raise UserError(f"--out {self.out}: is a file; name a folder")
-
-    def facts(self, schema: int) -> dict[str, Any]:
-        """What results say of the run, but for what it compares."""
-        base = self.base
-        return {
-            "schema": schema,
-            **made_by(),
-            "preset": base.preset,
-            "resolution": f"{base.cameras.width}x{base.cameras.height}",
-            "seconds": self.seconds,
-            "seeds": self.seeds,
-            "scenes": [path.stem for path in self.scenes],
-            "spp": {"training": base.raytrace.spp, "test": base.raytrace.evaluation_spp},
-        }
 
 
 def merged(layers: Sequence[Mapping[str, Any]], assignments: Sequence[str]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from ...core.ledger import StageName
 from ...core.scene_files import read_raster_choice, split_views
 from ...core.settings import Settings
 from ...core.workspace import Source, Workspace, file_sha256
+from ...effects.store import plan_of
 from ...stages.pipeline import run_stage
 from ...stages.prepare import draw_passes
 from ...stages.raytrace import trace_views
@@ -62,6 +63,11 @@ def choose_by_pose(views: Sequence[View], policy: str, budget: int, seed: int) -
     rule = untrained(policy)
     assert rule is not None  # both names above are rules
     return rule.choose(Candidates.of_views(views), budget, seed).views
+
+
+def without_left_out(workspace: Workspace, settings: Settings) -> Settings:
+    """The settings without what the scene's effect plan leaves off of the model."""
+    return settings.model_copy(update={"model": plan_of(workspace, settings).model(settings.model)})
 
 
 def scene_workspace(source: Path, root: Path) -> Workspace:

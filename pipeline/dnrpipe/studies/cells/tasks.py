@@ -86,7 +86,7 @@ class Step1Task(StudyTask):
     Args:
         policy: chooses the views.
         seconds: of training at most; None: the settings' epochs.
-        pace: file of the seconds of an epoch; needed where ``seconds`` limit them.
+        pace: file of the seconds of an epoch, where ``seconds`` limit them.
     """
 
     kind: Literal["step1"] = "step1"
@@ -94,7 +94,7 @@ class Step1Task(StudyTask):
     policy: str
     seed: int
     seconds: float | None
-    pace: Path | None = None
+    pace: Path
     folder: Path
 
     def result(self) -> Step1Result:

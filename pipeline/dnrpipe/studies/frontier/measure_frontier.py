@@ -18,7 +18,7 @@ from ...core.settings import Settings
 from ...core.workspace import digest
 from ...stages.stage import Run
 from ...workers.view_tasks import worker_count
-from ..ablation.cell_loop import Request
+from ..ablation.ablate import Request
 from ..cells.provenance import made_by
 from .frontier_plots import plot
 from .frontier_report import markdown
@@ -162,7 +162,7 @@ def _others(text: str) -> tuple[str, ...]:
 
 def _trace_baselines(swept: Frontier, settings: Settings, samples: tuple[int, ...], cores: int) -> BaselineFile:
     """Path tracing of the test views, rendered where it is not on disk."""
-    references = sorted(swept.references[swept.scene.name].values())
+    references = swept.references[swept.scene.name]
     model = swept.settings_of(swept.request.rows[0], swept.scene).model
     base = settings.base.model_dump()
     fingerprint = digest([BASELINE_VERSION, references, samples, model.base, base, cores, swept.perceptual])

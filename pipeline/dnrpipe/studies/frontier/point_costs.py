@@ -35,10 +35,10 @@ def point_of(swept: Frontier, row: Row, seed: int, base_ms: float | None, cores:
         base_ms: of a base image by the baselines' clock; None: as the cell measured it.
         cores: that ray tracing keeps busy.
     """
-    path = swept.cells.get((swept.scene.name, row.name, seed))
-    if path is None or not path.exists():
+    task = swept.cells.get((swept.scene.name, row.name, seed))
+    if task is None or not task.output.exists():
         return None
-    cell = read_cell(path)
+    cell = read_cell(task.output)
     workspace, training = swept.scene.workspace, cell.training
     based, work = cell.base not in ("none", "raster"), upfront_work(workspace.ledger.read())
     split = traced_split(swept.request.base, row.spp)

@@ -12,7 +12,7 @@ from ...core.errors import UserError
 from ...core.settings import Settings
 from ...core.workspace import Workspace
 from ...stages.stage import Run
-from ..ablation.cell_loop import Ablation
+from ..ablation.ablate import Ablation
 from ..ablation.rows import CLASSIC, ROWS, Row, ViewChoice
 from ..cells.scenes import Scene, prepared
 

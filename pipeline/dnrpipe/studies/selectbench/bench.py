@@ -1,36 +1,34 @@
-"""The loop over all cells: what is due, in an order that gives a whole table early, resumable at any point.
+"""The loop over all cells, and what it writes.
 
-<out>/
-  scenes/<scene>.dnr                 the scene converted, once
-  scenes/<scene>-<pool>.dnr          its candidates and test views: passes; ray tracing as far as somebody chose them
+<out>/, beside what every study has (`cells.study`), whose <scene> is <scene>-<pool> here
+  scenes/<scene>.dnr          the scene converted, once
+  scenes/<scene>-<pool>.dnr   its candidates and test views: passes; ray tracing as far as somebody chose them
   selections/<scene>-<pool>/<fingerprint>.json   the views that a rule, or active learning, chose, why, at what cost
-  step1/<scene>-<pool>/<fingerprint>.json   the same of a trained policy, and coarse models (weights beside them)
-  cells/<scene>-<pool>/<fingerprint>.json   one cell each; the fingerprint is a hash of all that decides it
-  results.json  report.md  views.png  seconds.png
+  report.md  views.png  seconds.png
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from dnrtrain.atomic import write_text
+
 from ... import __version__
-from ...core.console import Console
 from ...core.settings import Settings
 from ...core.workspace import digest
-from ...effects.store import plan_of
-from ...stages.trainer import perceptual_weights
 from ..cells.cell import CELL_VERSION
-from ..cells.measure import written_seconds
-from ..cells.provenance import code_state
+from ..cells.measure import METRICS, mean_of, written_seconds
 from ..cells.request import StudyRequest
-from ..cells.scenes import base_file, make_bases, trace_references, trace_train
-from ..cells.tasks import CellTask, ChoiceFile, Step1Task, StudyTask, files_of, once
-from ..cells.worker_pool import WorkerPool
+from ..cells.scenes import base_file, make_bases, trace_train, without_left_out
+from ..cells.study import CELL_WORKER, Study
+from ..cells.tasks import CellTask, ChoiceFile, Step1Task, StudyTask, files_of, once, read_cell
 from .active.settings import ActiveSettings, ActiveTask
+from .bench_plots import plot
+from .bench_tables import SCHEMA, markdown
 from .policies import Contender, rules_fingerprint, settings_of
 from .pools import Pool, place_pool, share_light
 from .rule_worker import RuleTask
@@ -63,50 +61,36 @@ class Place:
 ChoiceTask = RuleTask | ActiveTask | Step1Task
 
 
-@dataclass(frozen=True)
-class PlannedCell:
-    """A cell's task, and the file of the selection that its views come from."""
-
-    task: CellTask
-    choice: Path
-
-
 @dataclass
-class Bench:
-    """The state of one run: pools, workers, and the cells known so far."""
+class Bench(Study[Request, Place]):
+    """Pools by (scene, name). chosen: the selections that the cells' views come from."""
 
-    request: Request
-    console: Console
-    worker_pool: WorkerPool
-    perceptual: bool = False
-    pools: list[Pool] = field(default_factory=list)
-    references: dict[str, list[str]] = field(default_factory=dict)
-    cells: dict[Place, PlannedCell] = field(default_factory=dict)
-    """Places whose policies chose the same views share one fingerprint."""
-    written_seconds: Callable[..., float] = field(default_factory=lambda: functools.cache(written_seconds))
+    COMMAND, SCHEMA, SINGLE = "bench-select", SCHEMA, True
+    pools: dict[tuple[str, str], Pool] = field(default_factory=dict, init=False)
+    chosen: dict[Place, ChoiceTask] = field(default_factory=dict, init=False)
+    written_seconds: Callable[..., float] = field(default_factory=lambda: functools.cache(written_seconds), init=False)
 
-    def run(self) -> Iterator[int]:
-        """Prepare all pools, then go seed by seed; yields each seed when its cells are done, a whole table."""
+    def open_scenes(self) -> None:
         request = self.request
-        self.perceptual = perceptual_weights(self.console) is not None
         places = [(source, name) for source in request.scenes for name in request.pools]
         with self.console.bar("scenes and cameras", len(places)) as bar:  # all, before anything takes long
             for source, name in places:
-                self.pools.append(place_pool(source, name, request.out, request.base, self.console))
-                bar.advance(note=f"{source.stem}-{name}")
-        with self.console.bar("pools", len(self.pools)) as bar:
-            for pool in self.pools:
-                traced = trace_references(pool.data, self._settings(pool))
-                self.references[pool.folder] = sorted(traced.values())
+                pool = place_pool(source, name, request.out, request.base, self.console)
+                self.pools[pool.scene, name] = pool
                 bar.advance(note=pool.folder)
-        for seed in range(request.seeds):
-            self._seed(seed)
-            yield seed
+        with self.console.bar("pools", len(self.pools)) as bar:
+            for pool in self.pools.values():
+                self.trace_references(pool.data, self._settings(pool))
+                bar.advance(note=pool.folder)
 
-    def _seed(self, seed: int) -> None:
-        chosen: dict[Place, ChoiceTask] = {}
+    def run_seed(self, seed: int) -> None:
+        super().run_seed(seed)
+        self.write()
+
+    def plan_cells(self, seed: int) -> None:
         starts: dict[Place, Step1Task] = {}
-        for pool in self.pools:
+        chosen: dict[Place, ChoiceTask] = {}
+        for pool in self.pools.values():
             for budget in self.request.budgets:
                 for contender in self.request.policies:
                     place = Place(pool.scene, pool.name, budget, contender.name, seed)
@@ -114,157 +98,126 @@ class Bench:
                     chosen[place] = task = self._choice_task(pool, contender, settings, seed)
                     if settings.starts_coarse:
                         coarse = isinstance(task, Step1Task)
-                        starts[place] = task if coarse else self._step1_task(pool, settings, SHARED_COARSE, seed)
+                        starts[place] = task if coarse else self.step1_task(pool.data, settings, SHARED_COARSE, seed)
         tasks = [*chosen.values(), *starts.values()]
-        self._work(f"selections, seed {seed}", "selectbench.rule_worker", tasks, RuleTask)
-        self._work(f"active selections, seed {seed}", "selectbench.active.active_worker", tasks, ActiveTask)
-        self._work(f"step 1, seed {seed}", "cells.cell", tasks, Step1Task)
-        for pool in self.pools:
+        self._work(f"selections, seed {seed}", "dnrpipe.studies.selectbench.rule_worker", tasks, RuleTask)
+        active = "dnrpipe.studies.selectbench.active.active_worker"
+        self._work(f"active selections, seed {seed}", active, tasks, ActiveTask)
+        self._work(f"step 1, seed {seed}", CELL_WORKER, tasks, Step1Task)
+        self.chosen |= chosen
+        for pool in self.pools.values():
             places = [place for place in chosen if (place.scene, place.pool) == (pool.scene, pool.name)]
-            self._trace_and_plan(pool, {place: chosen[place] for place in places}, starts)
-        cells = [cell.task for place, cell in self.cells.items() if place.seed == seed]
-        self._work(f"cells, seed {seed}", "cells.cell", cells, CellTask)
+            self._plan_pool(pool, places, starts)
 
     def _work(self, label: str, module: str, tasks: Sequence[StudyTask], kind: type[StudyTask]) -> None:
         """Run the tasks of a kind."""
-        due = once(task for task in tasks if isinstance(task, kind))
-        self.worker_pool.work(label, f"dnrpipe.studies.{module}", due)
-
-    # -- selections ------------------------------------------------------------------------------------
+        self.worker_pool.work(label, module, once(task for task in tasks if isinstance(task, kind)))
 
     def _choice_task(self, pool: Pool, contender: Contender, settings: Settings, seed: int) -> ChoiceTask:
         """A selection by the contender's policy."""
         policy, budget, inputs = contender.policy, settings.select.budget, pool.data.inputs
-        if contender.kind == "step1":
-            return self._step1_task(pool, settings, policy, seed)
-        common: dict[str, Any] = {"workspace": pool.data.workspace.root, "policy": policy, "seed": seed}
-        folder = self.request.out / "selections" / pool.folder
+        if contender.kind == "step1":  # the preset's epochs: what step 1 takes is part of what its policy costs
+            return self.step1_task(pool.data, settings, policy, seed)
+        decisive = [CHOICE_VERSION, rules_fingerprint(), inputs, policy, budget, seed]
+        if contender.kind == "active":
+            model, step1 = settings.model.coarse().model_dump(), settings.select.step1.model_dump()
+            decisive = [CHOICE_VERSION, CELL_VERSION, __version__, inputs, model, step1, asdict(ActiveSettings())]
+            decisive += [policy, budget, seed, *self.environment]
+        common: dict[str, Any] = {
+            **files_of(self.request.out / "selections" / pool.folder, digest(decisive)),
+            "workspace": pool.data.workspace.root,
+            "policy": policy,
+            "seed": seed,
+            "label": f"{pool.folder} {contender.name} {budget}",
+        }
         if contender.kind == "rule":
-            fingerprint = digest([CHOICE_VERSION, rules_fingerprint(), inputs, policy, budget, seed])
-            label, output = f"{pool.folder} {contender.name} {budget}", folder / f"{fingerprint}.json"
-            return RuleTask(**common, fingerprint=fingerprint, output=output, budget=budget, label=label)
-        model, step1 = settings.model.coarse().model_dump(), settings.select.step1.model_dump()
-        fingerprint = digest(
-            [
-                *(CHOICE_VERSION, CELL_VERSION, __version__, inputs, model, step1, asdict(ActiveSettings())),
-                *(policy, budget, seed, self.worker_pool.device, self.worker_pool.threads),
-            ]
-        )
-        label = f"{pool.folder} {policy} {budget}"
-        return ActiveTask(**common, **files_of(folder, fingerprint), settings=settings, label=label)
+            return RuleTask(**common, budget=budget)
+        return ActiveTask(**common, settings=settings)
 
-    def _step1_task(self, pool: Pool, settings: Settings, policy: str, seed: int) -> Step1Task:
-        """Step 1: a trained policy's selection, or the coarse model that all others share."""
-        model, step1 = settings.model.coarse().model_dump(), settings.select.step1.model_dump()
-        fingerprint = digest(
-            [
-                *(CELL_VERSION, __version__, pool.data.inputs, model, step1, policy, settings.select.budget, seed),
-                *(self.worker_pool.device, self.worker_pool.threads),
-            ]
-        )
-        return Step1Task(
-            **files_of(self.request.out / "step1" / pool.folder, fingerprint),
-            workspace=pool.data.workspace.root,
-            settings=settings,
-            policy=policy,
-            seconds=None,  # the preset's epochs: what step 1 takes is part of what its policy costs
-            seed=seed,
-            label=f"{pool.folder} step 1",
-        )
-
-    # -- cells -----------------------------------------------------------------------------------------
-
-    def _trace_and_plan(
-        self,
-        pool: Pool,
-        chosen: Mapping[Place, ChoiceTask],
-        starts: Mapping[Place, Step1Task],
-    ) -> None:
+    def _plan_pool(self, pool: Pool, places: Sequence[Place], starts: Mapping[Place, Step1Task]) -> None:
         """Trace what anybody chose in this pool, and note the tasks of its cells."""
         settings = self._settings(pool)
         order = {name: index for index, name in enumerate(pool.data.train)}
         # In the pool's order: two policies that choose the same views in another order are the same cell.
-        views = {place: sorted(read_choice(task.output).views, key=order.__getitem__) for place, task in chosen.items()}
+        views = {place: sorted(self._choice(place).views, key=order.__getitem__) for place in places}
         everything = sorted({name for names in views.values() for name in names})
         traced, bases = trace_train(pool.data, settings, everything), {}
         if settings.model.base != "none":
-            share_light([other for other in self.pools if other.scene == pool.scene])
+            share_light([other for other in self.pools.values() if other.scene == pool.scene])
             bases = make_bases(pool.data, settings, everything)
         for place, names in views.items():
-            fingerprints = {name: traced[name] for name in names}
-            task = self._cell_task(pool, settings, place, fingerprints, starts.get(place), bases)
-            self.cells[place] = PlannedCell(task, chosen[place].output)
-
-    def _cell_task(
-        self,
-        pool: Pool,
-        settings: Settings,
-        place: Place,
-        traced: dict[str, str],
-        coarse: Step1Task | None,
-        bases: dict[str, str],
-    ) -> CellTask:
-        """Train on the views and measure.
-
-        Args:
-            pool: of the candidates.
-            settings: of the pool.
-            place: in the tables.
-            traced: fingerprints of the training views' pictures.
-            coarse: the model that step 2 starts from.
-            bases: fingerprints of base images by split and view; {} where the model reads none.
-        """
-        views = list(traced)
-        model, step2 = settings.model.model_dump(mode="json"), settings.finetune.step2.model_dump(mode="json")
-        worker_pool, data = self.worker_pool, pool.data
-        used = [f"train/{name}" for name in views] + [f"test/{name}" for name in data.test]
-        shown = [CELL_VERSION, __version__, data.inputs, self.references[pool.folder], model]
-        shown.append([bases[name] for name in used] if bases else None)
-        start = coarse and coarse.fingerprint
-        train = [place.seed, list(traced.values()), step2, start, self.request.seconds]
-        fingerprint = digest([*shown, train, worker_pool.device, worker_pool.threads, self.perceptual])
-        pace = [*shown[:5], len(views), step2, worker_pool.device, worker_pool.threads]
-        return CellTask(
-            **files_of(self.request.out / "cells" / pool.folder, fingerprint),
-            scene=pool.scene,
-            seed=place.seed,
-            workspace=data.workspace.root,
-            settings=settings,
-            network=True,
-            views=views,
-            coarse=coarse and coarse.folder,
-            coarse_cost=coarse and coarse.result(),
-            seconds=self.request.seconds,
-            # Where step 2 starts from a coarse model, all policies give step 1 the same share of their time.
-            full_step1=coarse is not None,
-            pace=self.request.out / "pace" / pool.folder / f"{digest(pace)}.json",
-            picture=None,
-            code=code_state(),
-            label=f"{pool.folder} {place.policy} {place.budget}",
-        )
+            coarse = starts.get(place)
+            self.cells[place] = self.cell_task(
+                pool.data,
+                settings,
+                place.seed,
+                {name: traced[name] for name in names},
+                coarse,
+                bases,
+                label=f"{place.policy} {place.budget}",
+                # Where step 2 starts from a coarse model, all policies give step 1 the same share of their time.
+                full_step1=coarse is not None,
+            )
 
     def _settings(self, pool: Pool) -> Settings:
         """The run's settings without what the scene's effect plan leaves off."""
-        base = self.request.base
-        model = plan_of(pool.data.workspace, base).model(base.model)
-        return base.model_copy(update={"model": model})
+        return without_left_out(pool.data.workspace, self.request.base)
 
-    # -- what views cost -------------------------------------------------------------------------------
+    def _choice(self, place: Place) -> ChoiceFile:
+        """The file of a selection, of whichever kind."""
+        return ChoiceFile.model_validate_json(self.chosen[place].output.read_bytes())
 
-    @property
-    def clock(self) -> Literal["seconds", "cpu_seconds"]:
-        """What costs are counted in: processor time where the model trains on a CPU."""
-        return "cpu_seconds" if self.worker_pool.device == "cpu" else "seconds"
+    # -- results ---------------------------------------------------------------------------------------
 
-    def view_seconds(self, pool: Pool, names: Sequence[str]) -> float:
-        """Seconds of ray tracing the views and their base images, by the files."""
-        kind, workspace = self._settings(pool).model.base, pool.data.workspace
-        files = [workspace.raytraced("train", name) for name in names]
-        if kind not in ("none", "raster"):
-            files += [base_file(workspace, kind, "train", name) for name in names]
-        return sum(self.written_seconds(file, self.clock) for file in files)
+    def compared(self) -> dict[str, Any]:
+        request = self.request
+        return {
+            "candidates": request.base.cameras.train,
+            "pools": request.pools,
+            "budgets": request.budgets,
+            "device": self.device,
+            "threads": self.threads,
+            "policies": {contender.name: contender.what for contender in request.policies},
+        }
 
+    def line(self, place: Place, task: CellTask) -> dict[str, Any]:
+        """One cell: metrics as means over the test views, and the seconds of each part.
 
-def read_choice(path: Path) -> ChoiceFile:
-    """The file of a selection, of whichever kind."""
-    return ChoiceFile.model_validate_json(path.read_bytes())
+        select_seconds: choosing, step 1 included where it chooses; view_seconds: tracing the views and their base
+        images; train_seconds: step 2, and step 1 where it only gives the start; total_seconds: all of them. On a CPU
+        seconds are of the processor.
+        """
+        cell, choice = read_cell(task.output), self._choice(place)
+        clock: Literal["seconds", "cpu_seconds"] = "cpu_seconds" if self.device == "cpu" else "seconds"
+        training = cell.training
+        assert training is not None  # every cell has a network
+        step1 = training.step1
+        chooses = step1 is not None and step1.key == choice.key
+        train = getattr(training.step2, clock) + (getattr(step1, clock) if step1 and not chooses else 0.0)
+        workspace = self.pools[place.scene, place.pool].data.workspace
+        files = [workspace.raytraced("train", name) for name in cell.views]
+        if cell.base not in ("none", "raster"):
+            files += [base_file(workspace, cell.base, "train", name) for name in cell.views]
+        seconds = {
+            "select_seconds": getattr(choice, clock),
+            "view_seconds": sum(self.written_seconds(file, clock) for file in files),
+            "train_seconds": train,
+        }
+        return {
+            **asdict(place),
+            "key": cell.key,
+            **{name: mean_of(cell.tests, name) for name in METRICS},
+            "views": choice.views,
+            **{name: round(value, 3) for name, value in seconds.items()},
+            "total_seconds": round(sum(seconds.values()), 3),
+            "select_peak_mb": choice.peak_mb and round(choice.peak_mb),
+            "epochs": training.epochs,
+            "steps": training.step2.steps,
+            "commit": cell.code["commit"],
+        }
+
+    def show(self, results: dict[str, Any]) -> None:
+        out: Path = self.request.out
+        write_text(out / "report.md", markdown(results))
+        plot(results, out / "views.png", "views")
+        plot(results, out / "seconds.png", "total_seconds")

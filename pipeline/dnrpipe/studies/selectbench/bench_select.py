@@ -1,28 +1,18 @@
-"""`dnrpipe bench-select` behind its options: settings, the run, and what it writes."""
+"""`dnrpipe bench-select` behind its options."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
-from pathlib import Path
 from typing import Any
-
-from dnrtrain.atomic import write_json, write_text
 
 from ...core.console import Console
 from ...core.errors import UserError
 from ...core.settings import merge, resolve
-from ...core.workspace import locked
-from ..cells.measure import METRICS, mean_of
 from ..cells.request import merged
 from ..cells.scenes import find_scenes
-from ..cells.tasks import read_cell
-from ..cells.worker_pool import make_pool
-from .bench import Bench, Place, PlannedCell, Request, read_choice
-from .bench_plots import plot
-from .bench_tables import SCHEMA, markdown
+from .bench import Bench, Request
 from .policies import choose_policies
-from .pools import Pool, choose_pools
+from .pools import choose_pools
 
 SMOKE: dict[str, Any] = {
     "cameras": {"train": 10, "test": 2, "width": 32, "height": 32},
@@ -44,17 +34,14 @@ def run_bench(
     pools: str | None,
     budgets: str | None,
     policies: str | None,
-    seeds: int,
     views: int | None,
     preset: str,
-    seconds: float | None,
-    jobs: int,
     assignments: Sequence[str],
-    out: Path,
     smoke: bool,
     console: Console,
+    **more: Any,
 ) -> dict[str, Any]:
-    """Run what is due and write results.json, report.md, views.png and seconds.png into ``out`` -> the results.
+    """Run what is due and write it -> the results. more: fields of `StudyRequest`.
 
     Settings come from the preset and these arguments alone, neither from the environment nor from
     dnrpipe.toml: the command that is kept in the results says all.
@@ -77,20 +64,10 @@ def run_bench(
         pools=choose_pools(pools or defaults["pools"]),
         budgets=wanted,
         policies=choose_policies(policies or defaults["policies"]),
-        seeds=seeds,
         base=base,
-        seconds=seconds,
-        out=out,
-        jobs=jobs,
+        **more,
     )
-    bench = Bench(request, console, make_pool(base, jobs, out / "logs" / "cells.log", console, single=True))
-    with locked(out, "bench-select"):
-        try:
-            for _ in bench.run():
-                _write(bench)
-        finally:
-            results = _write(bench)
-    return results
+    return Bench(request, console).carry_out()
 
 
 def choose_budgets(text: str, candidates: int) -> list[int]:
@@ -109,65 +86,3 @@ def choose_budgets(text: str, candidates: int) -> list[int]:
     if not found:
         raise UserError("--budgets: names none; for example 10,25")
     return sorted(found)
-
-
-def _gather(bench: Bench) -> dict[str, Any]:
-    """Everything that tables and plots need; cells whose file is missing are left out."""
-    pools = {(pool.scene, pool.name): pool for pool in bench.pools}
-    request = bench.request
-    return {
-        **request.facts(SCHEMA),
-        "candidates": request.base.cameras.train,
-        "pools": request.pools,
-        "budgets": request.budgets,
-        "device": bench.worker_pool.device,
-        "threads": bench.worker_pool.threads,
-        "policies": {contender.name: contender.what for contender in request.policies},
-        "cells": [
-            _line(bench, pools[place.scene, place.pool], place, cell)
-            for place, cell in bench.cells.items()
-            if cell.task.output.exists()
-        ],
-    }
-
-
-def _line(bench: Bench, pool: Pool, place: Place, planned: PlannedCell) -> dict[str, Any]:
-    """One cell: metrics as means over the test views, and the seconds of each part.
-
-    select_seconds: choosing, step 1 included where it chooses; view_seconds: tracing the views and their base images;
-    train_seconds: step 2, and step 1 where it only gives the start; total_seconds: all of them.
-    """
-    cell, choice = read_cell(planned.task.output), read_choice(planned.choice)
-    training, clock = cell.training, bench.clock
-    assert training is not None  # every cell has a network
-    step1 = training.step1
-    chooses = step1 is not None and step1.key == choice.key
-    train = getattr(training.step2, clock) + (getattr(step1, clock) if step1 and not chooses else 0.0)
-    seconds = {
-        "select_seconds": getattr(choice, clock),
-        "view_seconds": bench.view_seconds(pool, cell.views),
-        "train_seconds": train,
-    }
-    return {
-        **asdict(place),
-        "key": cell.key,
-        **{name: mean_of(cell.tests, name) for name in METRICS},
-        "views": choice.views,
-        **{name: round(value, 3) for name, value in seconds.items()},
-        "total_seconds": round(sum(seconds.values()), 3),
-        "select_peak_mb": choice.peak_mb and round(choice.peak_mb),
-        "epochs": training.epochs,
-        "steps": training.step2.steps,
-        "commit": cell.code["commit"],
-    }
-
-
-def _write(bench: Bench) -> dict[str, Any]:
-    """Results, report and curves of the cells that are there."""
-    out, results = bench.request.out, _gather(bench)
-    if results["cells"]:
-        write_json(out / "results.json", results)
-        write_text(out / "report.md", markdown(results))
-        plot(results, out / "views.png", "views")
-        plot(results, out / "seconds.png", "total_seconds")
-    return results

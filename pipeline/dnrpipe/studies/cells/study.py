@@ -1,0 +1,215 @@
+"""A study's run: what its scenes and cells have in common, and its results.
+
+Every file is named by the fingerprint of all that decides it, so that a run may stop and go on at any point.
+
+<out>/
+  step1/<scene>/<fingerprint>.json  coarse models, and the views that their policy chose (weights beside them)
+  cells/<scene>/<fingerprint>.json  one cell each
+  pace/<scene>/<fingerprint>.json   seconds of an epoch
+  results.json
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeVar
+
+from dnrtrain.atomic import write_json
+from dnrtrain.settings import ModelSettings, Strict
+
+from ... import __version__
+from ...core.console import Console
+from ...core.settings import Settings
+from ...core.workspace import digest, locked
+from ...stages.trainer import perceptual_weights
+from .cell import CELL_VERSION
+from .provenance import code_state, made_by
+from .request import StudyRequest
+from .scenes import Scene, trace_references, traced_split
+from .tasks import CellTask, Step1Task, files_of, once
+from .worker_pool import make_pool
+
+CELL_WORKER = "dnrpipe.studies.cells.cell"
+Request = TypeVar("Request", bound=StudyRequest)
+Place = TypeVar("Place")
+
+
+@dataclass
+class Study(ABC, Generic[Request, Place]):
+    """The state of one run. references: fingerprints of the test views' pictures, by scene.
+
+    cells: by their places in the tables; those that come to the same share one fingerprint.
+    """
+
+    COMMAND: ClassVar[str]
+    SCHEMA: ClassVar[int]
+    SINGLE: ClassVar[bool] = False
+    """Of `make_pool`."""
+
+    request: Request
+    console: Console
+    perceptual: bool = field(default=False, init=False)
+    references: dict[str, list[str]] = field(default_factory=dict, init=False)
+    cells: dict[Place, CellTask] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        log = self.request.out / "logs" / "cells.log"
+        self.worker_pool = make_pool(self.request.base, self.request.jobs, log, self.console, single=self.SINGLE)
+        self.environment = self.device, self.threads = self.worker_pool.device, self.worker_pool.threads
+
+    def carry_out(self) -> dict[str, Any]:
+        """Run what is due and write the results, also where some of it failed -> the results.
+
+        Raises TasksFailed: some cells failed; the others are written.
+        """
+        with locked(self.request.out, self.COMMAND):
+            try:
+                self.run()
+            finally:
+                results = self.write()
+        return results
+
+    def run(self) -> None:
+        """Prepare all scenes, then go seed by seed, so that a whole table of the first seed exists early."""
+        self.perceptual = perceptual_weights(self.console) is not None
+        self.open_scenes()
+        for seed in range(self.request.seeds):
+            self.run_seed(seed)
+
+    @abstractmethod
+    def open_scenes(self) -> None:
+        """Prepare all scenes and trace their references."""
+
+    def run_seed(self, seed: int) -> None:
+        """Make the seed's cells."""
+        self.plan_cells(seed)
+        due = once(task for task in self.cells.values() if task.seed == seed)
+        self.worker_pool.work(f"cells, seed {seed}", CELL_WORKER, due)
+
+    @abstractmethod
+    def plan_cells(self, seed: int) -> None:
+        """Note the tasks of the seed's cells, once all that they read is made."""
+
+    def trace_references(self, scene: Scene, settings: Settings) -> None:
+        """Path-trace the scene's test views and note what decides them."""
+        self.references[scene.name] = sorted(trace_references(scene, settings).values())
+
+    # -- tasks -----------------------------------------------------------------------------------------
+
+    def step1_task(
+        self, scene: Scene, settings: Settings, policy: str, seed: int, seconds: float | None = None
+    ) -> Step1Task:
+        """Step 1: a trained policy's selection, or a coarse model that cells share. seconds: of training at most."""
+        model, step1, budget = settings.model.coarse(), settings.select.step1, settings.select.budget
+        decisive = [scene.inputs, model.model_dump(), step1.model_dump(), policy, budget, seed, seconds]
+        return Step1Task(
+            **files_of(
+                self.request.out / "step1" / scene.name,
+                digest([CELL_VERSION, __version__, *decisive, *self.environment]),
+            ),
+            workspace=scene.workspace.root,
+            settings=settings,
+            policy=policy,
+            seed=seed,
+            seconds=seconds,
+            pace=self._pace_file(scene, "step1", model, step1, policy, budget),
+            label=f"{scene.name} step 1",
+        )
+
+    def cell_task(
+        self,
+        scene: Scene,
+        settings: Settings,
+        seed: int,
+        traced: Mapping[str, str],
+        coarse: Step1Task | None,
+        bases: Mapping[str, str],
+        *,
+        label: str,
+        network: bool = True,
+        full_step1: bool = False,
+        spp: int | None = None,
+        picture: bool = False,
+    ) -> CellTask:
+        """Train on the views and measure.
+
+        Args:
+            scene, settings, seed: of the cell.
+            traced: fingerprints of the training views' pictures.
+            coarse: the model that step 2 starts from.
+            bases: fingerprints of base images by split and view; {} where none are read.
+            label: in messages, after the scene.
+            network, full_step1: of `CellTask`.
+            spp: of the training views' pictures, None: the settings'.
+            picture: whether a test view is kept.
+        """
+        views, seconds = (list(traced), self.request.seconds) if network else ([], None)
+        model, step2 = settings.model.model_dump(mode="json"), settings.finetune.step2.model_dump(mode="json")
+        used = [*(f"train/{name}" for name in views), *(f"test/{name}" for name in scene.test)]
+        decisive = [scene.inputs, self.references[scene.name], model, [bases[name] for name in used] if bases else None]
+        if network:
+            time = [seconds, full_step1] if seconds else None
+            train = [seed, list(traced.values()), step2, coarse and coarse.fingerprint, time]
+            decisive += [train, *self.environment]
+        fingerprint = digest([CELL_VERSION, __version__, *decisive, self.perceptual])
+        folder = self.request.out / "cells" / scene.name
+        return CellTask(
+            **files_of(folder, fingerprint),
+            scene=scene.name,
+            seed=seed,
+            workspace=scene.workspace.root,
+            settings=settings,
+            network=network,
+            views=views,
+            targets=traced_split(self.request.base, spp),
+            coarse=coarse and coarse.folder,
+            coarse_cost=coarse and coarse.result(),
+            seconds=seconds,
+            full_step1=full_step1,
+            pace=self._pace_file(scene, "step2", settings.model, settings.finetune.step2, str(len(traced))),
+            picture=folder / f"{fingerprint}.png" if picture else None,
+            code=code_state(),
+            label=f"{scene.name} {label}",
+        )
+
+    def _pace_file(self, scene: Scene, step: str, model: ModelSettings, schedule: Strict, *more: str | int) -> Path:
+        """Where the seconds of an epoch are kept; whatever makes epochs longer or shorter is in the name."""
+        parts = [CELL_VERSION, scene.inputs, step, model.model_dump(), schedule.model_dump(mode="json"), *more]
+        return self.request.out / "pace" / scene.name / f"{digest([*parts, *self.environment])}.json"
+
+    # -- results ---------------------------------------------------------------------------------------
+
+    def write(self) -> dict[str, Any]:
+        """Write the results of the cells that are there -> the results; without any cell nothing is written."""
+        request, base = self.request, self.request.base
+        results = {
+            "schema": self.SCHEMA,
+            **made_by(),
+            "preset": base.preset,
+            "resolution": f"{base.cameras.width}x{base.cameras.height}",
+            "seconds": request.seconds,
+            "seeds": request.seeds,
+            "scenes": [path.stem for path in request.scenes],
+            "spp": {"training": base.raytrace.spp, "test": base.raytrace.evaluation_spp},
+            **self.compared(),
+            "cells": [self.line(place, task) for place, task in self.cells.items() if task.output.exists()],
+        }
+        if results["cells"]:
+            write_json(request.out / "results.json", results)
+            self.show(results)
+        return results
+
+    @abstractmethod
+    def compared(self) -> dict[str, Any]:
+        """What results say of what the study compares."""
+
+    @abstractmethod
+    def line(self, place: Place, task: CellTask) -> dict[str, Any]:
+        """A cell as results hold it: all that tables and plots need."""
+
+    @abstractmethod
+    def show(self, results: dict[str, Any]) -> None:
+        """Write tables and pictures of the results."""
