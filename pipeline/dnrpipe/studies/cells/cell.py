@@ -11,9 +11,10 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from filelock import FileLock
+from pydantic import Field, TypeAdapter
 
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import ContractError
@@ -47,7 +48,7 @@ KEPT_SETS = 8
 
 
 class Worker(FileWorker):
-    """Answers a `Step1Task` or a `CellTask`."""
+    TASK = TypeAdapter(Annotated[Step1Task | CellTask, Field(discriminator="kind")])
 
     def __init__(self, common: dict[str, Any]) -> None:
         super().__init__(common)
@@ -55,12 +56,8 @@ class Worker(FileWorker):
         self.views = functools.lru_cache(maxsize=KEPT_SETS)(load_cell_views)
         self.weights = weights_or_none()  # fingerprints of cells hold whether there are any
 
-    def answer(self, task: dict[str, Any]) -> Step1Result | CellResult:
-        if task["kind"] == "step1":
-            return self._step1(Step1Task.model_validate(task))
-        return self._cell(CellTask.model_validate(task))
-
-    # -- the two kinds of tasks ------------------------------------------------------------------------
+    def answer(self, task: Step1Task | CellTask) -> Step1Result | CellResult:
+        return self._step1(task) if isinstance(task, Step1Task) else self._cell(task)
 
     def _step1(self, task: Step1Task) -> Step1Result:
         """The coarse model on rasterised candidates, and the views its policy chooses."""

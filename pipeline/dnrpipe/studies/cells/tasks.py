@@ -6,11 +6,12 @@ Seconds are wall seconds of training; ``cpu_seconds`` are the processor's.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, TypeAdapter
 
 from dnrtrain.atomic import write_json
 
@@ -33,8 +34,11 @@ class StudyTask(PoolTask):
     workspace: Path
 
 
-class FileWorker:
+class FileWorker(ABC):
     """A worker that writes each answer to its task's ``output``. common["threads"]: of torch, 0 = its own choice."""
+
+    TASK: ClassVar[TypeAdapter[Any]]
+    """What it is asked."""
 
     def __init__(self, common: dict[str, Any]) -> None:
         import torch
@@ -44,13 +48,13 @@ class FileWorker:
         self.threads = torch.get_num_threads()
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
-        made = self.answer(task).model_dump(mode="json", by_alias=True, exclude_unset=True)
+        made = self.answer(self.TASK.validate_python(task)).model_dump(mode="json", by_alias=True, exclude_unset=True)
         write_json(Path(task["output"]), made)
         return made
 
-    def answer(self, task: dict[str, Any]) -> BaseModel:
+    @abstractmethod
+    def answer(self, task: Any) -> BaseModel:
         """What the file will hold; fields that were not given are left out."""
-        raise NotImplementedError
 
 
 def weights_or_none() -> Any:

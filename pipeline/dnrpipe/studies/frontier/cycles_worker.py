@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from dnrtrain.display import DisplayTransform
 
@@ -24,12 +25,11 @@ REFERENCE = "reference"
 
 
 class Worker(FileWorker):
-    """Answers a `CyclesMeasureTask`; names begin with ``Cycles``."""
+    """Names begin with ``Cycles``."""
 
-    def answer(self, task: dict[str, Any]) -> BaselineFile:
-        return self._measure(CyclesMeasureTask.model_validate(task))
+    TASK = TypeAdapter(CyclesMeasureTask)
 
-    def _measure(self, task: CyclesMeasureTask) -> BaselineFile:
+    def answer(self, task: CyclesMeasureTask) -> BaselineFile:
         workspace = Workspace.open(task.workspace)
         frames = read_record(task.frames, CyclesAnswer)
         display = DisplayTransform(read_frame(workspace), workspace.scene)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from dnrtrain.exr import read_exr
 
@@ -23,12 +24,11 @@ WARM = 2
 
 
 class Worker(FileWorker):
-    """Answers a `PathTracingTask`; milliseconds are medians of processor time over the threads."""
+    """Milliseconds are medians of processor time over the threads."""
 
-    def answer(self, task: dict[str, Any]) -> BaselineFile:
-        return self._measure(PathTracingTask.model_validate(task))
+    TASK = TypeAdapter(PathTracingTask)
 
-    def _measure(self, task: PathTracingTask) -> BaselineFile:
+    def answer(self, task: PathTracingTask) -> BaselineFile:
         from ...core.scene_files import split_views
         from ..frames.baselines import METHODS as ALL
         from ..frames.baselines import make_baselines, render_baselines

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import shutil
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from dnrtrain.checkpoint import load_model
 from dnrtrain.dataset import ViewSet
@@ -26,7 +28,7 @@ CLOCKS = ("seconds", "cpu_seconds")
 
 
 class Worker(FileWorker):
-    """Answers an `ActiveTask`."""
+    TASK = TypeAdapter(ActiveTask)
 
     def __init__(self, common: dict[str, Any]) -> None:
         super().__init__(common)
@@ -37,10 +39,7 @@ class Worker(FileWorker):
         shutil.rmtree(Path(task["folder"]), ignore_errors=True)
         return made
 
-    def answer(self, task: dict[str, Any]) -> SelectionResult:
-        return self._choose(ActiveTask.model_validate(task))
-
-    def _choose(self, task: ActiveTask) -> SelectionResult:
+    def answer(self, task: ActiveTask) -> SelectionResult:
         settings = task.settings
         views = load_cell_views(task.workspace, "train", raytraced=False, base="none")
         members = Members(
@@ -58,6 +57,7 @@ class Worker(FileWorker):
         )
 
 
+@dataclass
 class Members:
     """Coarse renderers that a policy trains for itself: runs of step 1 without an agent, each in a folder of its own.
 
@@ -72,20 +72,18 @@ class Members:
         fingerprint: of the caller's inputs.
     """
 
-    def __init__(
-        self,
-        views: ViewSet,
-        model: ModelSettings,
-        step1: Step1Settings,
-        settings: ActiveSettings,
-        seed: int,
-        device: str,
-        folder: Path,
-        fingerprint: str,
-    ) -> None:
-        self.views, self.model, self.settings, self.seed = views.to(device), model, settings, seed
-        self.device, self.folder, self.fingerprint = device, folder, fingerprint
-        self.step1 = step1.model_copy(update={"epochs": settings.epochs, "validation_views": 0})
+    views: ViewSet
+    model: ModelSettings
+    step1: Step1Settings
+    settings: ActiveSettings
+    seed: int
+    device: str
+    folder: Path
+    fingerprint: str
+
+    def __post_init__(self) -> None:
+        self.views = self.views.to(self.device)
+        self.step1 = self.step1.model_copy(update={"epochs": self.settings.epochs, "validation_views": 0})
         self.folders: list[Path] = []
         self.trained = dict.fromkeys(CLOCKS, 0.0)
         """What the epochs of this process took."""
