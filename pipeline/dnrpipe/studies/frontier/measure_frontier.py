@@ -14,12 +14,13 @@ from dnrtrain.atomic import atomic_path, write_json, write_text
 
 from ...core.errors import UserError
 from ...core.scene_files import scene_fingerprint, split_views
-from ...core.settings import Settings
 from ...core.workspace import digest
 from ...stages.stage import Run
 from ...workers.view_tasks import worker_count
 from ..ablation.ablate import Request
 from ..cells.provenance import made_by
+from ..cells.scenes import without_left_out
+from ..cells.worker_pool import WorkerPool
 from .frontier_plots import plot
 from .frontier_report import markdown
 from .point_costs import break_evens, pareto, point_of, settle_frames
@@ -35,6 +36,7 @@ from .records import (
 from .sweep import OTHERS, Frontier, Sweep
 
 BASELINE_VERSION, CYCLES_VERSION = 1, 1
+BASELINE_WORKER = "dnrpipe.studies.frontier.baseline_worker"
 CYCLES = "cycles"
 SAMPLE_COUNTS = (1, 2, 4, 8, 16, 64)
 COLUMNS: tuple[str, ...] = (
@@ -74,13 +76,11 @@ def run_frontier(
     """Measure what is due and write it -> the results.
 
     Args:
-        run: workspace, settings and console.
         budgets, spp, iterations: views, samples and optimiser steps of our points, as the options have them.
         frames: numbers of frames to compare for.
         also: names of other ways to train, and Cycles.
         ladder: samples of the baselines.
-        seeds: trainings of every point.
-        jobs: cells side by side; 0: one per core.
+        seeds, jobs: of `StudyRequest`.
 
     Raises:
         UserError: unknown names, numbers that do not fit. TasksFailed: some cells failed; the others are written.
@@ -88,7 +88,9 @@ def run_frontier(
     workspace, settings = run.workspace, run.settings
     candidates = len(split_views(workspace)["train"])
     counts = numbers(frames, "--frames", (200, 2000))
-    others = _others(also)
+    others = () if also.strip() == "none" else tuple(filter(None, (part.strip() for part in also.split(","))))
+    if unknown := set(others) - {*OTHERS, CYCLES}:
+        raise UserError(f"--also {', '.join(sorted(unknown))}: choose of {', '.join((*OTHERS, CYCLES))}, or none")
     sweep = Sweep(
         budgets=numbers(budgets, "--budgets", (6, 12, settings.select.budget), candidates),
         samples=numbers(spp, "--spp", (16, settings.raytrace.spp)),
@@ -113,10 +115,11 @@ def run_frontier(
     swept = Frontier(request, run.console, workspace=workspace)
     swept.run()
     cores = worker_count(0)
-    traced = _trace_baselines(swept, settings, samples, cores)
+    worker_pool = replace(swept.worker_pool, threads=cores, workers=1)
+    traced = _trace_baselines(swept, samples, worker_pool)
     baselines = traced.baselines
     if CYCLES in others:
-        baselines = [*baselines, *_cycles_baselines(swept, settings, samples, cores)]
+        baselines = [*baselines, *_cycles_baselines(swept, samples, worker_pool)]
     points = [
         point
         for seed in range(seeds)
@@ -150,50 +153,32 @@ def run_frontier(
     return results
 
 
-def _others(text: str) -> tuple[str, ...]:
-    """Names of other ways to train, and Cycles."""
-    if text.strip() == "none":
-        return ()
-    names = tuple(filter(None, (part.strip() for part in text.split(","))))
-    if unknown := set(names) - {*OTHERS, CYCLES}:
-        raise UserError(f"--also {', '.join(sorted(unknown))}: choose of {', '.join((*OTHERS, CYCLES))}, or none")
-    return names
-
-
-def _trace_baselines(swept: Frontier, settings: Settings, samples: tuple[int, ...], cores: int) -> BaselineFile:
+def _trace_baselines(swept: Frontier, samples: tuple[int, ...], worker_pool: WorkerPool) -> BaselineFile:
     """Path tracing of the test views, rendered where it is not on disk."""
-    references = swept.references[swept.scene.name]
-    model = swept.settings_of(swept.request.rows[0], swept.scene).model
-    base = settings.base.model_dump()
-    fingerprint = digest([BASELINE_VERSION, references, samples, model.base, base, cores, swept.perceptual])
+    settings = without_left_out(swept.scene.workspace, swept.request.base)
+    facts = [swept.references[swept.scene.name], samples, settings.model.base, settings.base.model_dump()]
+    fingerprint = digest([BASELINE_VERSION, *facts, worker_pool.threads, swept.perceptual])
     task = PathTracingTask(
         fingerprint=fingerprint,
         workspace=swept.scene.workspace.root,
-        settings=settings.model_copy(update={"model": model}),
+        settings=settings,
         samples=list(samples),
         output=swept.request.out / "rivals" / f"{fingerprint}.json",
         label="path tracing",
     )
-    worker_pool = replace(swept.worker_pool, threads=cores, workers=1)
-    worker_pool.work("path tracing of the test views", "dnrpipe.studies.frontier.path_tracing_worker", [task])
+    worker_pool.work("path tracing of the test views", BASELINE_WORKER, [task])
     found = BaselineFile.model_validate_json(task.output.read_bytes())
     if lost := sum(one.masked for one in found.baselines if not one.denoised):
         worker_pool.console.warn(f"repaired: {lost} pixels of the path-traced test views were not finite and are black")
     return found
 
 
-def _cycles_baselines(
-    swept: Frontier,
-    settings: Settings,
-    samples: tuple[int, ...],
-    cores: int,
-) -> list[BaselinePoint]:
+def _cycles_baselines(swept: Frontier, samples: tuple[int, ...], worker_pool: WorkerPool) -> list[BaselinePoint]:
     """Cycles on the test views, rendered and measured where that is not on disk."""
-    workspace, views = swept.scene.workspace, split_views(swept.scene.workspace)["test"]
-    reference_spp, folder = settings.raytrace.evaluation_spp, swept.request.out / "rivals"
-    fingerprint = digest(
-        [CYCLES_VERSION, scene_fingerprint(workspace), [v.model_dump() for v in views], samples, reference_spp, cores]
-    )
+    workspace, views = swept.scene.workspace, list(swept.scene.test.values())
+    reference_spp, folder = swept.request.base.raytrace.evaluation_spp, swept.request.out / "rivals"
+    facts = [scene_fingerprint(workspace), [v.model_dump() for v in views], samples, reference_spp]
+    fingerprint = digest([CYCLES_VERSION, *facts, worker_pool.threads])
     pictures = folder / f"cycles-{fingerprint}"
     render = CyclesFramesTask(
         scene_dir=workspace.scene,
@@ -204,7 +189,6 @@ def _cycles_baselines(
         output=pictures / "frames.json",
         label="Cycles",
     )
-    worker_pool = replace(swept.worker_pool, threads=cores, workers=1)
     worker_pool.work("Cycles on the test views", "dnrpipe.blender.passes.cycles_frames", [render])
     measure = CyclesMeasureTask(
         workspace=workspace.root,
@@ -214,7 +198,7 @@ def _cycles_baselines(
         output=folder / f"{digest([fingerprint, swept.perceptual])}.json",
         label="Cycles",
     )
-    worker_pool.work("measuring Cycles", "dnrpipe.studies.frontier.cycles_worker", [measure])
+    worker_pool.work("measuring Cycles", BASELINE_WORKER, [measure])
     return BaselineFile.model_validate_json(measure.output.read_bytes()).baselines
 
 
