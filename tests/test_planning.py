@@ -348,8 +348,7 @@ def test_a_scene_is_planned_and_the_plan_carried_out(
     tmp_path: Path, demo_blend: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from dnrpipe.cli import _main
-    from dnrpipe.studies.planning import carry_out, choose
-    from dnrpipe.studies.planning import pilot_parts as pilot
+    from dnrpipe.studies.planning import carry_out, choose, pilot
 
     monkeypatch.chdir(tmp_path)
     for module, name, value in (

@@ -18,7 +18,7 @@ from .pilot import run_pilot
 from .quality import Gain, Prior, load_prior, measured_gains, scene_gain, views_error, with_noise
 from .records import Choice, Pilot, PilotFacts, Plan, Prediction, PriorFacts, Route, Wanted, read_plan, write_plan
 from .routes import as_reported, break_even, routes
-from .seconds import Costs, Work, noise_at
+from .seconds import Costs, Work, noise_at, trained_pixels
 
 BLIND_POLICY = "farthest"
 RULE_SECONDS = 2.0
@@ -68,11 +68,10 @@ def make_predictor(workspace: Workspace, settings: Settings, pilot: Pilot, prior
     light = renderer.light
     due = None if light is None or renderer.light_is_baked else (light["size"], light["spp"])
     width, height = settings.cameras.width, settings.cameras.height
-    patch = settings.finetune.step2.patch or max(width, height)
     frames, training = pilot.frames, pilot.training
     work = Work(
         pixels=width * height,
-        trained=min(patch, width) * min(patch, height),
+        trained=trained_pixels(settings, width, height),
         light=due,
         policy_seconds=_policy_seconds(workspace, settings, training.seconds),
         tests=len(split_views(workspace).get("test", [])),
