@@ -123,7 +123,7 @@ def _expected(predictor: Predictor, results: FrontierResults, wanted: float, fra
     width, height = predictor.pilot.size
     scale = predictor.wall.work.pixels / (width * height)
     assert predictor.pilot.frames is not None  # make_predictor asked for it
-    part = as_reported(predictor.pilot.frames, predictor.reference)
+    part = as_reported(predictor.pilot.frames, predictor.quality.reference)
     return routes(part, neural, light, scale, wanted, frames)
 
 

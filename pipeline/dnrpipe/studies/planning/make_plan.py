@@ -15,7 +15,7 @@ from ...stages.base_images import base_renderer
 from ...stages.stage import Run
 from .choose import Predictor, best_within, budgets, cheapest_reaching
 from .pilot import run_pilot
-from .quality import Gain, Prior, load_prior, measured_gains, scene_gain, views_error, with_noise
+from .quality import Gain, Prior, Quality, load_prior, measured_gains, scene_gain, views_error, with_noise
 from .records import Choice, Pilot, PilotFacts, Plan, Prediction, PriorFacts, Route, Wanted, read_plan, write_plan
 from .routes import as_reported, break_even, routes
 from .seconds import Costs, Work, noise_at, trained_pixels
@@ -42,8 +42,8 @@ def make_plan(run: Run, wanted: Wanted, prior: Prior | None = None) -> Plan:
         wanted=wanted,
         pilot=PilotFacts(fingerprint=pilot.fingerprint, seconds=pilot.seconds, load=pilot.load),
         policy=policy_of(workspace, settings),
-        base_psnr=with_noise(predictor.base, predictor.reference),
-        gain=predictor.gain.most,
+        base_psnr=with_noise(predictor.quality.base, predictor.quality.reference),
+        gain=predictor.quality.gain.most,
         chosen=chosen,
         table=budgets(grid),
         prior=PriorFacts(source=prior.source, scenes=prior.scenes, sd=prior.sd),
@@ -81,11 +81,13 @@ def make_predictor(workspace: Workspace, settings: Settings, pilot: Pilot, prior
         pilot=pilot,
         wall=Costs(pilot, work, "seconds"),
         processor=Costs(pilot, work, "cpu_seconds"),
-        prior=prior,
-        base=frames.base.psnr,
-        gain=_gain(pilot, prior),
-        judged=views_error(frames.deviation, frames.views, work.tests),
-        reference=_reference_noise(settings, pilot),
+        quality=Quality(
+            prior=prior,
+            base=frames.base.psnr,
+            gain=_gain(pilot, prior),
+            judged=views_error(frames.deviation, frames.views, work.tests),
+            reference=_reference_noise(settings, pilot),
+        ),
         batch=settings.finetune.step2.batch,
     )
 
@@ -124,7 +126,7 @@ def whether_to_train(
     neural = cheapest_reaching(grid, at)
     width, height = predictor.pilot.size
     scale = predictor.wall.work.pixels / (width * height)
-    part = as_reported(predictor.pilot.frames, predictor.reference)
+    part = as_reported(predictor.pilot.frames, predictor.quality.reference)
     found = routes(part, neural, predictor.wall.light(), scale, at, wanted.frames)
     return found, at
 
