@@ -21,9 +21,9 @@ from dnrpipe.studies.planning.choose import NEAR, Predictor, best_within, budget
 from dnrpipe.studies.planning.pilot import pilot_path, read_pilot
 from dnrpipe.studies.planning.pilot_worker import without_reference
 from dnrpipe.studies.planning.quality import (
-    Quality,
     Gain,
     Measured,
+    Quality,
     load_prior,
     scene_gain,
     share,
