@@ -24,7 +24,7 @@ from ...core.scene_files import read_frame, split_views
 from ...core.settings import Settings
 from ...core.workspace import Workspace
 from .measure import base_pictures, measure, network_pictures, rendered_ms
-from .scenes import base_file, raster_file
+from .scenes import base_files, raster_file
 from .tasks import (
     CellResult,
     CellTask,
@@ -37,7 +37,7 @@ from .tasks import (
 )
 
 if TYPE_CHECKING:
-    from dnrtrain.dataset import ViewSet
+    from dnrtrain.dataset import Base, ViewSet
     from dnrtrain.records import Epoch, ModelRecord
 
 CELL_VERSION = 2  # raise when training or measuring changes what a cell holds, or what fingerprints hash
@@ -103,9 +103,6 @@ class Worker(FileWorker):
             shutil.rmtree(task.folder)
         else:
             pictures, frame_ms = base_pictures(test), None
-        base_ms = None
-        if base not in ("none", "raster"):
-            base_ms = rendered_ms([base_file(workspace, base, "test", name) for name in test.names])
         return CellResult(
             key=task.fingerprint,
             scene=task.scene,
@@ -117,7 +114,7 @@ class Worker(FileWorker):
             views=task.views,
             training=training,
             frame_ms=frame_ms,
-            base_ms=base_ms,
+            base_ms=rendered_ms(base_files(workspace, base, "test", test.names)),
             threads=self.threads,
             device=self.device,
             tests=measure(pictures, test, workspace, self.weights, task.picture),
@@ -202,7 +199,7 @@ def load_cell_views(
     names: tuple[str, ...] | None = None,
     *,
     raytraced: bool,
-    base: str,
+    base: Base,
     targets: str | None = None,
 ) -> ViewSet:
     """Views with ray-traced or rasterised targets and their base images.
@@ -221,16 +218,17 @@ def load_cell_views(
     views = {view.name: view for view in split_views(workspace)[split]}
     chosen = [views[name] for name in names or views]
     passes = [workspace.passes(split, view.name) for view in chosen]
-    extra: dict[str, Any] = {}
-    if base == "raster":
-        extra = {"base": base}
-        if split == "test":
-            passes = [raster_file(workspace, view.name) for view in chosen]
-    elif base != "none":
-        extra = {"base": base, "base_files": [base_file(workspace, base, split, view.name) for view in chosen]}
-    images = [workspace.raytraced(targets or split, view.name) for view in chosen] if raytraced else None
-    frame = read_frame(workspace)
-    return load_views(passes, images, frame, cameras=chosen, folder=workspace.scene, **extra)
+    if base == "raster" and split == "test":
+        passes = [raster_file(workspace, view.name) for view in chosen]
+    return load_views(
+        passes,
+        [workspace.raytraced(targets or split, view.name) for view in chosen] if raytraced else None,
+        read_frame(workspace),
+        cameras=chosen,
+        folder=workspace.scene,
+        base=base,
+        base_files=base_files(workspace, base, split, [view.name for view in chosen]) or None,
+    )
 
 
 def _with_epochs(settings: Settings, step1: int | None = None, step2: int | None = None) -> Settings:

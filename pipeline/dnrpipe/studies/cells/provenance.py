@@ -9,12 +9,14 @@ import platform
 import shlex
 import subprocess
 import sys
+from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from ...core.errors import UserError
+from ...workers.view_tasks import worker_count
 
 PACKAGES = ("dnrpipe", "torch", "numpy", "mitsuba", "bpy", "flip-evaluator")
 SOURCE = Path(__file__).resolve().parents[4]
@@ -54,11 +56,10 @@ def code_state() -> dict[str, Any]:
 
 def machine() -> dict[str, Any]:
     """Processor, cores that this process may use, memory in GiB, operating system."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     return {
         "processor": _processor(),
-        "cores": cores,
+        "cores": worker_count(0),
         "memory_gib": round(memory / 2**30, 1),
         "system": f"{platform.system()} {platform.machine()}",
     }
@@ -66,12 +67,10 @@ def machine() -> dict[str, Any]:
 
 def versions() -> dict[str, str | None]:
     """Versions of Python and of what decides the figures; None where not installed."""
-    found: dict[str, str | None] = {"python": platform.python_version()}
+    found: dict[str, str | None] = {"python": platform.python_version(), **dict.fromkeys(PACKAGES)}
     for name in PACKAGES:
-        try:
+        with suppress(PackageNotFoundError):
             found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = None
     return found
 
 

@@ -16,6 +16,7 @@ from ...core.scene_files import read_raster_choice, split_views
 from ...core.settings import Settings
 from ...core.workspace import Source, Workspace, file_sha256
 from ...effects.store import plan_of
+from ...stages.base_images import RENDERED, base_path, base_views
 from ...stages.pipeline import run_stage
 from ...stages.prepare import draw_passes
 from ...stages.raytrace import trace_views
@@ -153,8 +154,6 @@ def make_bases(scene: Scene, settings: Settings, train: Sequence[str]) -> dict[s
     if settings.model.base == "raster":
         drawn = {f"train/{name}": scene.inputs for name in train}  # by `prepare`
         return drawn | {f"test/{name}": made for name, made in _raster_test_views(scene, settings).items()}
-    from ...stages.base_images import base_views
-
     chosen = {"train": [scene.train[name] for name in train], "test": list(scene.test.values())}
     made = {}
     for split, views in chosen.items():
@@ -162,17 +161,19 @@ def make_bases(scene: Scene, settings: Settings, train: Sequence[str]) -> dict[s
             scene.run(settings, "evaluate" if split == "test" else "finetune"),
             views,
             split,
-            paths=[base_file(workspace, settings.model.base, split, view.name) for view in views],
+            paths=base_files(workspace, settings.model.base, split, [view.name for view in views]),
         )
         made |= {f"{split}/{view.name}": task["fingerprint"] for view, task in zip(views, tasks, strict=True)}
     return made
 
 
-def base_file(workspace: Workspace, kind: str, split: str, view: str) -> Path:
-    """Where a view's base image lies: the workspace's own place for baked ones, beside it for the kinds it is not."""
-    from ...stages.base_images import base_path
+def base_files(workspace: Workspace, kind: str, split: str, views: Iterable[str]) -> list[Path]:
+    """Where the views' base images lie: the workspace's own place for baked ones, beside it for the kinds it is not.
 
-    return base_path(workspace, split, view) if kind == "baked" else base_path(workspace, f"{kind}-{split}", view)
+    Empty for kinds that are not rendered into files of their own.
+    """
+    folder = split if kind == "baked" else f"{kind}-{split}"
+    return [base_path(workspace, folder, view) for view in views] if kind in RENDERED else []
 
 
 def raster_file(workspace: Workspace, view: str) -> Path:

@@ -14,9 +14,10 @@ from collections.abc import Iterable, Sequence
 from typing import Literal
 
 from ...core.ledger import break_even_frames, total, upfront_work
+from ...stages.base_images import RENDERED
 from ..ablation.rows import Row
 from ..cells.measure import METRICS, mean_of, written_seconds
-from ..cells.scenes import base_file, traced_split
+from ..cells.scenes import base_files, traced_split
 from ..cells.tasks import read_cell
 from ..frames.pareto_front import Point as CostAndQuality
 from ..frames.pareto_front import crossover, frontier
@@ -40,7 +41,7 @@ def point_of(swept: Frontier, row: Row, seed: int, base_ms: float | None, cores:
         return None
     cell = read_cell(task.output)
     workspace, training = swept.scene.workspace, cell.training
-    based, work = cell.base not in ("none", "raster"), upfront_work(workspace.ledger.read())
+    work = upfront_work(workspace.ledger.read())
     split = traced_split(swept.request.base, row.spp)
     parts: dict[str, float] = {"passes": 0.0, "tracing": 0.0, "light": 0.0, "base images": 0.0, "training": 0.0}
     if training is not None:
@@ -48,9 +49,8 @@ def point_of(swept: Frontier, row: Row, seed: int, base_ms: float | None, cores:
         parts["passes"] = total(r for r in work["passes"] if r.name in candidates).cpu_seconds / cores
         parts["tracing"] = sum(written_seconds(workspace.raytraced(split, name)) for name in cell.views) / cores
         parts["training"] = training.cpu_seconds / cell.threads
-        if based:
-            files = [base_file(workspace, cell.base, "train", name) for name in cell.views]
-            parts["base images"] = sum(written_seconds(file) for file in files) / cores
+        files = base_files(workspace, cell.base, "train", cell.views)
+        parts["base images"] = sum(map(written_seconds, files)) / cores
     if cell.base == "baked":
         parts["light"] = total(work["light"]).cpu_seconds / cores
     return Point(
@@ -63,7 +63,7 @@ def point_of(swept: Frontier, row: Row, seed: int, base_ms: float | None, cores:
         parts={name: round(value, 3) for name, value in parts.items()},
         upfront=sum(parts.values()),
         network_ms=cell.frame_ms or 0.0,
-        base_ms=(base_ms or cell.base_ms or 0.0) if based else 0.0,
+        base_ms=(base_ms or cell.base_ms or 0.0) if cell.base in RENDERED else 0.0,
         **{name: mean_of(cell.tests, name) for name in METRICS},  # type: ignore[arg-type]
     )
 

@@ -23,7 +23,7 @@ from ...core.workspace import digest
 from ..cells.cell import CELL_VERSION
 from ..cells.measure import METRICS, mean_of, written_seconds
 from ..cells.request import StudyRequest
-from ..cells.scenes import base_file, make_bases, trace_train, without_left_out
+from ..cells.scenes import base_files, make_bases, trace_train, without_left_out
 from ..cells.study import CELL_WORKER, Study
 from ..cells.tasks import CellTask, ChoiceFile, Step1Task, StudyTask, files_of, once, read_cell
 from .active.settings import ActiveSettings, ActiveTask
@@ -196,8 +196,7 @@ class Bench(Study[Request, Place]):
         train = getattr(training.step2, clock) + (getattr(step1, clock) if step1 and not chooses else 0.0)
         workspace = self.pools[place.scene, place.pool].data.workspace
         files = [workspace.raytraced("train", name) for name in cell.views]
-        if cell.base not in ("none", "raster"):
-            files += [base_file(workspace, cell.base, "train", name) for name in cell.views]
+        files += base_files(workspace, cell.base, "train", cell.views)
         seconds = {
             "select_seconds": getattr(choice, clock),
             "view_seconds": sum(self.written_seconds(file, clock) for file in files),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import resource
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +11,7 @@ from pydantic import TypeAdapter
 
 from ...core.scene_files import split_views
 from ...core.workspace import Workspace
+from ...raytrace.tasks import costs_since
 from ..cells.tasks import FileWorker, SelectionResult, StudyTask
 
 if TYPE_CHECKING:
@@ -39,9 +39,9 @@ class Worker(FileWorker):
         views = split_views(Workspace.open(task.workspace))["train"]
         policy = untrained(task.policy)
         assert policy is not None  # a trained one is chosen by step 1
-        visibility, *spent = _look(task.workspace) if policy.needs_visibility else (None, 0.0, 0.0)
+        visibility, wall, cpu = _look(task.workspace) if policy.needs_visibility else (None, 0.0, 0.0)
         candidates = Candidates.of_views(views, visibility)
-        wall, cpu = time.perf_counter(), time.process_time()
+        started = time.monotonic() - wall, time.process_time() - cpu
         choice = policy.choose(candidates, task.budget, task.seed)
         return SelectionResult(
             key=task.fingerprint,
@@ -49,9 +49,7 @@ class Worker(FileWorker):
             gains=choice.gains,
             why=choice.why,
             details=choice.details,
-            seconds=time.perf_counter() - wall + spent[0],
-            cpu_seconds=time.process_time() - cpu + spent[1],
-            peak_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            **costs_since(*started),
         )
 
 
