@@ -29,10 +29,7 @@ def apply(session: Session, plan: Plan, prior: Prior | None = None) -> Plan:
 
     ``carried_out`` is the choice once its steps fit the time left; ``actual`` is what it took and gave.
 
-    Args:
-        session: of the workspace; it adopts the plan's settings.
-        plan: with a choice.
-        prior: by default the package's.
+    The session adopts the plan's settings. prior: by default the package's.
     """
     workspace = session.workspace
     before = len(workspace.ledger.read())
