@@ -33,7 +33,7 @@ from ..cells.scenes import (
     without_left_out,
 )
 from ..cells.study import CELL_WORKER, Study
-from ..cells.tasks import CellTask, Step1Task, once, read_cell
+from ..cells.tasks import CellTask, Step1Task, once
 from .ablation_plots import contact_sheet, plot
 from .ablation_tables import SCHEMA, markdown
 from .rows import Row, choose_rows, needs_base, needs_coarse, settings_of, step1_policy
@@ -179,7 +179,7 @@ class Ablation(Study[Request, tuple[str, str, int]]):
         }
 
     def line(self, place: tuple[str, str, int], task: CellTask) -> dict[str, Any]:
-        cell = read_cell(task.output)
+        cell = task.result()
         training = cell.training
         step1 = training and training.step1
         return {
@@ -202,11 +202,9 @@ class Ablation(Study[Request, tuple[str, str, int]]):
         write_text(out / "tables.md", markdown(results))
         plot(results, out / "plot.png")
         for scene in results["scenes"]:
-            folder = out / "cells" / scene
-            pictures = [("reference", folder / "truth.png")]
-            for cell in results["cells"]:
-                if cell["scene"] == scene and cell["seed"] == 0:
-                    psnr = pictured(read_cell(folder / f"{cell['key']}.json").tests)["psnr"]
-                    pictures.append((f"{cell['row']} {psnr:.1f} dB", folder / f"{cell['key']}.png"))
+            pictures = [("reference", out / "cells" / scene / "truth.png")]
+            for (name, row, _), task in self.cells.items():
+                if name == scene and task.picture is not None and task.output.exists():
+                    pictures.append((f"{row} {pictured(task.result().tests)['psnr']:.1f} dB", task.picture))
             if len(pictures) > 1 and all(path.exists() for _, path in pictures):
                 contact_sheet(pictures, out / "pictures" / f"{scene}.png")

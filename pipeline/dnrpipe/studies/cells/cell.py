@@ -23,18 +23,10 @@ from dnrtrain.events import Event, Selected
 from ...core.scene_files import read_frame, split_views
 from ...core.settings import Settings
 from ...core.workspace import Workspace
+from ...stages.trainer import perceptual_weights
 from .measure import base_pictures, measure, network_pictures, rendered_ms
 from .scenes import base_files, raster_file
-from .tasks import (
-    CellResult,
-    CellTask,
-    FileWorker,
-    Step1Result,
-    Step1Task,
-    Training,
-    TrainingCost,
-    weights_or_none,
-)
+from .tasks import CellResult, CellTask, FileWorker, Step1Result, Step1Task, Training, TrainingCost
 
 if TYPE_CHECKING:
     from dnrtrain.dataset import Base, ViewSet
@@ -54,7 +46,7 @@ class Worker(FileWorker):
         super().__init__(common)
         self.device = common["device"]
         self.views = functools.lru_cache(maxsize=KEPT_SETS)(load_cell_views)
-        self.weights = weights_or_none()  # fingerprints of cells hold whether there are any
+        self.weights = perceptual_weights(None)  # the parent has told; fingerprints of cells hold whether there are any
 
     def answer(self, task: Step1Task | CellTask) -> Step1Result | CellResult:
         return self._step1(task) if isinstance(task, Step1Task) else self._cell(task)
@@ -202,15 +194,9 @@ def load_cell_views(
     base: Base,
     targets: str | None = None,
 ) -> ViewSet:
-    """Views with ray-traced or rasterised targets and their base images.
+    """Views of a workspace with ray-traced or rasterised targets and their base images.
 
-    Args:
-        root: of the workspace.
-        split: train or test.
-        names: of the views, None: all of the split.
-        raytraced: whether targets are ray-traced.
-        base: kind of the base images.
-        targets: folder of the ray-traced pictures, where it is not the split's.
+    names: None for all of the split. targets: folder of the ray-traced pictures, where it is not the split's.
     """
     from dnrtrain.dataset import load_views
 

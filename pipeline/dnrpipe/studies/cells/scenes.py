@@ -34,13 +34,8 @@ HARD_LIGHT = ("interior", "jewels")
 class Scene:
     """One prepared scene of a study.
 
-    Args:
-        name: results are filed by it.
-        workspace: of the scene.
-        console: of the study.
-        train, test: views by name.
-        inputs: hash of passes and cameras.
-        run_id: of the study in the ledger.
+    name: results are filed by it. train, test: views by name. inputs: hash of passes and cameras. run_id: of the study
+    in the ledger.
     """
 
     name: str
@@ -97,12 +92,7 @@ def find_scenes(text: str | None) -> list[Path]:
 
 
 def prepared(name: str, run: Run, command: str) -> Scene:
-    """The workspace's passes, made where they are missing, without a word.
-
-    Args:
-        name: of the scene in results.
-        run: workspace, settings and the study's console.
-        command: names the study in the ledger.
+    """The workspace's passes, made where they are missing, without a word. command: names the study in the ledger.
 
     Raises UserError: no test views, too few candidates.
     """

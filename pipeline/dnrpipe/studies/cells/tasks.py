@@ -57,16 +57,6 @@ class FileWorker(ABC):
         """What the file will hold; fields that were not given are left out."""
 
 
-def weights_or_none() -> Any:
-    """Weights of the perceptual metrics, None where there are none, which the parent process has said."""
-    from dnrtrain.weights import WeightsMissing, load_weights
-
-    try:
-        return load_weights()
-    except WeightsMissing:
-        return None
-
-
 Fingerprinted = TypeVar("Fingerprinted", bound=StudyTask)
 
 
@@ -155,6 +145,10 @@ class CellTask(StudyTask):
     picture: Path | None
     code: dict[str, Any]
 
+    def result(self) -> CellResult:
+        """What it gave, once it is done."""
+        return CellResult.model_validate_json(self.output.read_bytes())
+
 
 class Training(BaseModel):
     """What a cell's training took. seconds_per_epoch: of step 2, where seconds limited it."""
@@ -195,13 +189,7 @@ class CellResult(BaseModel):
 
     @property
     def base(self) -> str:
-        """Kind of its base images."""
         return self.settings["model"]["base"]
-
-
-def read_cell(path: Path) -> CellResult:
-    """A cell's file."""
-    return CellResult.model_validate_json(path.read_bytes())
 
 
 class ChoiceFile(BaseModel):

@@ -65,8 +65,7 @@ def make_pool(settings: Settings, jobs: int, log: Path, console: Console, *, sin
     Args:
         settings: name the device.
         jobs: workers; 0: one per core, one on a GPU.
-        log: what workers print.
-        console: shows progress and failures.
+        log, console: of `WorkerPool`.
         single: one thread a worker also where there are fewer workers than cores, so that ``jobs`` does not enter what
             comes out.
     """

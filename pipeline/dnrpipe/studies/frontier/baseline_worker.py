@@ -21,8 +21,9 @@ from dnrtrain.perceptual import build_lpips
 from ...blender.tasks import CyclesAnswer
 from ...core.scene_files import read_frame, read_record, split_views
 from ...core.workspace import Workspace
+from ...stages.trainer import perceptual_weights
 from ..cells.measure import view_metrics
-from ..cells.tasks import FileWorker, weights_or_none
+from ..cells.tasks import FileWorker
 from ..frames.baselines import METHODS as ALL
 from ..frames.baselines import make_baselines, render_baselines
 from ..frames.ours import BASE, Ours
@@ -99,7 +100,7 @@ class Judge:
     """Measures pictures of test views, display RGB, torch [1, 3, H, W] each. truth: likewise."""
 
     def __init__(self, workspace: Workspace, names: list[str], truth: list[Any]) -> None:
-        weights = weights_or_none()
+        weights = perceptual_weights(None)
         self.lpips = None if weights is None else build_lpips(weights)
         gbuffers = [read_exr(workspace.passes("test", name))[0] for name in names]
         masks = [torch.from_numpy(np.ascontiguousarray(g["mask"] > 0.5)).float()[None, None] for g in gbuffers]

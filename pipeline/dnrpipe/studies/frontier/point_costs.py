@@ -18,7 +18,6 @@ from ...stages.base_images import RENDERED
 from ..ablation.rows import Row
 from ..cells.measure import METRICS, mean_of, written_seconds
 from ..cells.scenes import base_files, traced_split
-from ..cells.tasks import read_cell
 from ..frames.pareto_front import Point as CostAndQuality
 from ..frames.pareto_front import crossover, frontier
 from .records import BaselinePoint, Metric, Point
@@ -30,16 +29,12 @@ HIGHER_IS_BETTER: dict[Metric, bool] = {"psnr": True, "ssim": True, "lpips_vgg":
 def point_of(swept: Frontier, row: Row, seed: int, base_ms: float | None, cores: int) -> Point | None:
     """A row's cell with its costs; None where the cell is not made yet.
 
-    Args:
-        swept: the sweep that made the cell.
-        row, seed: of the cell.
-        base_ms: of a base image by the baselines' clock; None: as the cell measured it.
-        cores: that ray tracing keeps busy.
+    base_ms: of a base image by the baselines' clock; None: as the cell measured it. cores: that ray tracing keeps busy.
     """
     task = swept.cells.get((swept.scene.name, row.name, seed))
     if task is None or not task.output.exists():
         return None
-    cell = read_cell(task.output)
+    cell = task.result()
     workspace, training = swept.scene.workspace, cell.training
     work = upfront_work(workspace.ledger.read())
     split = traced_split(swept.request.base, row.spp)

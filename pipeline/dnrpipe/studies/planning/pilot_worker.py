@@ -20,7 +20,7 @@ from dnrtrain.contract import View
 from ...core.scene_files import read_frame
 from ...core.settings import Settings
 from ...core.workspace import Workspace
-from ..cells.tasks import weights_or_none
+from ...stages.trainer import perceptual_weights, torch_device
 from .records import Record
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ class Worker:
         return self._frames(FramesTask.model_validate(task))
 
     def _train(self, task: TrainTask) -> dict[str, Any]:
-        weights = weights_or_none()  # training will do without, too
+        weights = perceptual_weights(None)  # training will do without, too
         found = [
             self._train_one(task, weights, folder, epochs)
             for folder, epochs in zip(task.folders, task.epochs, strict=True)
@@ -105,8 +105,6 @@ class Worker:
         from dnrtrain.dataset import load_views
         from dnrtrain.events import EpochEnd
         from dnrtrain.step2 import run_step2
-
-        from ...stages.trainer import torch_device
 
         started = time.monotonic()
         step2 = self.settings.finetune.step2.model_copy(

@@ -25,7 +25,7 @@ from ..cells.measure import METRICS, mean_of, written_seconds
 from ..cells.request import StudyRequest
 from ..cells.scenes import base_files, make_bases, trace_train, without_left_out
 from ..cells.study import CELL_WORKER, Study
-from ..cells.tasks import CellTask, ChoiceFile, Step1Task, StudyTask, files_of, once, read_cell
+from ..cells.tasks import CellTask, ChoiceFile, Step1Task, StudyTask, files_of, once
 from .active.settings import ActiveSettings, ActiveTask
 from .bench_plots import plot
 from .bench_tables import SCHEMA, markdown
@@ -187,7 +187,7 @@ class Bench(Study[Request, Place]):
         images; train_seconds: step 2, and step 1 where it only gives the start; total_seconds: all of them. On a CPU
         seconds are of the processor.
         """
-        cell, choice = read_cell(task.output), self._choice(place)
+        cell, choice = task.result(), self._choice(place)
         clock: Literal["seconds", "cpu_seconds"] = "cpu_seconds" if self.device == "cpu" else "seconds"
         training = cell.training
         assert training is not None  # every cell has a network
