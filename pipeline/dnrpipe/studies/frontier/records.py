@@ -78,7 +78,6 @@ class Point(Measured):
 
     @property
     def ms(self) -> float:
-        """Milliseconds of a frame."""
         return self.frame_ms
 
 
@@ -96,7 +95,6 @@ class BaselinePoint(Measured):
 
     @property
     def by_cycles(self) -> bool:
-        """Whether Cycles rendered it."""
         return self.name.startswith(CYCLES_PREFIX)
 
 

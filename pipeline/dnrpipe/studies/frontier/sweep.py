@@ -5,7 +5,7 @@ Views, references and base images are traced once, into the workspace itself.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ...core.errors import UserError
@@ -40,18 +40,15 @@ class Sweep:
         ]
         spp, epochs = settings.raytrace.spp, settings.finetune.step2.epochs
         if "random" in self.also:
-            found += [
-                self._row(f"{views} random views", views, spp, epochs, views_by="random") for views in self.budgets
-            ]
+            found += [self._row(f"{views} random views", views, spp, epochs, "random") for views in self.budgets]
         if "all" in self.also:
-            found.append(self._row("all candidates", None, spp, epochs, views_by="all"))
+            found.append(self._row("all candidates", None, spp, epochs, "all"))
         if "paper" in self.also:
             if settings.preset not in CLASSIC:
                 raise UserError(
                     f"the paper's row has sizes for the presets {', '.join(CLASSIC)}; leave it out of --also"
                 )
-            paper = ROWS["paper"]
-            found.append(Row("paper", paper.what, paper.family, paper.changes, paper.views, budget=max(self.budgets)))
+            found.append(replace(ROWS["paper"], budget=max(self.budgets)))
         if settings.model.base != "none":
             found.append(Row("base image alone", ROWS["base"].what, "dnr", network=False))
         return found
