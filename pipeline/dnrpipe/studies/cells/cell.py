@@ -11,7 +11,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from filelock import FileLock
 from pydantic import Field, TypeAdapter
@@ -31,6 +31,8 @@ from .tasks import CellResult, CellTask, FileWorker, Step1Result, Step1Task, Tra
 if TYPE_CHECKING:
     from dnrtrain.dataset import Base, ViewSet
     from dnrtrain.records import Epoch, ModelRecord
+
+Task = TypeVar("Task", Step1Task, CellTask)
 
 CELL_VERSION = 2  # raise when training or measuring changes what a cell holds, or what fingerprints hash
 STEP1_SHARE = 1 / 3
@@ -55,10 +57,8 @@ class Worker(FileWorker):
         """The coarse model on rasterised candidates, and the views its policy chooses."""
         settings = task.settings
         if task.seconds is not None:
-            short = _with_epochs(settings, step1=2)
-            pace = self._pace(task.pace, task.folder, lambda folder: self._train_step1(task, short, folder))
-            limit = max(1, int(task.seconds / pace))
-            settings = _with_epochs(settings, step1=min(limit, settings.select.step1.epochs))
+            limit = max(1, int(task.seconds / self._pace(task, self._train_step1)))
+            settings = _with_epochs(settings, min(limit, settings.select.step1.epochs))
         events = self._train_step1(task, settings, task.folder)
         selected = next(event for event in events if isinstance(event, Selected))
         return Step1Result(
@@ -121,8 +121,7 @@ class Worker(FileWorker):
         settings, coarse = task.settings, task.coarse_cost
         pace = None
         if task.seconds is not None:
-            short = _with_epochs(settings, step2=2)
-            pace = self._pace(task.pace, task.folder, lambda folder: self._train_step2(task, short, folder))
+            pace = self._pace(task, self._train_step2)
             spent = STEP1_SHARE * task.seconds if task.full_step1 else self._clock(coarse) if coarse else 0.0
             left = task.seconds - spent
             if left < pace:
@@ -130,7 +129,7 @@ class Worker(FileWorker):
                     f"--seconds {task.seconds:g}: step 1 leaves {max(left, 0.0):.1f} s, and an epoch of step 2"
                     f" takes {pace:.1f} s; give more"
                 )
-            settings = _with_epochs(settings, step2=int(left / pace))
+            settings = _with_epochs(settings, int(left / pace))
         for _ in self._train_step2(task, settings, task.folder):
             pass
         cost = training_cost(task.folder)
@@ -144,18 +143,18 @@ class Worker(FileWorker):
             perceptual=self.weights is not None,
         )
 
-    def _pace(self, file: Path, folder: Path, train: Callable[[Path], Iterator[Event]]) -> float:
-        """Seconds of one epoch: the second of two (the first warms up), kept in ``file`` for the row's other seeds."""
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(f"{file}.lock"):  # cells side by side train by one figure, not by one each
-            if not file.exists():
-                scratch = folder.with_name(f"{folder.name}.pace")
-                for _ in train(scratch):
+    def _pace(self, task: Task, train: Callable[[Task, Settings, Path], Iterator[Event]]) -> float:
+        """Seconds of one epoch: the second of two (the first warms up), kept for the row's other seeds."""
+        task.pace.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(f"{task.pace}.lock"):  # cells side by side train by one figure, not by one each
+            if not task.pace.exists():
+                scratch = task.folder.with_name(f"{task.folder.name}.pace")
+                for _ in train(task, _with_epochs(task.settings, 2), scratch):
                     pass
                 last = _record(scratch).history[-1]
                 shutil.rmtree(scratch)
-                write_json(file, self._clock(last))
-        return float(json.loads(file.read_text()))
+                write_json(task.pace, self._clock(last))
+        return float(json.loads(task.pace.read_text()))
 
     def _clock(self, cost: TrainingCost | Epoch) -> float:
         """Seconds of training; on a CPU by processor time, which other work on the machine does not stretch."""
@@ -217,10 +216,10 @@ def load_cell_views(
     )
 
 
-def _with_epochs(settings: Settings, step1: int | None = None, step2: int | None = None) -> Settings:
+def _with_epochs(settings: Settings, epochs: int) -> Settings:
+    """Of whichever step is trained by them."""
     changed = settings.model_copy(deep=True)
-    changed.select.step1.epochs = step1 or changed.select.step1.epochs
-    changed.finetune.step2.epochs = step2 or changed.finetune.step2.epochs
+    changed.select.step1.epochs = changed.finetune.step2.epochs = epochs
     return changed
 
 

@@ -1,5 +1,8 @@
 """`dnrpipe frontier` behind its options: the sweep, the baselines, and what it writes into ``frontier/``.
 
+Every point is a row of an ablation, so that it shares its workers, coarse models and resuming. Views, references and
+base images are traced once, into the workspace itself.
+
 results.json  results.csv  frontier-<N>.png (one per number of frames)  report.md
 """
 
@@ -7,19 +10,21 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from dnrtrain.atomic import atomic_path, write_json, write_text
 
 from ...core.errors import UserError
 from ...core.scene_files import scene_fingerprint, split_views
-from ...core.workspace import digest
+from ...core.settings import Settings
+from ...core.workspace import Workspace, digest
 from ...stages.stage import Run
 from ...workers.view_tasks import worker_count
-from ..ablation.ablate import Request
+from ..ablation.ablate import Ablation, Request
+from ..ablation.rows import CLASSIC, ROWS, Row, ViewChoice
 from ..cells.provenance import made_by
-from ..cells.scenes import without_left_out
+from ..cells.scenes import Scene, prepared, without_left_out
 from ..cells.worker_pool import WorkerPool
 from .frontier_plots import plot
 from .frontier_report import markdown
@@ -33,16 +38,66 @@ from .records import (
     FrontierResults,
     PathTracingTask,
 )
-from .sweep import OTHERS, Frontier, Sweep
 
 BASELINE_VERSION, CYCLES_VERSION = 1, 1
 BASELINE_WORKER = "dnrpipe.studies.frontier.baseline_worker"
 CYCLES = "cycles"
+OTHERS = ("random", "all", "paper")
+"""Other ways to train, compared at the settings' own samples and epochs."""
 SAMPLE_COUNTS = (1, 2, 4, 8, 16, 64)
 COLUMNS: tuple[str, ...] = (
     "name", "kind", "seed", "views", "spp", "steps", "upfront", "frame_ms", "psnr", "ssim", "lpips_vgg", "flip",
     "rival_ms", "break_even",
 )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """budgets (views), samples per pixel, optimiser steps: every combination is trained. also: of OTHERS."""
+
+    budgets: tuple[int, ...]
+    samples: tuple[int, ...]
+    steps: tuple[int, ...]
+    also: tuple[str, ...] = OTHERS
+
+    def rows(self, settings: Settings) -> list[Row]:
+        """All points as rows; the base image alone last. Raises UserError: no paper row at these sizes."""
+        batch = settings.finetune.step2.batch
+        found = [
+            self._row(f"{views} views, {spp} spp, {steps} steps", views, spp, max(1, round(steps * batch / views)))
+            for views in self.budgets
+            for spp in self.samples
+            for steps in self.steps
+        ]
+        spp, epochs = settings.raytrace.spp, settings.finetune.step2.epochs
+        if "random" in self.also:
+            found += [self._row(f"{views} random views", views, spp, epochs, "random") for views in self.budgets]
+        if "all" in self.also:
+            found.append(self._row("all candidates", None, spp, epochs, "all"))
+        if "paper" in self.also:
+            if settings.preset not in CLASSIC:
+                raise UserError(
+                    f"the paper's row has sizes for the presets {', '.join(CLASSIC)}; leave it out of --also"
+                )
+            found.append(replace(ROWS["paper"], budget=max(self.budgets)))
+        if settings.model.base != "none":
+            found.append(Row("base image alone", ROWS["base"].what, "dnr", network=False))
+        return found
+
+    @staticmethod
+    def _row(name: str, views: int | None, spp: int, epochs: int, views_by: ViewChoice = "farthest") -> Row:
+        changes = {"finetune": {"step2": {"epochs": epochs}}}
+        return Row(name, name, "dnr", changes, views_by, budget=views, spp=spp)
+
+
+@dataclass
+class Frontier(Ablation):
+    """An ablation of one scene: the workspace that is open."""
+
+    workspace: Workspace = field(kw_only=True)
+
+    def _open(self, source: Path) -> Scene:
+        return prepared(source.stem, Run(self.workspace, self.request.base, self.console), "frontier")
 
 
 def numbers(text: str | None, option: str, default: Sequence[int], most: int | None = None) -> tuple[int, ...]:
@@ -114,17 +169,18 @@ def run_frontier(
     )
     swept = Frontier(request, run.console, workspace=workspace)
     swept.run()
+    (scene,) = swept.scenes
     cores = worker_count(0)
     worker_pool = replace(swept.worker_pool, threads=cores, workers=1)
-    traced = _trace_baselines(swept, samples, worker_pool)
+    traced = _trace_baselines(swept, scene, samples, worker_pool)
     baselines = traced.baselines
     if CYCLES in others:
-        baselines = [*baselines, *_cycles_baselines(swept, samples, worker_pool)]
+        baselines = [*baselines, *_cycles_baselines(swept, scene, samples, worker_pool)]
     points = [
         point
         for seed in range(seeds)
         for row in rows
-        if (row.network or seed == 0) and (point := point_of(swept, row, seed, traced.base_ms, cores))
+        if (row.network or seed == 0) and (point := point_of(swept, scene, row, seed, traced.base_ms, cores))
     ]
     if seeds > 1:
         points = [
@@ -141,7 +197,7 @@ def run_frontier(
         sweep=asdict(sweep),
         frames=list(counts),
         cores=cores,
-        test_views=len(swept.scene.test),
+        test_views=len(scene.test),
         evaluation_spp=settings.raytrace.evaluation_spp,
         threads=swept.threads,
         baseline_threads=traced.threads,
@@ -153,14 +209,14 @@ def run_frontier(
     return results
 
 
-def _trace_baselines(swept: Frontier, samples: tuple[int, ...], worker_pool: WorkerPool) -> BaselineFile:
+def _trace_baselines(swept: Ablation, scene: Scene, samples: tuple[int, ...], worker_pool: WorkerPool) -> BaselineFile:
     """Path tracing of the test views, rendered where it is not on disk."""
-    settings = without_left_out(swept.scene.workspace, swept.request.base)
-    facts = [swept.references[swept.scene.name], samples, settings.model.base, settings.base.model_dump()]
+    settings = without_left_out(scene.workspace, swept.request.base)
+    facts = [swept.references[scene.name], samples, settings.model.base, settings.base.model_dump()]
     fingerprint = digest([BASELINE_VERSION, *facts, worker_pool.threads, swept.perceptual])
     task = PathTracingTask(
         fingerprint=fingerprint,
-        workspace=swept.scene.workspace.root,
+        workspace=scene.workspace.root,
         settings=settings,
         samples=list(samples),
         output=swept.request.out / "rivals" / f"{fingerprint}.json",
@@ -173,9 +229,11 @@ def _trace_baselines(swept: Frontier, samples: tuple[int, ...], worker_pool: Wor
     return found
 
 
-def _cycles_baselines(swept: Frontier, samples: tuple[int, ...], worker_pool: WorkerPool) -> list[BaselinePoint]:
+def _cycles_baselines(
+    swept: Ablation, scene: Scene, samples: tuple[int, ...], worker_pool: WorkerPool
+) -> list[BaselinePoint]:
     """Cycles on the test views, rendered and measured where that is not on disk."""
-    workspace, views = swept.scene.workspace, list(swept.scene.test.values())
+    workspace, views = scene.workspace, list(scene.test.values())
     reference_spp, folder = swept.request.base.raytrace.evaluation_spp, swept.request.out / "rivals"
     facts = [scene_fingerprint(workspace), [v.model_dump() for v in views], samples, reference_spp]
     fingerprint = digest([CYCLES_VERSION, *facts, worker_pool.threads])

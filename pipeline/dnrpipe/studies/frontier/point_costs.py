@@ -15,32 +15,32 @@ from typing import Literal
 
 from ...core.ledger import break_even_frames, total, upfront_work
 from ...stages.base_images import RENDERED
+from ..ablation.ablate import Ablation
 from ..ablation.rows import Row
 from ..cells.measure import METRICS, mean_of, written_seconds
-from ..cells.scenes import base_files, traced_split
+from ..cells.scenes import Scene, base_files, traced_split
 from ..frames.pareto_front import Point as CostAndQuality
 from ..frames.pareto_front import crossover, frontier
 from .records import BaselinePoint, Metric, Point
-from .sweep import Frontier
 
 HIGHER_IS_BETTER: dict[Metric, bool] = {"psnr": True, "ssim": True, "lpips_vgg": False, "flip": False}
 
 
-def point_of(swept: Frontier, row: Row, seed: int, base_ms: float | None, cores: int) -> Point | None:
+def point_of(swept: Ablation, scene: Scene, row: Row, seed: int, base_ms: float | None, cores: int) -> Point | None:
     """A row's cell with its costs; None where the cell is not made yet.
 
     base_ms: of a base image by the baselines' clock; None: as the cell measured it. cores: that ray tracing keeps busy.
     """
-    task = swept.cells.get((swept.scene.name, row.name, seed))
+    task = swept.cells.get((scene.name, row.name, seed))
     if task is None or not task.output.exists():
         return None
     cell = task.result()
-    workspace, training = swept.scene.workspace, cell.training
+    workspace, training = scene.workspace, cell.training
     work = upfront_work(workspace.ledger.read())
     split = traced_split(swept.request.base, row.spp)
     parts: dict[str, float] = {"passes": 0.0, "tracing": 0.0, "light": 0.0, "base images": 0.0, "training": 0.0}
     if training is not None:
-        candidates = {f"train/{name}" for name in swept.scene.train}
+        candidates = {f"train/{name}" for name in scene.train}
         parts["passes"] = total(r for r in work["passes"] if r.name in candidates).cpu_seconds / cores
         parts["tracing"] = sum(written_seconds(workspace.raytraced(split, name)) for name in cell.views) / cores
         parts["training"] = training.cpu_seconds / cell.threads

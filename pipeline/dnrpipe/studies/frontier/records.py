@@ -105,7 +105,7 @@ class FrontierResults(Record):
     """``frontier/results.json``. The first fields are of `provenance.made_by`.
 
     Args:
-        sweep: fields of `sweep.Sweep`.
+        sweep: fields of `measure_frontier.Sweep`.
         frames: numbers of frames that are compared for.
         threads, baseline_threads: of cells, and of path tracing.
         points, baselines: everything measured.

@@ -13,8 +13,7 @@ from typing import Any
 
 from ..cells.markdown import NONE, made_line, spread, table
 from ..cells.provenance import read_made
-from .figures import SPHERICAL, Figures
-from .intervals import LEVEL, Difference
+from .figures import LEVEL, SPHERICAL, Difference, Figures
 from .pools import POOLS
 
 SCHEMA = 1
