@@ -21,7 +21,7 @@ from ...core.settings import Settings, resolve
 from ...stages.stage import Run
 from ..cells.cell import STEP1_SHARE
 from ..cells.measure import METRICS, mean_of, pictured
-from ..cells.request import StudyRequest, merged
+from ..cells.request import merged
 from ..cells.scenes import (
     Scene,
     choose_by_pose,
@@ -29,6 +29,7 @@ from ..cells.scenes import (
     make_bases,
     prepared,
     scene_workspace,
+    trace_references,
     trace_train,
     without_left_out,
 )
@@ -48,14 +49,6 @@ SMOKE: dict[str, Any] = {
 SMOKE_SCENE, SMOKE_ROWS = "emissive_only", "vanilla,paper"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Request(StudyRequest):
-    """``base``: the preset's settings; ``overrides``: the user's, which hold for all rows."""
-
-    rows: list[Row]
-    overrides: dict[str, Any]
-
-
 def run_ablation(
     *,
     scenes: str | None,
@@ -67,7 +60,7 @@ def run_ablation(
     console: Console,
     **more: Any,
 ) -> dict[str, Any]:
-    """Run what is due and write it -> the results. more: fields of `StudyRequest`.
+    """Run what is due and write it -> the results. more: fields of `Study`.
 
     Settings come from the preset and these arguments alone, neither from the environment nor from
     dnrpipe.toml: the command that is kept in the results says all.
@@ -77,62 +70,63 @@ def run_ablation(
     """
     budgeted = {} if budget is None else {"select": {"budget": budget}}
     overrides = merged([SMOKE if smoke else {}, budgeted], assignments)
-    request = Request(
-        scenes=find_scenes(scenes or (SMOKE_SCENE if smoke else None)),
+    return Ablation(
+        sources=find_scenes(scenes or (SMOKE_SCENE if smoke else None)),
         rows=choose_rows(rows or (SMOKE_ROWS if smoke else "core")),
         base=resolve(preset, overrides, environment={}),
         overrides=overrides,
+        console=console,
         **more,
-    )
-    return Ablation(request, console).carry_out()
+    ).carry_out()
 
 
-@dataclass
-class Ablation(Study[Request, tuple[str, str, int]]):
-    """Cells by (scene, row, seed)."""
+@dataclass(kw_only=True)
+class Ablation(Study[tuple[str, str, int]]):
+    """Cells by (scene, row, seed). overrides: the user's settings, which hold for all rows; ``base`` has them, too."""
 
     COMMAND, SCHEMA = "ablate", SCHEMA
+    rows: list[Row]
+    overrides: dict[str, Any]
     scenes: list[Scene] = field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
-        """Refuse rows whose settings cannot be, before any work is done. Raises UserError."""
-        for row in self.request.rows:
-            self.settings_of(row)
         super().__post_init__()
+        for row in self.rows:  # a row whose settings cannot be is refused before any work is done
+            self.settings_of(row)
 
     def open_scenes(self) -> None:
-        with self.console.bar("scenes", len(self.request.scenes)) as bar:
-            for source in self.request.scenes:
+        with self.console.bar("scenes", len(self.sources)) as bar:
+            for source in self.sources:
                 scene = self._open(source)
-                self.trace_references(scene, self.request.base)
+                self.references[scene.name] = trace_references(scene, self.base)
                 self.scenes.append(scene)
                 bar.advance(note=scene.name)
 
     def _open(self, source: Path) -> Scene:
-        workspace = scene_workspace(source, self.request.out / "scenes" / f"{source.stem}.dnr")
-        return prepared(source.stem, Run(workspace, self.request.base, self.console), self.COMMAND)
+        workspace = scene_workspace(source, self.out / "scenes" / f"{source.stem}.dnr")
+        return prepared(source.stem, Run(workspace, self.base, self.console), self.COMMAND)
 
     def plan_cells(self, seed: int) -> None:
         step1: dict[tuple[str, str], Step1Task] = {}
         for scene in self.scenes:
-            for row in self.request.rows:
+            for row in self.rows:
                 settings = self.settings_of(row, scene)
                 if needs_coarse(row, settings):
-                    seconds = None if row.full_step1 or not self.request.seconds else STEP1_SHARE * self.request.seconds
+                    seconds = None if row.full_step1 or not self.seconds else STEP1_SHARE * self.seconds
                     step1[scene.name, row.name] = self.step1_task(scene, settings, step1_policy(row), seed, seconds)
         self.worker_pool.work(f"step 1, seed {seed}", CELL_WORKER, once(step1.values()))
         for scene in self.scenes:
             self._plan_scene(scene, seed, step1)
 
     def _plan_scene(self, scene: Scene, seed: int, step1: dict[tuple[str, str], Step1Task]) -> None:
-        chosen = {row.name: self._views(scene, row, seed, step1) for row in self.request.rows}
+        chosen = {row.name: self._views(scene, row, seed, step1) for row in self.rows}
         everything = sorted({name for names in chosen.values() for name in names})
         by_spp: dict[int | None, set[str]] = {}
-        for row in self.request.rows:
+        for row in self.rows:
             by_spp.setdefault(row.spp, set()).update(chosen[row.name])
-        traced = {spp: trace_train(scene, self.request.base, names, spp) for spp, names in by_spp.items()}
+        traced = {spp: trace_train(scene, self.base, names, spp) for spp, names in by_spp.items()}
         bases: dict[str, dict[str, str]] = {}
-        for row in self.request.rows:
+        for row in self.rows:
             settings = self.settings_of(row, scene)
             kind, based = settings.model.base, needs_base(row, settings)
             if based and kind not in bases:
@@ -156,14 +150,14 @@ class Ablation(Study[Request, tuple[str, str, int]]):
             return step1[scene.name, row.name].result().selected
         if row.views == "all":
             return list(scene.train)
-        names, budget = list(scene.train), row.budget or self.request.base.select.budget
+        names, budget = list(scene.train), row.budget or self.base.select.budget
         # Farthest points are the same views for every seed.
         chosen = choose_by_pose(list(scene.train.values()), row.views, budget, seed if row.views == "random" else 0)
         return [names[place] for place in chosen]
 
     def settings_of(self, row: Row, scene: Scene | None = None) -> Settings:
         """The row's settings; with a scene, without what its effect plan leaves off."""
-        settings = settings_of(row, self.request.base, self.request.overrides)
+        settings = settings_of(row, self.base, self.overrides)
         if not row.network and settings.model.base == "none":
             raise UserError(f"row {row.name}: preset '{settings.preset}' has no base image (model.base is none)")
         return settings if scene is None else without_left_out(scene.workspace, settings)
@@ -172,10 +166,10 @@ class Ablation(Study[Request, tuple[str, str, int]]):
 
     def compared(self) -> dict[str, Any]:
         return {
-            "budget": self.request.base.select.budget,
+            "budget": self.base.select.budget,
             "device": self.device,
             "threads": self.threads,
-            "rows": {row.name: row.what for row in self.request.rows},
+            "rows": {row.name: row.what for row in self.rows},
         }
 
     def line(self, place: tuple[str, str, int], task: CellTask) -> dict[str, Any]:
@@ -198,7 +192,7 @@ class Ablation(Study[Request, tuple[str, str, int]]):
         }
 
     def show(self, results: dict[str, Any]) -> None:
-        out = self.request.out
+        out = self.out
         write_text(out / "tables.md", markdown(results))
         plot(results, out / "plot.png")
         for scene in results["scenes"]:

@@ -24,19 +24,15 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def made_line(results: Mapping[str, Any]) -> str:
-    """How the results were made: command, date, code, machine, preset and resolution."""
-    box = results["machine"]
+    """How the results were made: command, date, commit and those of its cells where they differ, machine, preset."""
+    box, state = results["machine"], f"commit {(results['commit'] or 'unknown')[:12]}"
+    if results["dirty"]:
+        state += " with changes"
+    commits = sorted({cell["commit"] for cell in results["cells"] if cell["commit"]})
+    if len(commits) > 1:
+        state += f" (cells of {len(commits)} commits: {', '.join(commit[:12] for commit in commits)})"
     return (
-        f"`{results['command']}`, {results['date'][:10]}, {code_of(results)}; {box['processor']},"
+        f"`{results['command']}`, {results['date'][:10]}, {state}; {box['processor']},"
         f" {box['cores']} cores, torch {results['versions']['torch']}. Preset"
         f" {results['preset']}, {results['resolution']}"
     )
-
-
-def code_of(results: Mapping[str, Any]) -> str:
-    """The commit that made the results, and those of its cells where they differ."""
-    commits = sorted({cell["commit"] for cell in results["cells"] if cell["commit"]})
-    state = f"commit {(results['commit'] or 'unknown')[:12]}{' with changes' if results['dirty'] else ''}"
-    if len(commits) > 1:
-        state += f" (cells of {len(commits)} commits: {', '.join(commit[:12] for commit in commits)})"
-    return state

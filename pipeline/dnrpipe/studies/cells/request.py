@@ -1,38 +1,13 @@
-"""What the command lines of `ablate` and `bench-select` ask for."""
+"""What the command lines of `ablate` and `bench-select` ask for: settings, and names."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from ...core.errors import UserError
-from ...core.settings import Settings, merge, parse_assignment
-
-
-@dataclass(frozen=True, kw_only=True)
-class StudyRequest:
-    """What to run. base: settings of all cells. seconds: of training, None: the preset's epochs.
-
-    Raises UserError: an amount of work that is none, or ``out`` is a file.
-    """
-
-    scenes: list[Path]
-    seeds: int
-    base: Settings
-    seconds: float | None
-    out: Path
-    jobs: int
-
-    def __post_init__(self) -> None:
-        if self.seconds is not None and not self.seconds > 0:
-            raise UserError(f"--seconds {self.seconds:g}: must be more than 0")
-        if self.seeds < 1 or self.jobs < 0:
-            raise UserError(f"--seeds {self.seeds} --jobs {self.jobs}: at least 1 seed; jobs from 0 (one per core)")
-        if self.out.exists() and not self.out.is_dir():
-            raise UserError(f"--out {self.out}: is a file; name a folder")
+from ...core.settings import merge, parse_assignment
 
 
 def merged(layers: Sequence[Mapping[str, Any]], assignments: Sequence[str]) -> dict[str, Any]:

@@ -130,9 +130,9 @@ def traced_split(settings: Settings, spp: int | None) -> str:
     return "train" if spp in (None, settings.raytrace.spp) else f"train-{spp}spp"
 
 
-def trace_references(scene: Scene, settings: Settings) -> dict[str, str]:
-    """Path-trace the test views, booked as evaluation -> fingerprint of each view's file."""
-    return _trace(scene.run(settings, "evaluate"), list(scene.test.values()), "test")
+def trace_references(scene: Scene, settings: Settings) -> list[str]:
+    """Path-trace the test views, booked as evaluation -> fingerprints of their files, sorted."""
+    return sorted(_trace(scene.run(settings, "evaluate"), list(scene.test.values()), "test").values())
 
 
 def make_bases(scene: Scene, settings: Settings, train: Sequence[str]) -> dict[str, str]:

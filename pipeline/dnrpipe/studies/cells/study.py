@@ -22,50 +22,73 @@ from dnrtrain.settings import ModelSettings, Strict
 
 from ... import __version__
 from ...core.console import Console
+from ...core.errors import UserError
 from ...core.settings import Settings
 from ...core.workspace import digest, locked
-from ...stages.trainer import perceptual_weights
+from ...stages.trainer import perceptual_weights, torch_device
+from ...workers.view_tasks import worker_count
 from .cell import CELL_VERSION
 from .provenance import code_state, made_by
-from .request import StudyRequest
-from .scenes import Scene, trace_references, traced_split
+from .scenes import Scene, traced_split
 from .tasks import CellTask, Step1Task, files_of, once
-from .worker_pool import make_pool
+from .worker_pool import WorkerPool
 
 CELL_WORKER = "dnrpipe.studies.cells.cell"
-Request = TypeVar("Request", bound=StudyRequest)
 Place = TypeVar("Place")
 
 
-@dataclass
-class Study(ABC, Generic[Request, Place]):
-    """The state of one run. references: fingerprints of the test views' pictures, by scene.
+@dataclass(kw_only=True)
+class Study(ABC, Generic[Place]):
+    """What to run, and the state of the run.
 
-    cells: by their places in the tables; those that come to the same share one fingerprint.
+    Args:
+        sources: scene files.
+        base: settings of all cells.
+        seconds: of training, None: the preset's epochs.
+        jobs: workers; 0: one per core, one on a GPU.
+        references: fingerprints of the test views' pictures, by scene.
+        cells: by their places in the tables; those that come to the same share one fingerprint.
+
+    Raises UserError: an amount of work that is none, or ``out`` is a file.
     """
 
     COMMAND: ClassVar[str]
     SCHEMA: ClassVar[int]
     SINGLE: ClassVar[bool] = False
-    """Of `make_pool`."""
+    """Whether workers have one thread also where they are fewer than cores, so that ``jobs`` decides nothing else."""
 
-    request: Request
+    sources: list[Path]
+    seeds: int
+    base: Settings
+    seconds: float | None
+    out: Path
+    jobs: int
     console: Console
     perceptual: bool = field(default=False, init=False)
     references: dict[str, list[str]] = field(default_factory=dict, init=False)
     cells: dict[Place, CellTask] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
-        log = self.request.out / "logs" / "cells.log"
-        self.worker_pool = make_pool(self.request.base, self.request.jobs, log, self.console, single=self.SINGLE)
-        self.environment = self.device, self.threads = self.worker_pool.device, self.worker_pool.threads
+        if self.seconds is not None and not self.seconds > 0:
+            raise UserError(f"--seconds {self.seconds:g}: must be more than 0")
+        if self.seeds < 1 or self.jobs < 0:
+            raise UserError(f"--seeds {self.seeds} --jobs {self.jobs}: at least 1 seed; jobs from 0 (one per core)")
+        if self.out.exists() and not self.out.is_dir():
+            raise UserError(f"--out {self.out}: is a file; name a folder")
+        device, cores = torch_device(self.base), worker_count(0)
+        on_gpu = device.startswith("cuda")
+        # Cells side by side on a thread each finish more per hour than one after the other on all cores.
+        workers = self.jobs or (1 if on_gpu else cores)
+        threads = 0 if on_gpu else 1 if self.SINGLE else max(1, cores // workers)
+        self.worker_pool = WorkerPool(device, threads, workers, self.out / "logs" / "cells.log", self.console)
+        self.environment = self.device, self.threads = device, threads
 
     def carry_out(self) -> dict[str, Any]:
         """Run what is due and write the results, also where some of it failed -> the results.
 
         Raises TasksFailed: some cells failed; the others are written.
         """
-        with locked(self.request.out, self.COMMAND):
+        with locked(self.out, self.COMMAND):
             try:
                 self.run()
             finally:
@@ -76,7 +99,7 @@ class Study(ABC, Generic[Request, Place]):
         """Prepare all scenes, then go seed by seed, so that a whole table of the first seed exists early."""
         self.perceptual = perceptual_weights(self.console) is not None
         self.open_scenes()
-        for seed in range(self.request.seeds):
+        for seed in range(self.seeds):
             self.run_seed(seed)
 
     @abstractmethod
@@ -93,10 +116,6 @@ class Study(ABC, Generic[Request, Place]):
     def plan_cells(self, seed: int) -> None:
         """Note the tasks of the seed's cells, once all that they read is made."""
 
-    def trace_references(self, scene: Scene, settings: Settings) -> None:
-        """Path-trace the scene's test views and note what decides them."""
-        self.references[scene.name] = sorted(trace_references(scene, settings).values())
-
     # -- tasks -----------------------------------------------------------------------------------------
 
     def step1_task(
@@ -107,7 +126,7 @@ class Study(ABC, Generic[Request, Place]):
         decisive = [scene.inputs, model.model_dump(), step1.model_dump(), policy, budget, seed, seconds]
         return Step1Task(
             **files_of(
-                self.request.out / "step1" / scene.name,
+                self.out / "step1" / scene.name,
                 digest([CELL_VERSION, __version__, *decisive, *self.environment]),
             ),
             workspace=scene.workspace.root,
@@ -146,7 +165,7 @@ class Study(ABC, Generic[Request, Place]):
             spp: of the training views' pictures, None: the settings'.
             picture: whether a test view is kept.
         """
-        views, seconds = (list(traced), self.request.seconds) if network else ([], None)
+        views, seconds = (list(traced), self.seconds) if network else ([], None)
         model, step2 = settings.model.model_dump(mode="json"), settings.finetune.step2.model_dump(mode="json")
         used = [*(f"train/{name}" for name in views), *(f"test/{name}" for name in scene.test)]
         decisive = [scene.inputs, self.references[scene.name], model, [bases[name] for name in used] if bases else None]
@@ -155,7 +174,7 @@ class Study(ABC, Generic[Request, Place]):
             train = [seed, list(traced.values()), step2, coarse and coarse.fingerprint, time]
             decisive += [train, *self.environment]
         fingerprint = digest([CELL_VERSION, __version__, *decisive, self.perceptual])
-        folder = self.request.out / "cells" / scene.name
+        folder = self.out / "cells" / scene.name
         return CellTask(
             **files_of(folder, fingerprint),
             scene=scene.name,
@@ -164,7 +183,7 @@ class Study(ABC, Generic[Request, Place]):
             settings=settings,
             network=network,
             views=views,
-            targets=traced_split(self.request.base, spp),
+            targets=traced_split(self.base, spp),
             coarse=coarse and coarse.folder,
             coarse_cost=coarse and coarse.result(),
             seconds=seconds,
@@ -178,27 +197,27 @@ class Study(ABC, Generic[Request, Place]):
     def _pace_file(self, scene: Scene, step: str, model: ModelSettings, schedule: Strict, *more: str | int) -> Path:
         """Where the seconds of an epoch are kept; whatever makes epochs longer or shorter is in the name."""
         parts = [CELL_VERSION, scene.inputs, step, model.model_dump(), schedule.model_dump(mode="json"), *more]
-        return self.request.out / "pace" / scene.name / f"{digest([*parts, *self.environment])}.json"
+        return self.out / "pace" / scene.name / f"{digest([*parts, *self.environment])}.json"
 
     # -- results ---------------------------------------------------------------------------------------
 
     def write(self) -> dict[str, Any]:
         """Write the results of the cells that are there -> the results; without any cell nothing is written."""
-        request, base = self.request, self.request.base
+        base = self.base
         results = {
             "schema": self.SCHEMA,
             **made_by(),
             "preset": base.preset,
             "resolution": f"{base.cameras.width}x{base.cameras.height}",
-            "seconds": request.seconds,
-            "seeds": request.seeds,
-            "scenes": [path.stem for path in request.scenes],
+            "seconds": self.seconds,
+            "seeds": self.seeds,
+            "scenes": [path.stem for path in self.sources],
             "spp": {"training": base.raytrace.spp, "test": base.raytrace.evaluation_spp},
             **self.compared(),
             "cells": [self.line(place, task) for place, task in self.cells.items() if task.output.exists()],
         }
         if results["cells"]:
-            write_json(request.out / "results.json", results)
+            write_json(self.out / "results.json", results)
             self.show(results)
         return results
 

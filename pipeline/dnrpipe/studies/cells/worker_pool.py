@@ -1,4 +1,4 @@
-"""Worker processes for cells: how many, on how many threads, and a loop that leaves out what is done."""
+"""Worker processes for cells: a loop that leaves out what is done."""
 
 from __future__ import annotations
 
@@ -7,10 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ...core.console import Console
-from ...core.settings import Settings
-from ...stages.trainer import torch_device
 from ...workers.answers import answers, warn_of_retries
-from ...workers.view_tasks import TasksFailed, worker_count
+from ...workers.view_tasks import TasksFailed
 from .tasks import PoolTask
 
 
@@ -55,22 +53,3 @@ class WorkerPool:
                 f"{label}: {len(failed)} of {len(due)} failed ({', '.join(failed[:5])}); the others are done."
                 f" See {self.log}; run the same command to try again"
             )
-
-
-def make_pool(settings: Settings, jobs: int, log: Path, console: Console, *, single: bool = False) -> WorkerPool:
-    """The workers of a study.
-
-    Cells side by side on a thread each finish more per hour than one after the other on all cores.
-
-    Args:
-        settings: name the device.
-        jobs: workers; 0: one per core, one on a GPU.
-        log, console: of `WorkerPool`.
-        single: one thread a worker also where there are fewer workers than cores, so that ``jobs`` does not enter what
-            comes out.
-    """
-    device, cores = torch_device(settings), worker_count(0)
-    on_gpu = device.startswith("cuda")
-    workers = jobs or (1 if on_gpu else cores)
-    threads = 0 if on_gpu else 1 if single else max(1, cores // workers)
-    return WorkerPool(device, threads, workers, log, console)

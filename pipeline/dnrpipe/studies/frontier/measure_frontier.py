@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from dnrtrain.atomic import atomic_path, write_json, write_text
@@ -21,7 +21,7 @@ from ...core.settings import Settings
 from ...core.workspace import Workspace, digest
 from ...stages.stage import Run
 from ...workers.view_tasks import worker_count
-from ..ablation.ablate import Ablation, Request
+from ..ablation.ablate import Ablation
 from ..ablation.rows import CLASSIC, ROWS, Row, ViewChoice
 from ..cells.provenance import made_by
 from ..cells.scenes import Scene, prepared, without_left_out
@@ -90,14 +90,14 @@ class Sweep:
         return Row(name, name, "dnr", changes, views_by, budget=views, spp=spp)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Frontier(Ablation):
     """An ablation of one scene: the workspace that is open."""
 
-    workspace: Workspace = field(kw_only=True)
+    workspace: Workspace
 
     def _open(self, source: Path) -> Scene:
-        return prepared(source.stem, Run(self.workspace, self.request.base, self.console), "frontier")
+        return prepared(source.stem, Run(self.workspace, self.base, self.console), "frontier")
 
 
 def numbers(text: str | None, option: str, default: Sequence[int], most: int | None = None) -> tuple[int, ...]:
@@ -135,7 +135,7 @@ def run_frontier(
         frames: numbers of frames to compare for.
         also: names of other ways to train, and Cycles.
         ladder: samples of the baselines.
-        seeds, jobs: of `StudyRequest`.
+        seeds, jobs: of `Study`.
 
     Raises:
         UserError: unknown names, numbers that do not fit. TasksFailed: some cells failed; the others are written.
@@ -157,8 +157,8 @@ def run_frontier(
     out = workspace.root / "frontier"
     name, base = workspace.root.name.removesuffix(".dnr"), settings.model_copy(deep=True)
     base.select.budget = max((row.budget or 1 for row in rows), default=1)
-    request = Request(
-        scenes=[Path(f"{name}.blend")],
+    swept = Frontier(
+        sources=[Path(f"{name}.blend")],
         rows=rows,
         seeds=seeds,
         base=base,
@@ -166,8 +166,9 @@ def run_frontier(
         seconds=None,
         out=out,
         jobs=jobs,
+        console=run.console,
+        workspace=workspace,
     )
-    swept = Frontier(request, run.console, workspace=workspace)
     swept.run()
     (scene,) = swept.scenes
     cores = worker_count(0)
@@ -211,7 +212,7 @@ def run_frontier(
 
 def _trace_baselines(swept: Ablation, scene: Scene, samples: tuple[int, ...], worker_pool: WorkerPool) -> BaselineFile:
     """Path tracing of the test views, rendered where it is not on disk."""
-    settings = without_left_out(scene.workspace, swept.request.base)
+    settings = without_left_out(scene.workspace, swept.base)
     facts = [swept.references[scene.name], samples, settings.model.base, settings.base.model_dump()]
     fingerprint = digest([BASELINE_VERSION, *facts, worker_pool.threads, swept.perceptual])
     task = PathTracingTask(
@@ -219,7 +220,7 @@ def _trace_baselines(swept: Ablation, scene: Scene, samples: tuple[int, ...], wo
         workspace=scene.workspace.root,
         settings=settings,
         samples=list(samples),
-        output=swept.request.out / "rivals" / f"{fingerprint}.json",
+        output=swept.out / "rivals" / f"{fingerprint}.json",
         label="path tracing",
     )
     worker_pool.work("path tracing of the test views", BASELINE_WORKER, [task])
@@ -234,7 +235,7 @@ def _cycles_baselines(
 ) -> list[BaselinePoint]:
     """Cycles on the test views, rendered and measured where that is not on disk."""
     workspace, views = scene.workspace, list(scene.test.values())
-    reference_spp, folder = swept.request.base.raytrace.evaluation_spp, swept.request.out / "rivals"
+    reference_spp, folder = swept.base.raytrace.evaluation_spp, swept.out / "rivals"
     facts = [scene_fingerprint(workspace), [v.model_dump() for v in views], samples, reference_spp]
     fingerprint = digest([CYCLES_VERSION, *facts, worker_pool.threads])
     pictures = folder / f"cycles-{fingerprint}"

@@ -37,7 +37,7 @@ def point_of(swept: Ablation, scene: Scene, row: Row, seed: int, base_ms: float 
     cell = task.result()
     workspace, training = scene.workspace, cell.training
     work = upfront_work(workspace.ledger.read())
-    split = traced_split(swept.request.base, row.spp)
+    split = traced_split(swept.base, row.spp)
     parts: dict[str, float] = {"passes": 0.0, "tracing": 0.0, "light": 0.0, "base images": 0.0, "training": 0.0}
     if training is not None:
         candidates = {f"train/{name}" for name in scene.train}
@@ -53,7 +53,7 @@ def point_of(swept: Ablation, scene: Scene, row: Row, seed: int, base_ms: float 
         kind=_kind(row),
         seed=seed,
         views=len(cell.views),
-        spp=(row.spp or swept.request.base.raytrace.spp) if training else None,
+        spp=(row.spp or swept.base.raytrace.spp) if training else None,
         steps=training and training.step2.steps,
         parts={name: round(value, 3) for name, value in parts.items()},
         upfront=sum(parts.values()),

@@ -12,7 +12,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any, Literal
 
 from dnrtrain.atomic import write_text
@@ -22,8 +21,7 @@ from ...core.settings import Settings
 from ...core.workspace import digest
 from ..cells.cell import CELL_VERSION
 from ..cells.measure import METRICS, mean_of, written_seconds
-from ..cells.request import StudyRequest
-from ..cells.scenes import base_files, make_bases, trace_train, without_left_out
+from ..cells.scenes import base_files, make_bases, trace_references, trace_train, without_left_out
 from ..cells.study import CELL_WORKER, Study
 from ..cells.tasks import CellTask, ChoiceFile, Step1Task, StudyTask, files_of, once
 from .active.settings import ActiveSettings, ActiveTask
@@ -36,15 +34,6 @@ from .rule_worker import RuleTask
 CHOICE_VERSION = 1  # raise when what a selection's file holds changes
 SHARED_COARSE = "farthest"
 """Step 1 without a selector trains the same for every policy, so that all share one coarse model."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Request(StudyRequest):
-    """The budget of ``base`` is the largest of ``budgets``."""
-
-    pools: list[str]
-    budgets: list[int]
-    policies: list[Contender]
 
 
 @dataclass(frozen=True)
@@ -61,26 +50,31 @@ class Place:
 ChoiceTask = RuleTask | ActiveTask | Step1Task
 
 
-@dataclass
-class Bench(Study[Request, Place]):
-    """Pools by (scene, name). chosen: the selections that the cells' views come from."""
+@dataclass(kw_only=True)
+class Bench(Study[Place]):
+    """The budget of ``base`` is the largest of ``budgets``.
+
+    pools: by (scene, name). chosen: the selections that the cells' views come from.
+    """
 
     COMMAND, SCHEMA, SINGLE = "bench-select", SCHEMA, True
+    pool_names: list[str]
+    budgets: list[int]
+    policies: list[Contender]
     pools: dict[tuple[str, str], Pool] = field(default_factory=dict, init=False)
     chosen: dict[Place, ChoiceTask] = field(default_factory=dict, init=False)
     written_seconds: Callable[..., float] = field(default_factory=lambda: functools.cache(written_seconds), init=False)
 
     def open_scenes(self) -> None:
-        request = self.request
-        places = [(source, name) for source in request.scenes for name in request.pools]
+        places = [(source, name) for source in self.sources for name in self.pool_names]
         with self.console.bar("scenes and cameras", len(places)) as bar:  # all, before anything takes long
             for source, name in places:
-                pool = place_pool(source, name, request.out, request.base, self.console)
+                pool = place_pool(source, name, self.out, self.base, self.console)
                 self.pools[pool.scene, name] = pool
                 bar.advance(note=pool.folder)
         with self.console.bar("pools", len(self.pools)) as bar:
             for pool in self.pools.values():
-                self.trace_references(pool.data, self._settings(pool))
+                self.references[pool.folder] = trace_references(pool.data, self._settings(pool))
                 bar.advance(note=pool.folder)
 
     def run_seed(self, seed: int) -> None:
@@ -91,8 +85,8 @@ class Bench(Study[Request, Place]):
         starts: dict[Place, Step1Task] = {}
         chosen: dict[Place, ChoiceTask] = {}
         for pool in self.pools.values():
-            for budget in self.request.budgets:
-                for contender in self.request.policies:
+            for budget in self.budgets:
+                for contender in self.policies:
                     place = Place(pool.scene, pool.name, budget, contender.name, seed)
                     settings = settings_of(contender, self._settings(pool), budget)
                     chosen[place] = task = self._choice_task(pool, contender, settings, seed)
@@ -124,7 +118,7 @@ class Bench(Study[Request, Place]):
             decisive = [CHOICE_VERSION, CELL_VERSION, __version__, inputs, model, step1, asdict(ActiveSettings())]
             decisive += [policy, budget, seed, *self.environment]
         common: dict[str, Any] = {
-            **files_of(self.request.out / "selections" / pool.folder, digest(decisive)),
+            **files_of(self.out / "selections" / pool.folder, digest(decisive)),
             "workspace": pool.data.workspace.root,
             "policy": policy,
             "seed": seed,
@@ -161,7 +155,7 @@ class Bench(Study[Request, Place]):
 
     def _settings(self, pool: Pool) -> Settings:
         """The run's settings without what the scene's effect plan leaves off."""
-        return without_left_out(pool.data.workspace, self.request.base)
+        return without_left_out(pool.data.workspace, self.base)
 
     def _choice(self, place: Place) -> ChoiceFile:
         """The file of a selection, of whichever kind."""
@@ -170,14 +164,13 @@ class Bench(Study[Request, Place]):
     # -- results ---------------------------------------------------------------------------------------
 
     def compared(self) -> dict[str, Any]:
-        request = self.request
         return {
-            "candidates": request.base.cameras.train,
-            "pools": request.pools,
-            "budgets": request.budgets,
+            "candidates": self.base.cameras.train,
+            "pools": self.pool_names,
+            "budgets": self.budgets,
             "device": self.device,
             "threads": self.threads,
-            "policies": {contender.name: contender.what for contender in request.policies},
+            "policies": {contender.name: contender.what for contender in self.policies},
         }
 
     def line(self, place: Place, task: CellTask) -> dict[str, Any]:
@@ -216,7 +209,7 @@ class Bench(Study[Request, Place]):
         }
 
     def show(self, results: dict[str, Any]) -> None:
-        out: Path = self.request.out
+        out = self.out
         write_text(out / "report.md", markdown(results))
         plot(results, out / "views.png", "views")
         plot(results, out / "seconds.png", "total_seconds")

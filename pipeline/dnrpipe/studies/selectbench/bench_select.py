@@ -10,7 +10,7 @@ from ...core.errors import UserError
 from ...core.settings import merge, resolve
 from ..cells.request import merged
 from ..cells.scenes import find_scenes
-from .bench import Bench, Request
+from .bench import Bench
 from .policies import choose_policies
 from .pools import choose_pools
 
@@ -41,7 +41,7 @@ def run_bench(
     console: Console,
     **more: Any,
 ) -> dict[str, Any]:
-    """Run what is due and write it -> the results. more: fields of `StudyRequest`.
+    """Run what is due and write it -> the results. more: fields of `Study`.
 
     Settings come from the preset and these arguments alone, neither from the environment nor from
     dnrpipe.toml: the command that is kept in the results says all.
@@ -59,15 +59,15 @@ def run_bench(
     base = resolve(preset, merge(overrides, {"select": {"budget": max(wanted)}}), environment={})
     if base.cameras.source != "auto":
         raise UserError(f"cameras.source={base.cameras.source}: the pools decide where cameras stand; use --pools")
-    request = Request(
-        scenes=find_scenes(scenes or (SMOKE_SCENE if smoke else None)),
-        pools=choose_pools(pools or defaults["pools"]),
+    return Bench(
+        sources=find_scenes(scenes or (SMOKE_SCENE if smoke else None)),
+        pool_names=choose_pools(pools or defaults["pools"]),
         budgets=wanted,
         policies=choose_policies(policies or defaults["policies"]),
         base=base,
+        console=console,
         **more,
-    )
-    return Bench(request, console).carry_out()
+    ).carry_out()
 
 
 def choose_budgets(text: str, candidates: int) -> list[int]:
