@@ -110,12 +110,8 @@ def _toggled(run: Run, plan: EffectPlan, effect: Effect) -> EffectPlan | None:
     if effect.part == "neural" or not (effect.present or effect.name in FORCEABLE):
         return None
     chosen = run.settings.effects
-    enable: tuple[EffectName, ...] = tuple(name for name in chosen.enable if name != effect.name)
-    disable: tuple[EffectName, ...] = tuple(name for name in chosen.disable if name != effect.name)
-    if effect.on:
-        disable = (*disable, effect.name)
-    else:
-        enable = (*enable, effect.name)
+    enable, disable = ([name for name in names if name != effect.name] for names in (chosen.enable, chosen.disable))
+    (disable if effect.on else enable).append(effect.name)
     return plan_of(run.workspace, run.settings, enable=enable, disable=disable, pilot=plan.pilot)
 
 
@@ -123,19 +119,14 @@ def table(plan: EffectPlan) -> str:
     """The plan as aligned lines: effect, on or off, evidence, cost, error."""
     depth = "not known before its pilot" if plan.max_depth is None else str(plan.max_depth)
     lines = [f"ray tracing: {plan.integrator}, path depth {depth}"]
-    head = ("effect", "", "cost", "error", "evidence")
-    rows: list[tuple[str, str, str, str, str]] = [head]
+    rows = [("effect", "", "cost", "error", "evidence")]
     for effect in plan.effects:
         state = ("on" if effect.on else "off") + (" (user)" if effect.by == "user" else "")
         evidence = effect.evidence[0] + (f" (+{len(effect.evidence) - 1})" if len(effect.evidence) > 1 else "")
         rows.append((effect.name, state, _percent(effect.cost), _percent(effect.error), evidence))
-    widths = [max(len(row[i]) for row in rows) for i in range(4)]
-    for row in rows:
-        cells = [
-            cell.rjust(w) if i in (2, 3) else cell.ljust(w)
-            for i, (cell, w) in enumerate(zip(row, widths, strict=False))
-        ]
-        lines.append("  ".join([*cells, row[4]]).rstrip())
+    a, b, c, d = (max(len(row[i]) for row in rows) for i in range(4))
+    for name, state, cost, error, evidence in rows:
+        lines.append(f"{name:<{a}}  {state:<{b}}  {cost:>{c}}  {error:>{d}}  {evidence}".rstrip())
     if all(effect.cost is None for effect in plan.effects):
         lines.append("cost and error are not measured yet: dnrpipe effects --measure")
     return "\n".join(lines)

@@ -21,7 +21,7 @@ from ...core.settings import Settings, resolve
 from ...stages.stage import Run
 from ..cells.cell import STEP1_SHARE
 from ..cells.measure import METRICS, mean_of, pictured
-from ..cells.request import merged
+from ..cells.request import SMOKE_RUN, SMOKE_SCENE, merged
 from ..cells.scenes import (
     Scene,
     choose_by_pose,
@@ -39,14 +39,7 @@ from .ablation_plots import contact_sheet, plot
 from .ablation_tables import SCHEMA, markdown
 from .rows import Row, choose_rows, needs_base, needs_coarse, settings_of, step1_policy
 
-SMOKE: dict[str, Any] = {
-    "cameras": {"train": 6, "val": 1, "test": 2, "width": 32, "height": 32},
-    "passes": {"raster": "cycles-direct", "coverage_samples": 16},
-    "raytrace": {"spp": 16, "evaluation_spp": 32, "max_depth": 3},
-    "select": {"budget": 3, "step1": {"epochs": 2}},
-    "finetune": {"step2": {"epochs": 4}},
-}
-SMOKE_SCENE, SMOKE_ROWS = "emissive_only", "vanilla,paper"
+SMOKE, SMOKE_ROWS = {"cameras": {"train": 6, "val": 1}, "select": {"budget": 3}}, "vanilla,paper"
 
 
 def run_ablation(
@@ -69,7 +62,7 @@ def run_ablation(
         UserError: unknown names, settings that do not fit. TasksFailed: some cells failed; the others are written.
     """
     budgeted = {} if budget is None else {"select": {"budget": budget}}
-    overrides = merged([SMOKE if smoke else {}, budgeted], assignments)
+    overrides = merged([*([SMOKE_RUN, SMOKE] if smoke else []), budgeted], assignments)
     return Ablation(
         sources=find_scenes(scenes or (SMOKE_SCENE if smoke else None)),
         rows=choose_rows(rows or (SMOKE_ROWS if smoke else "core")),

@@ -9,6 +9,16 @@ from typing import Any
 from ...core.errors import UserError
 from ...core.settings import merge, parse_assignment
 
+SMOKE_SCENE = "emissive_only"
+SMOKE_RUN: dict[str, Any] = {
+    "cameras": {"test": 2, "width": 32, "height": 32},
+    "passes": {"raster": "cycles-direct", "coverage_samples": 16},
+    "raytrace": {"spp": 16, "evaluation_spp": 32, "max_depth": 3},
+    "select": {"step1": {"epochs": 2}},
+    "finetune": {"step2": {"epochs": 4}},
+}
+"""What ``--smoke`` is about: a small scene, few epochs."""
+
 
 def merged(layers: Sequence[Mapping[str, Any]], assignments: Sequence[str]) -> dict[str, Any]:
     """Nested settings, later ones first; ``assignments``, KEY=VALUE, before all."""

@@ -25,7 +25,7 @@ from ..ablation.ablate import Ablation
 from ..ablation.rows import CLASSIC, ROWS, Row, ViewChoice
 from ..cells.provenance import made_by
 from ..cells.scenes import Scene, prepared, without_left_out
-from ..cells.worker_pool import WorkerPool
+from ..cells.study import WorkerPool
 from .frontier_plots import plot
 from .frontier_report import markdown
 from .point_costs import break_evens, pareto, point_of, settle_frames

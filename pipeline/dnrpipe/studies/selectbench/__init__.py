@@ -3,8 +3,7 @@
 pools          sets of candidates: a workspace per scene and pool
 rigs           cameras of the pools that are no spheres
 policies       what competes, as data
-bench_select   options in
-bench          the resumable loop: selections, ray tracing of the chosen views, cells; report and plots
+bench_select   the resumable loop: selections, ray tracing of the chosen views, cells; report and plots
 rule_worker    one selection by a rule, in a worker process
 active/        baselines from the literature that train renderers of their own
 figures        numbers of a table from results.json, paired differences and their confidence
