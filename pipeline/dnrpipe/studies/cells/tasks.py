@@ -32,6 +32,20 @@ class StudyTask(PoolTask):
 
     fingerprint: str
     workspace: Path
+    seed: int
+
+
+class TrainingTask(StudyTask):
+    """Train in ``folder``.
+
+    seconds: of training at most, None: the settings' epochs. pace: file of the seconds of an epoch, where ``seconds``
+    limit them.
+    """
+
+    settings: Settings
+    seconds: float | None
+    pace: Path
+    folder: Path
 
 
 class FileWorker(ABC):
@@ -74,22 +88,11 @@ def files_of(folder: Path, fingerprint: str) -> dict[str, Any]:
     return {"fingerprint": fingerprint, **made}
 
 
-class Step1Task(StudyTask):
-    """Train step 1 into ``folder`` -> `Step1Result`.
-
-    Args:
-        policy: chooses the views.
-        seconds: of training at most; None: the settings' epochs.
-        pace: file of the seconds of an epoch, where ``seconds`` limit them.
-    """
+class Step1Task(TrainingTask):
+    """Train step 1 -> `Step1Result`. policy: chooses the views."""
 
     kind: Literal["step1"] = "step1"
-    settings: Settings
     policy: str
-    seed: int
-    seconds: float | None
-    pace: Path
-    folder: Path
 
     def result(self) -> Step1Result:
         """What it gave, once it is done."""
@@ -113,35 +116,27 @@ class Step1Result(TrainingCost):
     epochs: int
 
 
-class CellTask(StudyTask):
+class CellTask(TrainingTask):
     """Train step 2, measure all test views -> `CellResult`.
 
     Args:
         network: False measures the base image alone.
-        views: of training.
-        targets: folder under raytraced/ of their pictures.
+        targets: folder under raytraced/ of the training views' pictures.
         coarse, coarse_cost: folder of step 1 and what that took; None where the network starts fresh.
-        seconds: of both steps; None: the settings' epochs.
+        seconds: of both steps.
         full_step1: step 1 counts as its whole share of the seconds, whatever it took.
-        pace: file of the seconds of an epoch, where ``seconds`` limit them.
-        folder: of the model, removed once it is measured.
+        folder: removed once the model is measured.
         picture: where one test view is kept, None: nowhere.
-        code: of `provenance.code_state`.
     """
 
     kind: Literal["cell"] = "cell"
     scene: str
-    seed: int
-    settings: Settings
     network: bool
     views: list[str]
     targets: str = "train"
     coarse: Path | None
     coarse_cost: Step1Result | None
-    seconds: float | None
     full_step1: bool
-    pace: Path
-    folder: Path
     picture: Path | None
     code: dict[str, Any]
 

@@ -34,7 +34,7 @@ from ...core.workspace import Workspace, digest
 from ...effects.plan import EffectPlan
 from ...effects.store import lenses, trace_config, variant_for
 from ...raytrace.tasks import BaseTask, TracerCommon, TraceTask
-from ...stages.base_images import RENDERED, BaseRenderer, bake_light, base_renderer
+from ...stages.base_images import RENDERED, bake_light, base_renderer
 from ...stages.effect_plan import resolve_plan
 from ...stages.raytrace import view_seed
 from ...stages.stage import Run
@@ -58,6 +58,10 @@ LIGHT_PATHS = 2 * 512 * 512 * 128
 """Paths of a bake of light that the pilot can afford: twice what ``light_spp = auto`` asks for at any size."""
 TIMEOUT = 600.0
 """Seconds after which a part counts as hung: ten times what the whole pilot should take."""
+
+
+Answers = list[tuple[dict[str, Any], dict[str, Any]]]
+"""(task, result) of each task."""
 
 
 def pilot_path(workspace: Workspace) -> Path:
@@ -88,7 +92,7 @@ def run_pilot(run: Run) -> Pilot:
         shutil.rmtree(piloting.folder, ignore_errors=True)
         load = os.getloadavg()[0] if hasattr(os, "getloadavg") else None
         found = Pilot(fingerprint=fingerprint, size=(first.width, first.height), load=load)
-    bake = found.light is None and not base_renderer(workspace, settings, plan).light_is_baked  # removed, perhaps
+    bake = found.light is None and not piloting.renderer.light_is_baked  # removed, perhaps
     if found.frames is not None and not bake:
         return found
     piloting.folder.mkdir(parents=True, exist_ok=True)
@@ -139,6 +143,7 @@ class Piloting:
         self.workspace, self.settings, self.console = self.run.workspace, self.run.settings, self.run.console
         self.folder = self.workspace.root / FOLDER / "pilot"
         self.train, self.held_out = _views(self.workspace)
+        self.renderer = base_renderer(self.workspace, self.settings, self.plan)
 
     def trace(self) -> TracePart:
         """Views at two numbers of samples. Each worker's first view compiles its kernels, which are of one size."""
@@ -170,8 +175,7 @@ class Piloting:
 
         None where there is no light to bake or it is on disk.
         """
-        renderer = base_renderer(self.workspace, self.settings, self.plan)
-        task = renderer.light
+        renderer, task = self.renderer, self.renderer.light
         if task is None or renderer.light_is_baked:
             return None
         size, spp = task["size"], max(1, min(task["spp"], LIGHT_PATHS // task["size"] ** 2))
@@ -191,16 +195,17 @@ class Piloting:
 
     def base(self) -> BasePart:
         """Base images of all views of the pilot."""
-        renderer = base_renderer(self.workspace, self.settings, self.plan)
-        common, environment = renderer.common, renderer.environment
-        if renderer.light is not None:
-            common |= {"light": str(self._light(renderer))}
+        common, light = self.renderer.common, self._light()
+        if light is not None:
+            common = common | {"light": str(light)}
         tasks = [
             BaseTask(view=view, output=self._base_file(kind, view), fingerprint=self.run.id).model_dump(mode="json")
             for kind, views in (("train", self.train), ("held", self.held_out))
             for view in views
         ]
-        found, took = self._timed("pilot: base images", "dnrpipe.raytrace.base_worker", common, tasks, 1, environment)
+        found, took = self._timed(
+            "pilot: base images", "dnrpipe.raytrace.base_worker", common, tasks, 1, self.renderer.environment
+        )
         seconds = [result["seconds"] for _, result in found]
         return BasePart(
             pixels=self.train[0].width * self.train[0].height,
@@ -226,15 +231,14 @@ class Piloting:
 
     def frames(self) -> FramePart:
         """The held-out views, by all renderers."""
-        renderer = base_renderer(self.workspace, self.settings, self.plan)
         task = FramesTask(
             views=self.held_out,
             folders=self._models(),
-            light=self._light(renderer) if renderer.light is not None else None,
+            light=self._light(),
             samples=list(SAMPLE_COUNTS),
             methods=list(METHODS),
         )
-        result = self._ask("pilot: frames", task, renderer.environment)
+        result = self._ask("pilot: frames", task, self.renderer.environment)
         if lost := result.pop("unknown"):
             self.console.warn(f"pilot: {lost} pixels of the held-out views were not finite; they take no part")
         return FramePart(views=len(self.held_out), **result)
@@ -243,7 +247,7 @@ class Piloting:
 
     def _timed(
         self, label: str, module: str, common: dict[str, Any], tasks: list[dict[str, Any]], *more: Any
-    ) -> tuple[list[tuple[dict[str, Any], dict[str, Any]]], float]:
+    ) -> tuple[Answers, float]:
         """(what `_run` gives, wall seconds), after the first task on a worker of its own: its kernels are then in
         Dr.Jit's cache on disk, as they are when the plan is carried out. Compiling them takes 2 to 7 s, which would
         count as the start of every later stage."""
@@ -259,8 +263,8 @@ class Piloting:
         tasks: list[dict[str, Any]],
         workers: int,
         environment: dict[str, str],
-    ) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-        """(task, result) of each. Raises UserError where one failed twice."""
+    ) -> Answers:
+        """Raises UserError where a task failed twice."""
         found = []
         with self.console.bar(label, len(tasks)) as bar:
             for outcome in answers(
@@ -281,8 +285,7 @@ class Piloting:
 
     def _ask(self, label: str, task: TrainTask | FramesTask, environment: dict[str, str]) -> dict[str, Any]:
         """The answer of `pilot_worker`."""
-        model = self.plan.model(self.settings.model)
-        settings = self.settings.model_copy(update={"model": model})
+        settings = self.settings.model_copy(update={"model": self.plan.model(self.settings.model)})
         common = PilotCommon(workspace=self.workspace.root, settings=settings).model_dump(mode="json")
         tasks = [task.model_dump(mode="json")]
         ((_, result),) = self._run(label, "dnrpipe.studies.planning.pilot_worker", common, tasks, 1, environment)
@@ -312,10 +315,11 @@ class Piloting:
     def _base_file(self, kind: str, view: View) -> Path:
         return self.folder / f"base-{kind}-{view.name}.exr"
 
-    def _light(self, renderer: BaseRenderer) -> Path:
-        """The real light where it is on disk, else the pilot's."""
-        assert renderer.light is not None
-        return Path(renderer.light["output"]) if renderer.light_is_baked else self.folder / "light.npz"
+    def _light(self) -> Path | None:
+        """The real light where it is on disk, else the pilot's; None where none is needed."""
+        if (light := self.renderer.light) is None:
+            return None
+        return Path(light["output"]) if self.renderer.light_is_baked else self.folder / "light.npz"
 
 
 def _raw_rmse(result: dict[str, Any]) -> float | None:

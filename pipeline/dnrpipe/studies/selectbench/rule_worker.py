@@ -23,7 +23,6 @@ class RuleTask(StudyTask):
 
     policy: str
     budget: int
-    seed: int
 
 
 class Worker(FileWorker):

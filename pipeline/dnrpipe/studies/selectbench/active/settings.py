@@ -29,5 +29,4 @@ class ActiveTask(StudyTask):
 
     settings: Settings
     policy: str
-    seed: int
     folder: Path
