@@ -53,13 +53,9 @@ def run_ablation(
     console: Console,
     **more: Any,
 ) -> dict[str, Any]:
-    """Run what is due and write it -> the results. more: fields of `Study`.
+    """`Study.carry_out` with the command's options. more: fields of `Study`.
 
-    Settings come from the preset and these arguments alone, neither from the environment nor from
-    dnrpipe.toml: the command that is kept in the results says all.
-
-    Raises:
-        UserError: unknown names, settings that do not fit. TasksFailed: some cells failed; the others are written.
+    Raises UserError: unknown names, settings that do not fit.
     """
     budgeted = {} if budget is None else {"select": {"budget": budget}}
     overrides = merged([*([SMOKE_RUN, SMOKE] if smoke else []), budgeted], assignments)

@@ -21,7 +21,11 @@ SMOKE_RUN: dict[str, Any] = {
 
 
 def merged(layers: Sequence[Mapping[str, Any]], assignments: Sequence[str]) -> dict[str, Any]:
-    """Nested settings, later ones first; ``assignments``, KEY=VALUE, before all."""
+    """Nested settings, later ones first; ``assignments``, KEY=VALUE, before all.
+
+    A study's settings come from its preset and from these alone, neither from the environment nor from dnrpipe.toml:
+    the command that is kept in the results says all.
+    """
     found: dict[str, Any] = {}
     for layer in (*layers, *map(parse_assignment, assignments)):
         found = merge(found, layer)
@@ -35,15 +39,9 @@ def choose_names(
     names: Collection[str],
     groups: Mapping[str, Collection[str]],
 ) -> list[str]:
-    """``"vanilla,dnr"``, or groups, in the order of ``names``.
+    """``"vanilla,dnr"``, or groups, in the order of ``names``, which are all there are.
 
-    Args:
-        option: the flag, for messages. kind: what is named, likewise: ``row``.
-        text: what was given.
-        names: all there are.
-        groups: of names.
-
-    Raises UserError: an unknown name, or none.
+    option, kind: the flag and what it names, for messages. Raises UserError: an unknown name, or none.
     """
     found: set[str] = set()
     for name in filter(None, (part.strip() for part in text.split(","))):

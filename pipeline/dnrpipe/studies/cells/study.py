@@ -127,10 +127,7 @@ class Study(ABC, Generic[Place]):
         self.environment = self.device, self.threads = device, threads
 
     def carry_out(self) -> dict[str, Any]:
-        """Run what is due and write the results, also where some of it failed -> the results.
-
-        Raises TasksFailed: some cells failed; the others are written.
-        """
+        """Run what is due and write the results. Raises TasksFailed: some cells failed; the others are written."""
         with locked(self.out, self.COMMAND):
             try:
                 self.run()

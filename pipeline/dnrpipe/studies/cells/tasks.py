@@ -161,7 +161,6 @@ class CellResult(BaseModel):
     """A cell's file.
 
     Args:
-        key: the task's fingerprint.
         settings: "model" and "step2", as they were given.
         frame_ms, base_ms: median milliseconds of the network's frame and of a base image.
         tests: a row of metrics per test view.

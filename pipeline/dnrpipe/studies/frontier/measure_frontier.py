@@ -128,14 +128,7 @@ def run_frontier(
     seeds: int,
     jobs: int,
 ) -> FrontierResults:
-    """Measure what is due and write it -> the results.
-
-    Args:
-        budgets, spp, iterations: views, samples and optimiser steps of our points, as the options have them.
-        frames: numbers of frames to compare for.
-        also: names of other ways to train, and Cycles.
-        ladder: samples of the baselines.
-        seeds, jobs: of `Study`.
+    """Measure what is due and write it -> the results. All but ``run`` are options of the command.
 
     Raises:
         UserError: unknown names, numbers that do not fit. TasksFailed: some cells failed; the others are written.
@@ -183,11 +176,6 @@ def run_frontier(
         for row in rows
         if (row.network or seed == 0) and (point := point_of(swept, scene, row, seed, traced.base_ms, cores))
     ]
-    if seeds > 1:
-        points = [
-            point if point.kind == "base" else point.model_copy(update={"name": f"{point.name}, seed {point.seed}"})
-            for point in points
-        ]
     points = break_evens(settle_frames(points), baselines)
     results = FrontierResults(
         schema_version=SCHEMA,

@@ -49,7 +49,7 @@ def point_of(swept: Ablation, scene: Scene, row: Row, seed: int, base_ms: float 
     if cell.base == "baked":
         parts["light"] = total(work["light"]).cpu_seconds / cores
     return Point(
-        name=row.name,
+        name=f"{row.name}, seed {seed}" if swept.seeds > 1 and row.network else row.name,
         kind=_kind(row),
         seed=seed,
         views=len(cell.views),

@@ -108,7 +108,6 @@ class FrontierResults(Record):
         sweep: fields of `measure_frontier.Sweep`.
         frames: numbers of frames that are compared for.
         threads, baseline_threads: of cells, and of path tracing.
-        points, baselines: everything measured.
         pareto: by number of frames, what nothing else beats, cheapest first.
     """
 

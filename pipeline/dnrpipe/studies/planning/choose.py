@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -20,13 +21,7 @@ NEAR = 0.02
 
 @dataclass(frozen=True)
 class Predictor:
-    """Costs and quality of any choice.
-
-    Args:
-        pilot: of the workspace.
-        wall, processor: costs by either clock.
-        batch: views a step.
-    """
+    """Costs, by either clock, and quality of any choice. batch: views a step."""
 
     pilot: Pilot
     wall: Costs
@@ -61,10 +56,8 @@ class Predictor:
     def grid(self, candidates: int) -> Iterator[Prediction]:
         """All choices with at most ``candidates`` views."""
         views = sorted({*(n for n in VIEWS if n <= candidates), candidates})
-        for count in views:
-            for spp in SAMPLES:
-                for steps in STEPS:
-                    yield self.predict(self.choice(count, spp, steps))
+        for wanted in itertools.product(views, SAMPLES, STEPS):
+            yield self.predict(self.choice(*wanted))
 
 
 def best_within(grid: list[Prediction], seconds: float) -> Prediction | None:

@@ -63,10 +63,8 @@ class FramesTask(Record):
 
     The answer holds fields of `records.FramePart`, and "unknown": pixels that no reference knows.
 
-    Args:
-        folders: of the models.
-        light: file of the baked light, None where there is none.
-        samples, methods: of the baselines.
+    folders: of the models. light: file of the baked light, None where there is none. samples, methods: of the
+    baselines.
     """
 
     kind: Literal["frames"] = "frames"

@@ -150,12 +150,7 @@ def without_noise(psnr: float, noise: float) -> float:
 class Quality:
     """PSNR of any choice on a scene, dB.
 
-    Args:
-        prior: of all scenes.
-        base: PSNR of the base image alone.
-        gain: of `scene_gain`.
-        judged: of `views_error`.
-        reference: RMSE of the references.
+    base: PSNR of the base image alone. judged: of `views_error`. reference: RMSE of the references.
     """
 
     prior: Prior

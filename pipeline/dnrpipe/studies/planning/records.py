@@ -221,7 +221,6 @@ class Plan(Record):
         gain: dB that the network adds with many views and steps.
         chosen: None where a table was asked for, or where nothing reaches the target.
         table: what each of a row of budgets buys.
-        settings_default: the settings as they are.
         routes: to the wanted frames at ``routes_psnr``, the cheapest first.
         break_even: frames from which on training is cheaper than path tracing; None where it never is.
         train: whether the neural renderer is the cheapest route.

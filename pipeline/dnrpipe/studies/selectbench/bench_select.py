@@ -59,13 +59,9 @@ def run_bench(
     console: Console,
     **more: Any,
 ) -> dict[str, Any]:
-    """Run what is due and write it -> the results. more: fields of `Study`.
+    """`Study.carry_out` with the command's options. more: fields of `Study`.
 
-    Settings come from the preset and these arguments alone, neither from the environment nor from
-    dnrpipe.toml: the command that is kept in the results says all.
-
-    Raises:
-        UserError: unknown names, settings that do not fit. TasksFailed: some cells failed; the others are written.
+    Raises UserError: unknown names, settings that do not fit.
     """
     # Step 2 trains all cells; validation views would cost passes and decide nothing.
     cameras = {"train": CANDIDATES, "val": 0}

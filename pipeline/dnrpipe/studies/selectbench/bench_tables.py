@@ -150,12 +150,6 @@ def _per_scene(figures: Figures, pool: str, budget: int) -> str:
     return f"PSNR by scene, `{pool}`, {budget} views:\n\n{table(['scene', *[f'`{p}`' for p in present]], rows)}"
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Print the report of a results file, or of several together."""
-    runs = [read_results(Path(argument)) for argument in arguments]
-    print(together(runs) if len(runs) > 1 else markdown(runs[0], pictures=False), end="")
-    return 0
-
-
 if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1:]))
+    files = [read_results(Path(argument)) for argument in sys.argv[1:]]
+    print(together(files) if len(files) > 1 else markdown(files[0], pictures=False), end="")

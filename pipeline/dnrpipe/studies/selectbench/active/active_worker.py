@@ -65,11 +65,7 @@ class Members:
         views: all candidates, targets = rasterised images.
         model: the renderer's settings; its ``coarse()`` part is trained.
         step1: learning rates and precision; epochs are those of ``settings``.
-        settings: how many renderers, in how many batches.
-        seed: of all weights and orders.
-        device: torch's.
-        folder: of the runs. An interrupted one is continued.
-        fingerprint: of the caller's inputs.
+        folder: of the runs. An interrupted one is continued where ``fingerprint`` is the same.
     """
 
     views: ViewSet

@@ -48,10 +48,7 @@ def choose_actively(
 ) -> Choice:
     """Choose ``budget`` of the views. Gains of the first third are 0: k-medoids counts in another measure.
 
-    Args:
-        policy: a key of KINDS.
-        views: all candidates, targets = rasterised images.
-        seed: of the variance head.
+    policy: a key of KINDS. views: all candidates, targets = rasterised images. seed: of the variance head.
     """
     kind = KINDS[policy]
     count = kind.MODELS or settings.members
