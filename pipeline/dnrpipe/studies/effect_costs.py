@@ -29,8 +29,7 @@ def override_settings(
     for name in (*enable, *disable, *auto):
         if name not in NAMES:
             raise UserError(f"no effect '{name}'; they are {', '.join(NAMES)}")
-    twice = {name for name in enable if name in disable}
-    if twice:
+    if twice := set(enable) & set(disable):
         raise UserError(f"--enable and --disable {sorted(twice)[0]}: give one of them")
 
     def change(settings: Settings) -> dict[str, Any]:
@@ -82,22 +81,18 @@ def measure_plan(run: Run, plan: EffectPlan) -> EffectPlan:
     workspace, settings = run.workspace, run.settings
     choice = variant_for(plan, settings)
     base = trace_config(workspace, plan, choice.variant)
-    rows: list[tuple[EffectName, dict[str, Any]]] = []
+    tasks: dict[EffectName, dict[str, Any]] = {}
     for effect in plan.effects:
         other = _toggled(run, plan, effect)
-        if other is None:
-            continue
-        config = trace_config(workspace, other, choice.variant)
-        if config == base:
+        if other is None or (config := trace_config(workspace, other, choice.variant)) == base:
             continue
         on, off = (base, config) if effect.on else (config, base)
         views = pilot_views(workspace, settings, plan if plan.on("depth-of-field") else other)
-        task = {"kind": "compare", "with_effect": on, "without_effect": off, "views": views, "spp": MEASURE_SPP}
-        rows.append((effect.name, task))
-    tasks = [task for _, task in rows]
-    results = run_pilots(tasks, choice, run.console, "measuring effects", workspace.log("effects"))
+        compare = {"kind": "compare", "with_effect": on, "without_effect": off, "views": views, "spp": MEASURE_SPP}
+        tasks[effect.name] = compare
+    results = run_pilots(list(tasks.values()), choice, run.console, "measuring effects", workspace.log("effects"))
     measured = {}
-    for (name, _), result in zip(rows, results, strict=True):
+    for name, result in zip(tasks, results, strict=True):
         measured[name] = {key: Measured.model_validate(result[key]) for key in ("cost", "error")}
         device = f"mitsuba {choice.variant}"
         run.book("evaluation", "scene", f"effect/{name}", result["seconds"], device=device)
@@ -110,7 +105,8 @@ def _toggled(run: Run, plan: EffectPlan, effect: Effect) -> EffectPlan | None:
     if effect.part == "neural" or not (effect.present or effect.name in FORCEABLE):
         return None
     chosen = run.settings.effects
-    enable, disable = ([name for name in names if name != effect.name] for names in (chosen.enable, chosen.disable))
+    enable: list[EffectName] = [name for name in chosen.enable if name != effect.name]
+    disable: list[EffectName] = [name for name in chosen.disable if name != effect.name]
     (disable if effect.on else enable).append(effect.name)
     return plan_of(run.workspace, run.settings, enable=enable, disable=disable, pilot=plan.pilot)
 

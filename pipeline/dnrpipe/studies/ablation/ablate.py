@@ -139,10 +139,10 @@ class Ablation(Study[tuple[str, str, int]]):
             return step1[scene.name, row.name].result().selected
         if row.views == "all":
             return list(scene.train)
-        names, budget = list(scene.train), row.budget or self.base.select.budget
+        budget = row.budget or self.base.select.budget
         # Farthest points are the same views for every seed.
         chosen = choose_by_pose(list(scene.train.values()), row.views, budget, seed if row.views == "random" else 0)
-        return [names[place] for place in chosen]
+        return [view.name for view in chosen]
 
     def settings_of(self, row: Row, scene: Scene | None = None) -> Settings:
         """The row's settings; with a scene, without what its effect plan leaves off."""

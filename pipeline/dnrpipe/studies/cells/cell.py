@@ -234,8 +234,8 @@ def _record(folder: Path) -> ModelRecord:
 def training_cost(folder: Path) -> TrainingCost:
     """Sums over all epochs, those of an interrupted run included, and what the choice at the end took."""
     record = _record(folder)
-    names = ("seconds", "cpu_seconds", "steps", "skipped")
-    cost: dict[str, Any] = {name: sum(getattr(epoch, name) for epoch in record.history) for name in names}
-    for name, value in record.choosing.items():
-        cost[name] += value
+    cost: dict[str, Any] = {
+        name: sum(getattr(epoch, name) for epoch in record.history) + record.choosing.get(name, 0)
+        for name in TrainingCost.model_fields
+    }
     return TrainingCost(**cost)

@@ -51,14 +51,14 @@ class Scene:
         return Run(self.workspace, settings, self.console, stage, self.run_id)
 
 
-def choose_by_pose(views: Sequence[View], policy: str, budget: int, seed: int) -> list[int]:
-    """Places of the views that a rule of poses alone chooses: ``farthest`` or ``random``."""
+def choose_by_pose(views: Sequence[View], policy: str, budget: int, seed: int) -> list[View]:
+    """The views that a rule of poses alone chooses: ``farthest`` or ``random``."""
     from dnrtrain.selector.policies import untrained
     from dnrtrain.selector.protocol import Candidates
 
     rule = untrained(policy)
     assert rule is not None  # both names above are rules
-    return rule.choose(Candidates.of_views(views), budget, seed).views
+    return [views[place] for place in rule.choose(Candidates.of_views(views), budget, seed).views]
 
 
 def without_left_out(workspace: Workspace, settings: Settings) -> Settings:

@@ -77,16 +77,13 @@ def settle_frames(points: Sequence[Point]) -> list[Point]:
     Points of one model share the network's least milliseconds: they run the same operations, and other work on the
     machine only adds to them.
     """
-    least: dict[bool, float] = {}
-    for point in points:
-        if point.network_ms:
-            paper = point.kind == "paper"
-            least[paper] = min(point.network_ms, least.get(paper, point.network_ms))
-    networks = [least[point.kind == "paper"] if point.network_ms else 0.0 for point in points]
-    return [
-        point.model_copy(update={"frame_ms": point.base_ms + network})
-        for point, network in zip(points, networks, strict=True)
-    ]
+
+    def network_ms(point: Point) -> float:
+        model = point.kind == "paper"
+        return min(p.network_ms for p in points if p.network_ms and (p.kind == "paper") == model)
+
+    frames = [point.base_ms + (network_ms(point) if point.network_ms else 0.0) for point in points]
+    return [point.model_copy(update={"frame_ms": ms}) for point, ms in zip(points, frames, strict=True)]
 
 
 def break_evens(points: Sequence[Point], baselines: Sequence[BaselinePoint]) -> list[Point]:

@@ -337,8 +337,6 @@ def _views(workspace: Workspace) -> tuple[list[View], list[View]]:
     splits = split_views(workspace)
     views = splits["train"]
     chosen = choose_by_pose(views, "farthest", min(VIEWS, len(views)), 0)
-    others = [view for i, view in enumerate(views) if i not in set(chosen)]
-    left = splits.get("test") or splits.get("val") or others or views
-    step = max(1, len(left) // HELD_OUT)
-    pick = left[::step][:HELD_OUT]
-    return [scaled_to(views[i], RESOLUTION) for i in chosen], [scaled_to(view, RESOLUTION) for view in pick]
+    left = splits.get("test") or splits.get("val") or [view for view in views if view not in chosen] or views
+    others = left[:: max(1, len(left) // HELD_OUT)][:HELD_OUT]
+    return [scaled_to(view, RESOLUTION) for view in chosen], [scaled_to(view, RESOLUTION) for view in others]
