@@ -34,7 +34,7 @@ from ..cells.scenes import (
     without_left_out,
 )
 from ..cells.study import CELL_WORKER, Study
-from ..cells.tasks import CellTask, Step1Task, once
+from ..cells.tasks import CellTask, Step1Task
 from .ablation_plots import contact_sheet, plot
 from .ablation_tables import SCHEMA, markdown
 from .rows import Row, choose_rows, needs_base, needs_coarse, settings_of, step1_policy
@@ -103,7 +103,7 @@ class Ablation(Study[tuple[str, str, int]]):
                 if needs_coarse(row, settings):
                     seconds = None if row.full_step1 or not self.seconds else STEP1_SHARE * self.seconds
                     step1[scene.name, row.name] = self.step1_task(scene, settings, step1_policy(row), seed, seconds)
-        self.worker_pool.work(f"step 1, seed {seed}", CELL_WORKER, once(step1.values()))
+        self.worker_pool.work(f"step 1, seed {seed}", CELL_WORKER, step1.values())
         for scene in self.scenes:
             self._plan_scene(scene, seed, step1)
 

@@ -12,7 +12,7 @@ Every file is named by the fingerprint of all that decides it, so that a run may
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
@@ -31,7 +31,7 @@ from ...workers.view_tasks import TasksFailed, worker_count
 from .cell import CELL_VERSION
 from .provenance import code_state, made_by
 from .scenes import Scene, traced_split
-from .tasks import CellTask, PoolTask, Step1Task, files_of, once
+from .tasks import CellTask, PoolTask, Step1Task, files_of
 
 CELL_WORKER = "dnrpipe.studies.cells.cell"
 Place = TypeVar("Place")
@@ -47,18 +47,21 @@ class WorkerPool:
     log: Path
     console: Console
 
-    def work(self, label: str, module: str, tasks: Sequence[PoolTask]) -> None:
-        """Run the tasks whose ``output`` file is missing on workers of ``module``.
+    def work(self, label: str, module: str, tasks: Iterable[PoolTask]) -> None:
+        """Run the tasks whose ``output`` file is missing on workers of ``module``; of several for one file the first.
 
         Raises TasksFailed after all others are done.
         """
-        due = [task.model_dump(mode="json") for task in tasks if not task.output.exists()]
+        once: dict[Path, PoolTask] = {}
+        for task in tasks:
+            once.setdefault(task.output, task)
+        due = [task.model_dump(mode="json") for task in once.values() if not task.output.exists()]
         if not due:
             return
         threads = {name: str(self.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")} if self.threads else {}
         common = {"threads": self.threads, "device": self.device}
         failed: list[str] = []
-        with self.console.bar(label, len(tasks), len(tasks) - len(due)) as bar:
+        with self.console.bar(label, len(once), len(once) - len(due)) as bar:
             for outcome in answers(
                 module,
                 common,
@@ -149,8 +152,8 @@ class Study(ABC, Generic[Place]):
     def run_seed(self, seed: int) -> None:
         """Make the seed's cells."""
         self.plan_cells(seed)
-        due = once(task for task in self.cells.values() if task.seed == seed)
-        self.worker_pool.work(f"cells, seed {seed}", CELL_WORKER, due)
+        tasks = [task for task in self.cells.values() if task.seed == seed]
+        self.worker_pool.work(f"cells, seed {seed}", CELL_WORKER, tasks)
 
     @abstractmethod
     def plan_cells(self, seed: int) -> None:

@@ -7,9 +7,8 @@ Seconds are wall seconds of training; ``cpu_seconds`` are the processor's.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal
 
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, TypeAdapter
 
@@ -69,17 +68,6 @@ class FileWorker(ABC):
     @abstractmethod
     def answer(self, task: Any) -> BaseModel:
         """What the file will hold; fields that were not given are left out."""
-
-
-Fingerprinted = TypeVar("Fingerprinted", bound=StudyTask)
-
-
-def once(tasks: Iterable[Fingerprinted]) -> list[Fingerprinted]:
-    """The first task of each fingerprint."""
-    found: dict[str, Fingerprinted] = {}
-    for task in tasks:
-        found.setdefault(task.fingerprint, task)
-    return list(found.values())
 
 
 def files_of(folder: Path, fingerprint: str) -> dict[str, Any]:

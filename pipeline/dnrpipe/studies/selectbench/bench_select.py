@@ -10,6 +10,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
@@ -26,7 +27,7 @@ from ..cells.measure import METRICS, mean_of, written_seconds
 from ..cells.request import SMOKE_RUN, SMOKE_SCENE, merged
 from ..cells.scenes import base_files, find_scenes, make_bases, trace_references, trace_train, without_left_out
 from ..cells.study import CELL_WORKER, Study
-from ..cells.tasks import CellTask, ChoiceFile, Step1Task, StudyTask, files_of, once
+from ..cells.tasks import CellTask, ChoiceFile, Step1Task, files_of
 from .active.settings import ActiveSettings, ActiveTask
 from .bench_plots import plot
 from .bench_tables import SCHEMA, markdown
@@ -150,28 +151,24 @@ class Bench(Study[Place]):
     def plan_cells(self, seed: int) -> None:
         starts: dict[Place, Step1Task] = {}
         chosen: dict[Place, ChoiceTask] = {}
-        for pool in self.pools.values():
-            for budget in self.budgets:
-                for contender in self.policies:
-                    place = Place(pool.scene, pool.name, budget, contender.name, seed)
-                    settings = settings_of(contender, self._settings(pool), budget)
-                    chosen[place] = task = self._choice_task(pool, contender, settings, seed)
-                    if settings.starts_coarse:
-                        coarse = isinstance(task, Step1Task)
-                        starts[place] = task if coarse else self.step1_task(pool.data, settings, SHARED_COARSE, seed)
-        tasks = [*chosen.values(), *starts.values()]
-        self._work(f"selections, seed {seed}", "dnrpipe.studies.selectbench.rule_worker", tasks, RuleTask)
-        active = "dnrpipe.studies.selectbench.active.active_worker"
-        self._work(f"active selections, seed {seed}", active, tasks, ActiveTask)
-        self._work(f"step 1, seed {seed}", CELL_WORKER, tasks, Step1Task)
+        for pool, budget, contender in itertools.product(self.pools.values(), self.budgets, self.policies):
+            place = Place(pool.scene, pool.name, budget, contender.name, seed)
+            settings = settings_of(contender, self._settings(pool), budget)
+            chosen[place] = task = self._choice_task(pool, contender, settings, seed)
+            if settings.starts_coarse:
+                coarse = isinstance(task, Step1Task)
+                starts[place] = task if coarse else self.step1_task(pool.data, settings, SHARED_COARSE, seed)
+        for label, worker, kind in (
+            ("selections", "dnrpipe.studies.selectbench.rule_worker", RuleTask),
+            ("active selections", "dnrpipe.studies.selectbench.active.active_worker", ActiveTask),
+            ("step 1", CELL_WORKER, Step1Task),
+        ):
+            tasks = [task for task in (*chosen.values(), *starts.values()) if isinstance(task, kind)]
+            self.worker_pool.work(f"{label}, seed {seed}", worker, tasks)
         self.chosen |= chosen
         for pool in self.pools.values():
             places = [place for place in chosen if (place.scene, place.pool) == (pool.scene, pool.name)]
             self._plan_pool(pool, places, starts)
-
-    def _work(self, label: str, module: str, tasks: Sequence[StudyTask], kind: type[StudyTask]) -> None:
-        """Run the tasks of a kind."""
-        self.worker_pool.work(label, module, once(task for task in tasks if isinstance(task, kind)))
 
     def _choice_task(self, pool: Pool, contender: Contender, settings: Settings, seed: int) -> ChoiceTask:
         """A selection by the contender's policy."""
