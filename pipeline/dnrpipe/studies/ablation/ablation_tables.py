@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import operator
 import statistics
@@ -41,9 +42,7 @@ PER_SCENE = (("psnr", "PSNR, dB", 2), ("psnr_mask", "PSNR inside the mask, dB", 
 BASELINES = ("vanilla", "paper")
 
 
-def read_results(path: Path) -> dict[str, Any]:
-    """``results.json`` of an ablation. Raises UserError: missing, damaged or of another schema."""
-    return read_made(path, "ablate", SCHEMA, "cells")
+read_results = functools.partial(read_made, command="ablate", schema=SCHEMA, part="cells")
 
 
 class Figures:

@@ -9,9 +9,9 @@ import functools
 import json
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 from filelock import FileLock
 from pydantic import Field, TypeAdapter
@@ -31,8 +31,6 @@ from .tasks import CellResult, CellTask, FileWorker, Step1Result, Step1Task, Tra
 if TYPE_CHECKING:
     from dnrtrain.dataset import Base, ViewSet
     from dnrtrain.records import Epoch, ModelRecord
-
-Task = TypeVar("Task", Step1Task, CellTask)
 
 CELL_VERSION = 2  # raise when training or measuring changes what a cell holds, or what fingerprints hash
 STEP1_SHARE = 1 / 3
@@ -57,31 +55,15 @@ class Worker(FileWorker):
         """The coarse model on rasterised candidates, and the views its policy chooses."""
         settings = task.settings
         if task.seconds is not None:
-            limit = max(1, int(task.seconds / self._pace(task, self._train_step1)))
+            limit = max(1, int(task.seconds / self._pace(task)))
             settings = _with_epochs(settings, min(limit, settings.select.step1.epochs))
-        events = self._train_step1(task, settings, task.folder)
+        events = self._events(task, settings, task.folder)
         selected = next(event for event in events if isinstance(event, Selected))
         return Step1Result(
             key=task.fingerprint,
             selected=selected.views,
             epochs=settings.select.step1.epochs,
             **training_cost(task.folder).model_dump(),
-        )
-
-    def _train_step1(self, task: Step1Task, settings: Settings, folder: Path) -> Iterator[Event]:
-        from dnrtrain.step1 import run_step1
-
-        return run_step1(
-            self.views(task.workspace, "train", raytraced=False, base="none"),
-            None,
-            settings.model,
-            settings.select.step1,
-            policy=task.policy,
-            budget=settings.select.budget,
-            seed=task.seed,
-            device=self.device,
-            checkpoints=folder,
-            fingerprint=task.fingerprint,
         )
 
     def _cell(self, task: CellTask) -> CellResult:
@@ -121,7 +103,7 @@ class Worker(FileWorker):
         settings, coarse = task.settings, task.coarse_cost
         pace = None
         if task.seconds is not None:
-            pace = self._pace(task, self._train_step2)
+            pace = self._pace(task)
             spent = STEP1_SHARE * task.seconds if task.full_step1 else self._clock(coarse) if coarse else 0.0
             left = task.seconds - spent
             if left < pace:
@@ -130,7 +112,7 @@ class Worker(FileWorker):
                     f" takes {pace:.1f} s; give more"
                 )
             settings = _with_epochs(settings, int(left / pace))
-        for _ in self._train_step2(task, settings, task.folder):
+        for _ in self._events(task, settings, task.folder):
             pass
         cost = training_cost(task.folder)
         return Training(
@@ -143,13 +125,13 @@ class Worker(FileWorker):
             perceptual=self.weights is not None,
         )
 
-    def _pace(self, task: Task, train: Callable[[Task, Settings, Path], Iterator[Event]]) -> float:
+    def _pace(self, task: Step1Task | CellTask) -> float:
         """Seconds of one epoch: the second of two (the first warms up), kept for the row's other seeds."""
         task.pace.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(f"{task.pace}.lock"):  # cells side by side train by one figure, not by one each
             if not task.pace.exists():
                 scratch = task.folder.with_name(f"{task.folder.name}.pace")
-                for _ in train(task, _with_epochs(task.settings, 2), scratch):
+                for _ in self._events(task, _with_epochs(task.settings, 2), scratch):
                     pass
                 last = _record(scratch).history[-1]
                 shutil.rmtree(scratch)
@@ -160,28 +142,23 @@ class Worker(FileWorker):
         """Seconds of training; on a CPU by processor time, which other work on the machine does not stretch."""
         return cost.cpu_seconds / self.threads if self.device == "cpu" else cost.seconds
 
-    def _train_step2(self, task: CellTask, settings: Settings, folder: Path) -> Iterator[Event]:
+    def _events(self, task: Step1Task | CellTask, settings: Settings, folder: Path) -> Iterator[Event]:
+        """Train the task's step into ``folder``."""
+        from dnrtrain.step1 import run_step1
         from dnrtrain.step2 import run_step2
 
-        return run_step2(
-            self.views(
-                task.workspace,
-                "train",
-                tuple(task.views),
-                raytraced=True,
-                base=settings.model.base,
-                targets=task.targets,
-            ),
-            None,
-            task.coarse or folder,  # not read by a fresh start
-            settings.model,
-            settings.finetune.step2,
-            seed=task.seed,
-            device=self.device,
-            checkpoints=folder,
-            fingerprint=task.fingerprint,
-            weights=self.weights,
+        run: dict[str, Any] = {"seed": task.seed, "device": self.device, "checkpoints": folder}
+        run["fingerprint"] = task.fingerprint
+        model, step1, step2 = settings.model, settings.select.step1, settings.finetune.step2
+        if isinstance(task, Step1Task):
+            views = self.views(task.workspace, "train", raytraced=False, base="none")
+            return run_step1(views, None, model, step1, policy=task.policy, budget=settings.select.budget, **run)
+        names = tuple(task.views)
+        views = self.views(
+            task.workspace, "train", names, raytraced=True, base=settings.model.base, targets=task.targets
         )
+        coarse = task.coarse or folder  # not read by a fresh start
+        return run_step2(views, None, coarse, model, step2, weights=self.weights, **run)
 
 
 def load_cell_views(

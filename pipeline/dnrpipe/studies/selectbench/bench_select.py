@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
@@ -45,6 +45,7 @@ SMOKE: dict[str, Any] = {
 SMOKE_REQUEST = {"pools": "dome,path", "budgets": "2,4", "policies": "random,farthest,kmedoids"}
 CORE = {"pools": "all", "budgets": "10,25", "policies": "core"}
 CANDIDATES = 100
+_written_seconds = functools.cache(written_seconds)  # results are written after every seed
 
 
 def run_bench(
@@ -130,7 +131,6 @@ class Bench(Study[Place]):
     policies: list[Contender]
     pools: dict[tuple[str, str], Pool] = field(default_factory=dict, init=False)
     chosen: dict[Place, ChoiceTask] = field(default_factory=dict, init=False)
-    written_seconds: Callable[..., float] = field(default_factory=lambda: functools.cache(written_seconds), init=False)
 
     def open_scenes(self) -> None:
         places = [(source, name) for source in self.sources for name in self.pool_names]
@@ -255,7 +255,7 @@ class Bench(Study[Place]):
         files += base_files(workspace, cell.base, "train", cell.views)
         seconds = {
             "select_seconds": getattr(choice, clock),
-            "view_seconds": sum(self.written_seconds(file, clock) for file in files),
+            "view_seconds": sum(_written_seconds(file, clock) for file in files),
             "train_seconds": train,
         }
         return {

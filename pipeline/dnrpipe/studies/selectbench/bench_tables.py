@@ -5,6 +5,7 @@ With several files, runs on other scenes with the same pools, one table of all o
 
 from __future__ import annotations
 
+import functools
 import statistics
 import sys
 from collections.abc import Mapping, Sequence
@@ -21,9 +22,7 @@ METRICS = (("psnr", "PSNR", 2), ("psnr_mask", "PSNR in mask", 2), ("ssim", "SSIM
 TIMES = (("select_seconds", "selection, s", 2), ("total_seconds", "total, s", 0))
 
 
-def read_results(path: Path) -> dict[str, Any]:
-    """``results.json`` of a benchmark. Raises UserError: missing, damaged or of another schema."""
-    return read_made(path, "bench-select", SCHEMA, "pools")
+read_results = functools.partial(read_made, command="bench-select", schema=SCHEMA, part="pools")
 
 
 def markdown(results: Mapping[str, Any], *, pictures: bool = True) -> str:
