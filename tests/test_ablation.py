@@ -21,7 +21,7 @@ from dnrpipe.core.settings import Settings, resolve
 from dnrpipe.studies.ablation.ablation_tables import Figures, markdown, ratio
 from dnrpipe.studies.ablation.rows import CLASSIC as CLASSIC_SIZES
 from dnrpipe.studies.ablation.rows import GROUPS, ROWS, choose_rows, needs_coarse, settings_of
-from dnrpipe.studies.cells.markdown import spread
+from dnrpipe.studies.cells.results import spread
 from dnrpipe.studies.cells.scenes import BENCHMARK, find_scenes
 
 CLASSIC = [row for row in ROWS.values() if row.family == "classic"]

@@ -11,12 +11,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..cells.markdown import NONE, made_line, spread, table
-from ..cells.provenance import read_made
+from ..cells.results import NONE, made_line, read_made, spread, table
 from ..cells.scenes import HARD_LIGHT
 from .rows import ROWS
 
 SCHEMA = 1
+read_results = functools.partial(read_made, command="ablate", schema=SCHEMA, part="cells")
 # Wu, Li, Wei: DNRSelect, table I (25 views, NeRF-Synthetic, 800²): PSNR, SSIM, LPIPS.
 PUBLISHED = {
     "full": (28.12, 0.8506, 0.0479),
@@ -40,9 +40,6 @@ COLUMNS: tuple[tuple[str, str, int], ...] = (
 PER_SCENE = (("psnr", "PSNR, dB", 2), ("psnr_mask", "PSNR inside the mask, dB", 2), ("ssim", "SSIM", 4),
              ("lpips_vgg", "LPIPS (VGG)", 4))  # fmt: skip
 BASELINES = ("vanilla", "paper")
-
-
-read_results = functools.partial(read_made, command="ablate", schema=SCHEMA, part="cells")
 
 
 class Figures:

@@ -44,7 +44,6 @@ class Worker(FileWorker):
 
     def __init__(self, common: dict[str, Any]) -> None:
         super().__init__(common)
-        self.device = common["device"]
         self.views = functools.lru_cache(maxsize=KEPT_SETS)(load_cell_views)
         self.weights = perceptual_weights(None)  # the parent has told; fingerprints of cells hold whether there are any
 

@@ -142,8 +142,18 @@ def make_bases(scene: Scene, settings: Settings, train: Sequence[str]) -> dict[s
     """
     workspace = scene.workspace
     if settings.model.base == "raster":
+        choice = read_raster_choice(workspace)
+        assert choice is not None, "stage prepare has chosen one"
+        tasks = draw_passes(
+            scene.run(settings, "prepare"),
+            "rasterised test views",
+            list(scene.test.values()),
+            [raster_file(workspace, name) for name in scene.test],
+            choice.engine,
+            raster=[True] * len(scene.test),
+        )
         drawn = {f"train/{name}": scene.inputs for name in train}  # by `prepare`
-        return drawn | {f"test/{name}": made for name, made in _raster_test_views(scene, settings).items()}
+        return drawn | {f"test/{name}": task["fingerprint"] for name, task in zip(scene.test, tasks, strict=True)}
     chosen = {"train": [scene.train[name] for name in train], "test": list(scene.test.values())}
     made = {}
     for split, views in chosen.items():
@@ -169,20 +179,6 @@ def base_files(workspace: Workspace, kind: str, split: str, views: Iterable[str]
 def raster_file(workspace: Workspace, view: str) -> Path:
     """Where a test view's passes with rasterised colour lie (`prepare` leaves that colour out)."""
     return workspace.root / "base" / "raster-test" / f"{view}.exr"
-
-
-def _raster_test_views(scene: Scene, settings: Settings) -> dict[str, str]:
-    chosen = read_raster_choice(scene.workspace)
-    assert chosen is not None, "stage prepare has chosen one"
-    tasks = draw_passes(
-        scene.run(settings, "prepare"),
-        "rasterised test views",
-        list(scene.test.values()),
-        [raster_file(scene.workspace, name) for name in scene.test],
-        chosen.engine,
-        raster=[True] * len(scene.test),
-    )
-    return {name: task["fingerprint"] for name, task in zip(scene.test, tasks, strict=True)}
 
 
 def _trace(run: Run, views: list[View], split: str, spp: int | None = None) -> dict[str, str]:

@@ -29,7 +29,7 @@ from ...stages.trainer import perceptual_weights, torch_device
 from ...workers.answers import answers, warn_of_retries
 from ...workers.view_tasks import TasksFailed, worker_count
 from .cell import CELL_VERSION
-from .provenance import code_state, made_by
+from .results import code_state, made_by
 from .scenes import Scene, traced_split
 from .tasks import CellTask, PoolTask, Step1Task, files_of
 

@@ -48,7 +48,10 @@ class TrainingTask(StudyTask):
 
 
 class FileWorker(ABC):
-    """A worker that writes each answer to its task's ``output``. common["threads"]: of torch, 0 = its own choice."""
+    """A worker that writes each answer to its task's ``output``.
+
+    common: "threads" of torch, 0 = its own choice, and its "device".
+    """
 
     TASK: ClassVar[TypeAdapter[Any]]
     """What it is asked."""
@@ -58,7 +61,7 @@ class FileWorker(ABC):
 
         if common["threads"]:
             torch.set_num_threads(common["threads"])
-        self.threads = torch.get_num_threads()
+        self.threads, self.device = torch.get_num_threads(), common["device"]
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
         made = self.answer(self.TASK.validate_python(task)).model_dump(mode="json", by_alias=True, exclude_unset=True)

@@ -23,7 +23,7 @@ from ...stages.stage import Run
 from ...workers.view_tasks import worker_count
 from ..ablation.ablate import Ablation
 from ..ablation.rows import CLASSIC, ROWS, Row, ViewChoice
-from ..cells.provenance import made_by
+from ..cells.results import made_by
 from ..cells.scenes import Scene, prepared, without_left_out
 from ..cells.study import WorkerPool
 from .frontier_plots import plot

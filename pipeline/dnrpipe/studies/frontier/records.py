@@ -13,7 +13,7 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 from ...blender.tasks import CyclesTask
 from ...core.errors import UserError
 from ...core.settings import Settings
-from ..cells.provenance import read_made
+from ..cells.results import read_made
 from ..cells.tasks import PoolTask
 
 SCHEMA = 1
@@ -102,7 +102,7 @@ CYCLES_PREFIX = "Cycles "
 
 
 class FrontierResults(Record):
-    """``frontier/results.json``. The first fields are of `provenance.made_by`.
+    """``frontier/results.json``. The first fields are of `results.made_by`.
 
     Args:
         sweep: fields of `measure_frontier.Sweep`.

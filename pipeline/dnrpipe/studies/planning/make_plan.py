@@ -73,12 +73,15 @@ def make_predictor(workspace: Workspace, settings: Settings, pilot: Pilot, prior
     light = renderer.light
     due = None if light is None or renderer.light_is_baked else (light["size"], light["spp"])
     width, height = settings.cameras.width, settings.cameras.height
+    splits = split_views(workspace)
+    trains = policy_of(workspace, settings) in TRAINED_NAMES or settings.starts_coarse
+    steps = settings.select.step1.epochs * len(splits["train"])
     work = Work(
         pixels=width * height,
         trained=trained_pixels(settings, width, height),
         light=due,
-        policy_seconds=_policy_seconds(workspace, settings, training.seconds),
-        tests=len(split_views(workspace).get("test", [])),
+        policy_seconds=steps * training.seconds if trains else RULE_SECONDS,  # steps as long as the pilot's
+        tests=len(splits.get("test", [])),
         evaluation_spp=trace.evaluation_spp,
     )
     base, noise = frames.base.psnr, noise_at(pilot.trace, training.spp)
@@ -170,10 +173,3 @@ def _carried_out(workspace: Workspace, plan: Plan) -> Prediction | None:
     same = before.wanted == plan.wanted and before.policy == plan.policy
     same = same and before.pilot.fingerprint == plan.pilot.fingerprint
     return before.carried_out if same and before.chosen.choice == plan.chosen.choice else None
-
-
-def _policy_seconds(workspace: Workspace, settings: Settings, step_seconds: float) -> float:
-    """Of the selection. A trained policy's steps are taken to last as long as the pilot's."""
-    if policy_of(workspace, settings) not in TRAINED_NAMES and not settings.starts_coarse:
-        return RULE_SECONDS
-    return settings.select.step1.epochs * len(split_views(workspace)["train"]) * step_seconds

@@ -12,17 +12,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..cells.markdown import NONE, made_line, spread, table
-from ..cells.provenance import read_made
+from ..cells.results import NONE, made_line, read_made, spread, table
 from .figures import LEVEL, SPHERICAL, Difference, Figures
 from .pools import POOLS
 
 SCHEMA = 1
+read_results = functools.partial(read_made, command="bench-select", schema=SCHEMA, part="pools")
 METRICS = (("psnr", "PSNR", 2), ("psnr_mask", "PSNR in mask", 2), ("ssim", "SSIM", 4), ("lpips_vgg", "LPIPS VGG", 4))
 TIMES = (("select_seconds", "selection, s", 2), ("total_seconds", "total, s", 0))
-
-
-read_results = functools.partial(read_made, command="bench-select", schema=SCHEMA, part="pools")
 
 
 def markdown(results: Mapping[str, Any], *, pictures: bool = True) -> str:

@@ -30,10 +30,6 @@ CLOCKS = ("seconds", "cpu_seconds")
 class Worker(FileWorker):
     TASK = TypeAdapter(ActiveTask)
 
-    def __init__(self, common: dict[str, Any]) -> None:
-        super().__init__(common)
-        self.device = common["device"]
-
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
         made = super().__call__(task)
         shutil.rmtree(Path(task["folder"]), ignore_errors=True)

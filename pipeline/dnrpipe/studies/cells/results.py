@@ -1,4 +1,4 @@
-"""What a results file says of its making: command, commit, date, machine, versions."""
+"""What a results file says of its making, and Markdown helpers of the studies' tables."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ import json
 import os
 import platform
 import shlex
+import statistics
 import subprocess
 import sys
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -19,6 +21,7 @@ from ...core.errors import UserError
 from ...workers.view_tasks import worker_count
 
 PACKAGES = ("dnrpipe", "torch", "numpy", "mitsuba", "bpy", "flip-evaluator")
+NONE = "–"
 SOURCE = Path(__file__).resolve().parents[4]
 
 
@@ -81,3 +84,35 @@ def _git(*arguments: str) -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()
+
+
+# -- Markdown ----------------------------------------------------------------------------------------------
+
+
+def spread(values: Sequence[float], digits: int, *, signed: bool = False) -> str:
+    """``mean ± standard deviation`` (of the sample) over seeds; the mean alone where there is one seed."""
+    if not values:
+        return NONE
+    text = f"{statistics.fmean(values):{'+' if signed else ''}.{digits}f}"
+    return f"{text} ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else text
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table; all columns but the first are right-aligned."""
+    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def made_line(results: Mapping[str, Any]) -> str:
+    """How the results were made: command, date, commit and those of its cells where they differ, machine, preset."""
+    box, state = results["machine"], f"commit {(results['commit'] or 'unknown')[:12]}"
+    if results["dirty"]:
+        state += " with changes"
+    commits = sorted({cell["commit"] for cell in results["cells"] if cell["commit"]})
+    if len(commits) > 1:
+        state += f" (cells of {len(commits)} commits: {', '.join(commit[:12] for commit in commits)})"
+    return (
+        f"`{results['command']}`, {results['date'][:10]}, {state}; {box['processor']},"
+        f" {box['cores']} cores, torch {results['versions']['torch']}. Preset"
+        f" {results['preset']}, {results['resolution']}"
+    )
