@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 CELL_VERSION = 2  # raise when training or measuring changes what a cell holds, or what fingerprints hash
 STEP1_SHARE = 1 / 3
 """Share of the training time that step 1 may take where all rows train equally long."""
-KEPT_SETS = 8
-"""Sets of views in memory; a cell needs two."""
 
 
 class Worker(FileWorker):
@@ -44,7 +42,7 @@ class Worker(FileWorker):
 
     def __init__(self, common: dict[str, Any]) -> None:
         super().__init__(common)
-        self.views = functools.lru_cache(maxsize=KEPT_SETS)(load_cell_views)
+        self.views = functools.lru_cache(maxsize=8)(load_cell_views)  # a cell needs two
         self.weights = perceptual_weights(None)  # the parent has told; fingerprints of cells hold whether there are any
 
     def answer(self, task: Step1Task | CellTask) -> Step1Result | CellResult:

@@ -168,8 +168,8 @@ def _carried_out(workspace: Workspace, plan: Plan) -> Prediction | None:
         before = read_plan(workspace.root)
     except UserError:  # truncated, or of another version
         return None
-    if before is None or before.chosen is None or plan.chosen is None:
-        return None
-    same = before.wanted == plan.wanted and before.policy == plan.policy
-    same = same and before.pilot.fingerprint == plan.pilot.fingerprint
-    return before.carried_out if same and before.chosen.choice == plan.chosen.choice else None
+
+    def decisive(one: Plan) -> tuple[Any, ...]:
+        return one.wanted, one.policy, one.pilot.fingerprint, one.chosen and one.chosen.choice
+
+    return before.carried_out if before is not None and decisive(before) == decisive(plan) else None

@@ -78,13 +78,11 @@ class Figures:
 
 @dataclass(frozen=True)
 class Difference:
-    """Mean of paired differences, half the width of its interval (None where one unit is all there is), units,
-    their kind, and the mean of each scene."""
+    """Mean of paired differences, half the width of its interval (None where one unit is all there is), and the mean
+    of each scene."""
 
     mean: float
     half: float | None
-    units: int
-    over: str
     scenes: dict[str, float]
 
     @property
@@ -101,10 +99,8 @@ def summarise(differences: Mapping[tuple[str, int], float], level: float = LEVEL
     for (scene, _), value in differences.items():
         by_scene.setdefault(scene, []).append(value)
     means = {scene: statistics.fmean(values) for scene, values in by_scene.items()}
-    single = len(means) == 1
-    units = next(iter(by_scene.values())) if single else list(means.values())
-    half = half_width(units, level)
-    return Difference(statistics.fmean(units), half, len(units), "seeds" if single else "scenes", means)
+    units = next(iter(by_scene.values())) if len(means) == 1 else list(means.values())
+    return Difference(statistics.fmean(units), half_width(units, level), means)
 
 
 def half_width(values: Sequence[float], level: float = LEVEL) -> float | None:
