@@ -130,7 +130,7 @@ class Worker(FileWorker):
                 scratch = task.folder.with_name(f"{task.folder.name}.pace")
                 for _ in self._events(task, _with_epochs(task.settings, 2), scratch):
                     pass
-                last = _record(scratch).history[-1]
+                last = finished_record(scratch).history[-1]
                 shutil.rmtree(scratch)
                 write_json(task.pace, self._clock(last))
         return float(json.loads(task.pace.read_text()))
@@ -197,17 +197,18 @@ def _with_epochs(settings: Settings, epochs: int) -> Settings:
     return changed
 
 
-def _record(folder: Path) -> ModelRecord:
+def finished_record(folder: Path) -> ModelRecord:
+    """Of a training that has just finished."""
     from dnrtrain.checkpoint import read_record
 
     record = read_record(folder)
-    assert record is not None  # its step has just finished
+    assert record is not None
     return record
 
 
 def training_cost(folder: Path) -> TrainingCost:
     """Sums over all epochs, those of an interrupted run included, and what the choice at the end took."""
-    record = _record(folder)
+    record = finished_record(folder)
     cost: dict[str, Any] = {
         name: sum(getattr(epoch, name) for epoch in record.history) + record.choosing.get(name, 0)
         for name in TrainingCost.model_fields

@@ -21,6 +21,7 @@ from ...core.scene_files import read_frame
 from ...core.settings import Settings
 from ...core.workspace import Workspace
 from ...stages.trainer import perceptual_weights, torch_device
+from ..cells.cell import finished_record
 from .records import Record
 
 if TYPE_CHECKING:
@@ -99,7 +100,6 @@ class Worker:
         return found[-1] | {"steps": [one["steps"] for one in found], "threads": self.threads}
 
     def _train_one(self, task: TrainTask, weights: Any, folder: Path, epochs: int) -> dict[str, Any]:
-        from dnrtrain.checkpoint import read_record
         from dnrtrain.dataset import load_views
         from dnrtrain.events import EpochEnd
         from dnrtrain.step2 import run_step2
@@ -138,9 +138,7 @@ class Worker:
                 last = now
         took = time.monotonic() - started
         between, cpu_between = np.maximum(0.0, np.median(gaps, axis=0)).tolist()
-        record = read_record(folder)
-        assert record is not None  # training has just finished
-        history = record.history
+        history = finished_record(folder).history
         later = history[1:] or history  # the first epoch warms up
         steps = sum(entry.steps for entry in later)
         booked = sum(entry.seconds for entry in history)

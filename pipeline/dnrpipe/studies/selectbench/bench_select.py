@@ -28,10 +28,9 @@ from ..cells.request import SMOKE_RUN, SMOKE_SCENE, merged
 from ..cells.scenes import base_files, find_scenes, make_bases, trace_references, trace_train, without_left_out
 from ..cells.study import CELL_WORKER, Study
 from ..cells.tasks import CellTask, ChoiceFile, Step1Task, files_of
-from .active.settings import ActiveSettings, ActiveTask
 from .bench_plots import plot
 from .bench_tables import SCHEMA, markdown
-from .policies import Contender, choose_policies, rules_fingerprint, settings_of
+from .policies import ActiveSettings, ActiveTask, Contender, choose_policies, rules_fingerprint, settings_of
 from .pools import Pool, choose_pools, place_pool, share_light
 from .rule_worker import RuleTask
 

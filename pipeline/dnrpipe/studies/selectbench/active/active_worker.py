@@ -21,10 +21,10 @@ from dnrtrain.step1 import run_step1
 
 from ...cells.cell import load_cell_views, training_cost
 from ...cells.tasks import FileWorker, SelectionResult
+from ..policies import ActiveSettings, ActiveTask
 from .batches import choose_actively
-from .settings import ActiveSettings, ActiveTask
 
-CLOCKS = ("seconds", "cpu_seconds")
+CLOCKS = {"seconds": time.monotonic, "cpu_seconds": time.process_time}
 
 
 class Worker(FileWorker):
@@ -82,11 +82,10 @@ class Members:
 
     def choose(self, policy: str, budget: int) -> tuple[Choice, dict[str, float]]:
         """The choice, and its wall and process seconds, those of interrupted runs included."""
-        clocks = (time.monotonic, time.process_time)
-        started = [clock() for clock in clocks]
+        started = [clock() for clock in CLOCKS.values()]
         choice = choose_actively(policy, self.views, budget, self.seed, self.settings, self.train)
         cost = {}
-        for name, clock, start in zip(CLOCKS, clocks, started, strict=True):
+        for (name, clock), start in zip(CLOCKS.items(), started, strict=True):
             looking = max(0.0, clock() - start - self.trained[name])
             cost[name] = looking + sum(getattr(training_cost(folder), name) for folder in self.folders)
         return choice, cost

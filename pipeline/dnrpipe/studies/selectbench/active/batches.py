@@ -21,9 +21,9 @@ from dnrtrain.selector.pool import canonical_order, complete_useful
 from dnrtrain.selector.protocol import Candidates, Choice
 from dnrtrain.selector.visibility import visibility_of
 
+from ..policies import ActiveSettings
 from .ensemble import Disagreement
 from .pieces import Doubt, Observed, Pieces, pieces_of
-from .settings import ActiveSettings
 from .variance import PredictedVariance
 
 Train = Callable[[list[int], int, int], DNR]
