@@ -35,14 +35,10 @@ def override_settings(
     def change(settings: Settings) -> dict[str, Any]:
         if not (enable or disable or auto):
             return {}
-        now = settings.effects
-        dropped = {*enable, *disable, *auto}
-        return {
-            "effects": {
-                "enable": [*(n for n in now.enable if n not in dropped), *dict.fromkeys(enable)],
-                "disable": [*(n for n in now.disable if n not in dropped), *dict.fromkeys(disable)],
-            }
-        }
+        now, dropped = settings.effects, {*enable, *disable, *auto}
+        enabled = [*(n for n in now.enable if n not in dropped), *dict.fromkeys(enable)]
+        disabled = [*(n for n in now.disable if n not in dropped), *dict.fromkeys(disable)]
+        return {"effects": {"enable": enabled, "disable": disabled}}
 
     return change
 

@@ -93,7 +93,7 @@ class Figures:
 
 
 def ratio(a: float, b: float) -> float:
-    """NaN where b is 0."""
+    """a / b; NaN where b is 0."""
     return a / b if b else math.nan
 
 

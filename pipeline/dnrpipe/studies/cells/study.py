@@ -167,11 +167,9 @@ class Study(ABC, Generic[Place]):
         """Step 1: a trained policy's selection, or a coarse model that cells share. seconds: of training at most."""
         model, step1, budget = settings.model.coarse(), settings.select.step1, settings.select.budget
         decisive = [scene.inputs, model.model_dump(), step1.model_dump(), policy, budget, seed, seconds]
+        fingerprint = digest([CELL_VERSION, __version__, *decisive, *self.environment])
         return Step1Task(
-            **files_of(
-                self.out / "step1" / scene.name,
-                digest([CELL_VERSION, __version__, *decisive, *self.environment]),
-            ),
+            **files_of(self.out / "step1" / scene.name, fingerprint),
             workspace=scene.workspace.root,
             settings=settings,
             policy=policy,

@@ -21,7 +21,6 @@ from .records import Pilot, PilotFacts, Plan, Prediction, PriorFacts, Route, Wan
 from .routes import as_reported, break_even, routes
 from .seconds import Costs, Work, noise_at, trained_pixels
 
-BLIND_POLICY = "farthest"
 RULE_SECONDS = 2.0
 """Wall seconds allowed for a choice of views that trains nothing."""
 
@@ -126,13 +125,10 @@ def whether_to_train(
 
 
 def policy_of(workspace: Workspace, settings: Settings) -> str:
-    """The policy that the plan counts on.
-
-    It is the settings', or farthest points in place of a trained one that nobody asked for by name.
-    """
+    """The policy that the plan counts on: the settings', or farthest points for a trained one that nobody named."""
     named = workspace.manifest.overrides.get("select", {}).get("policy")
     trained = settings.select.policy in TRAINED_NAMES
-    return BLIND_POLICY if trained and named is None else settings.select.policy
+    return "farthest" if trained and named is None else settings.select.policy
 
 
 def _choose(grid: list[Prediction], wanted: Wanted) -> Prediction | None:
