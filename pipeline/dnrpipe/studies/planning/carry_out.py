@@ -80,7 +80,7 @@ def steps_within(predictor: Predictor, choice: Choice, seconds: float) -> Predic
 
 
 def steps_that_fit(session: Session, plan: Plan, prior: Prior) -> Plan:
-    """The plan with ``carried_out``; as it is where it wants a PSNR, or where all was traced by an earlier run."""
+    """The plan with ``carried_out``; as it is without a wanted time, with a wanted PSNR, or if all was traced."""
     wanted, answers = plan.wanted.seconds, session.answers
     pilot = read_pilot(session.workspace)
     if wanted is None or plan.wanted.psnr is not None or not answers["raytrace"]["ran"] or pilot is None:
