@@ -18,10 +18,10 @@ from tools import result_tables
 
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import Settings, resolve
-from dnrpipe.studies.ablation.ablation_tables import Figures, markdown
+from dnrpipe.studies.ablation.ablation_tables import Figures, markdown, ratio
 from dnrpipe.studies.ablation.rows import CLASSIC as CLASSIC_SIZES
 from dnrpipe.studies.ablation.rows import GROUPS, ROWS, choose_rows, needs_coarse, settings_of
-from dnrpipe.studies.cells.markdown import spread
+from dnrpipe.studies.cells.results import spread
 from dnrpipe.studies.cells.scenes import BENCHMARK, find_scenes
 
 CLASSIC = [row for row in ROWS.values() if row.family == "classic"]
@@ -145,8 +145,8 @@ def test_means_differences_and_ratios_are_paired_by_seed() -> None:
     )
     figures = Figures(made)
     assert figures.mean("vanilla", "psnr", ["a", "b"]) == [25.0, 27.0]
-    assert figures.difference("dnr", "vanilla", "psnr", ["a", "b"]) == [4.0, 5.0]
-    assert figures.ratio("dnr", "vanilla", "lpips_vgg", ["a"]) == pytest.approx([1.25, 26 / 22])
+    assert figures.paired("dnr", "vanilla", "psnr", ["a", "b"]) == [4.0, 5.0]
+    assert figures.paired("dnr", "vanilla", "lpips_vgg", ["a"], ratio) == pytest.approx([1.25, 26 / 22])
     text = markdown(made)
     assert "| **mean** | +4.50 ± 0.71 | 1.18 ± 0.01 |" in text  # LPIPS: 1.175 and 1.185
     assert "| a | 21.00 ± 1.41 | 25.50 ± 0.71 | 40.0 |" in text

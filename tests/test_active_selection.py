@@ -21,8 +21,8 @@ from dnrpipe.studies.selectbench.active.active_worker import Members
 from dnrpipe.studies.selectbench.active.batches import KINDS, choose_actively, sizes
 from dnrpipe.studies.selectbench.active.ensemble import Disagreement, Spread
 from dnrpipe.studies.selectbench.active.pieces import COUNT, Pieces, cells_of, pieces_of, seen_cells
-from dnrpipe.studies.selectbench.active.settings import ActiveSettings
 from dnrpipe.studies.selectbench.active.variance import UNKNOWN, PredictedVariance, Reduction, features_of, train_head
+from dnrpipe.studies.selectbench.policies import ActiveSettings
 from dnrtrain.checkpoint import read_record
 from dnrtrain.contract import View, write_cameras
 from dnrtrain.dataset import ViewSet, load_views

@@ -15,10 +15,9 @@ from hypothesis import strategies as st
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import resolve
 from dnrpipe.studies.frontier.frontier_report import markdown, verdict
-from dnrpipe.studies.frontier.measure_frontier import numbers
+from dnrpipe.studies.frontier.measure_frontier import Sweep, numbers
 from dnrpipe.studies.frontier.point_costs import break_evens, pareto, settle_frames, total_seconds
 from dnrpipe.studies.frontier.records import BaselinePoint, FrontierResults, Point, read_frontier
-from dnrpipe.studies.frontier.sweep import Sweep
 
 
 def point(name: str, upfront: float, frame_ms: float, psnr: float, kind: Any = "ours") -> Point:

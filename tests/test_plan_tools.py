@@ -10,7 +10,7 @@ import pytest
 from tools.plan_equal import markdown
 from tools.plan_prior import collect, fit, fit_prior, without
 
-from dnrpipe.studies.planning.quality import Prior, predict, scene_gain, with_noise
+from dnrpipe.studies.planning.quality import Prior, Quality, scene_gain, with_noise
 
 SCENES = {"quick": (3.0, 0.08), "slow": (6.0, 0.28), "even": (4.0, 0.15), "plain": (2.0, 0.12)}
 """Scenes that learn by the formula: their G and b."""
@@ -53,9 +53,9 @@ def test_cells_of_the_formula_are_fitted_and_a_scene_left_out_has_no_say() -> No
     assert prior.scenes == sorted(SCENES)
     assert prior.gain_mean == pytest.approx(3.75, abs=1.0)
     off = [
-        predict(
-            prior, 28.0, scene_gain(prior, []), cell["views"], cell["steps"], cell["noise"], reference=0.005
-        ).expected
+        Quality(prior, 28.0, scene_gain(prior, []), reference=0.005)
+        .predict(cell["views"], cell["steps"], cell["noise"])
+        .expected
         - cell["psnr"]
         for cell in cells()
     ]

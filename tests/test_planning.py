@@ -23,8 +23,8 @@ from dnrpipe.studies.planning.pilot_worker import without_reference
 from dnrpipe.studies.planning.quality import (
     Gain,
     Measured,
+    Quality,
     load_prior,
-    predict,
     scene_gain,
     share,
     views_error,
@@ -107,7 +107,7 @@ def predictor() -> Predictor:
     work = Work(pixels=128 * 128, trained=128 * 128, light=(512, 128), policy_seconds=1.0, tests=12, evaluation_spp=512)
     gain = scene_gain(PRIOR, [Measured(6, 100, 1.0), Measured(6, 300, 1.8)])
     wall, processor = Costs(one, work, "seconds"), Costs(one, work, "cpu_seconds")
-    return Predictor(one, wall, processor, PRIOR, 28.0, gain, judged=0.0, reference=0.0, batch=1)
+    return Predictor(one, wall, processor, Quality(PRIOR, 28.0, gain), batch=1)
 
 
 @functools.cache
@@ -154,14 +154,14 @@ def test_processor_seconds_count_no_waiting_and_no_cores() -> None:
 @given(st.integers(4, 200), st.integers(50, 10_000), st.floats(0.001, 0.2))
 def test_more_views_and_samples_never_hurt_nor_steps_without_noise(views: int, steps: int, noise: float) -> None:
     gain = scene_gain(PRIOR, [Measured(6, 100, 1.0)])
-    here = predict(PRIOR, 28.0, gain, views, steps, noise).expected
-    assert predict(PRIOR, 28.0, gain, views + 1, steps, noise).expected >= here
+    here = Quality(PRIOR, 28.0, gain).predict(views, steps, noise).expected
+    assert Quality(PRIOR, 28.0, gain).predict(views + 1, steps, noise).expected >= here
     assert (
-        predict(PRIOR, 28.0, gain, views, steps + 50, 0.0).expected
-        >= predict(PRIOR, 28.0, gain, views, steps, 0.0).expected
+        Quality(PRIOR, 28.0, gain).predict(views, steps + 50, 0.0).expected
+        >= Quality(PRIOR, 28.0, gain).predict(views, steps, 0.0).expected
     )
-    assert predict(PRIOR, 28.0, gain, views, steps, noise / 2).expected >= here
-    sure, unsure = (predict(PRIOR, 28.0, gain, views, steps, noise, judged=judged) for judged in (0.0, 2.0))
+    assert Quality(PRIOR, 28.0, gain).predict(views, steps, noise / 2).expected >= here
+    sure, unsure = (Quality(PRIOR, 28.0, gain, judged=judged).predict(views, steps, noise) for judged in (0.0, 2.0))
     assert sure.expected == unsure.expected and unsure.high - unsure.low > sure.high - sure.low
 
 
@@ -212,7 +212,7 @@ def test_what_a_report_measures_counts_its_references_noise() -> None:
     assert shown.base.psnr == pytest.approx(28.0 - 2.124, abs=0.01)
     assert max(point.psnr for point in shown.rival) < 30.0
     gain = scene_gain(PRIOR, [])
-    clean, noisy = (predict(PRIOR, 28.0, gain, 25, 500, 0.0, reference=r).expected for r in (0.0, 0.02))
+    clean, noisy = (Quality(PRIOR, 28.0, gain, reference=r).predict(25, 500, 0.0).expected for r in (0.0, 0.02))
     assert noisy == pytest.approx(with_noise(clean, 0.02))
 
 
@@ -313,7 +313,7 @@ def test_few_frames_are_not_worth_training_and_many_are() -> None:
     few = routes(one.pilot.frames, neural, one.wall.light(), 1.0, at, 5)
     assert few[0].name == "path tracing + denoiser"
     dear = 33.0  # the rival needs 0.2 s a frame there
-    at_dear = cheapest_reaching(grid, one.base + 0.7 * one.gain.most)
+    at_dear = cheapest_reaching(grid, one.quality.base + 0.7 * one.quality.gain.most)
     many = routes(one.pilot.frames, at_dear, one.wall.light(), 1.0, dear, 1_000_000)
     assert many[0].name == "neural renderer"
     even = break_even(many)
@@ -348,8 +348,7 @@ def test_a_scene_is_planned_and_the_plan_carried_out(
     tmp_path: Path, demo_blend: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from dnrpipe.cli import _main
-    from dnrpipe.studies.planning import carry_out, choose
-    from dnrpipe.studies.planning import pilot_parts as pilot
+    from dnrpipe.studies.planning import carry_out, choose, pilot
 
     monkeypatch.chdir(tmp_path)
     for module, name, value in (

@@ -24,7 +24,7 @@ from tools.plan_equal import predictor_in
 from tools.plan_prior import read_cells, without
 
 from dnrpipe.core.errors import UserError
-from dnrpipe.studies.cells.provenance import made_by
+from dnrpipe.studies.cells.results import made_by
 from dnrpipe.studies.frames.pareto_front import crossover, frontier
 from dnrpipe.studies.frontier.records import FrontierResults, Point, read_frontier
 from dnrpipe.studies.planning.choose import VIEWS, Predictor
@@ -123,7 +123,7 @@ def _expected(predictor: Predictor, results: FrontierResults, wanted: float, fra
     width, height = predictor.pilot.size
     scale = predictor.wall.work.pixels / (width * height)
     assert predictor.pilot.frames is not None  # make_predictor asked for it
-    part = as_reported(predictor.pilot.frames, predictor.reference)
+    part = as_reported(predictor.pilot.frames, predictor.quality.reference)
     return routes(part, neural, light, scale, wanted, frames)
 
 

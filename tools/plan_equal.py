@@ -28,7 +28,7 @@ from dnrpipe.core.errors import UserError
 from dnrpipe.core.scene_files import read_json, split_views
 from dnrpipe.core.workspace import Workspace
 from dnrpipe.stages.session import Session, resolve_settings
-from dnrpipe.studies.cells.provenance import made_by
+from dnrpipe.studies.cells.results import made_by
 from dnrpipe.studies.planning.carry_out import apply, steps_within
 from dnrpipe.studies.planning.choose import Predictor
 from dnrpipe.studies.planning.make_plan import make_plan, make_predictor

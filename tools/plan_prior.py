@@ -23,7 +23,7 @@ import torch
 
 from dnrpipe.core.workspace import Workspace
 from dnrpipe.studies.planning.pilot import read_pilot
-from dnrpipe.studies.planning.quality import Prior, load_prior, measured_gains, predict, scene_gain, without_noise
+from dnrpipe.studies.planning.quality import Prior, Quality, load_prior, measured_gains, scene_gain, without_noise
 from dnrpipe.studies.planning.seconds import noise_at
 from dnrtrain.atomic import write_json
 from dnrtrain.exr import read_metadata
@@ -198,9 +198,9 @@ def fit(path: Path, out: Path) -> None:
         networks = zip(pilot["steps"], pilot["psnr"], strict=True)
         gain = scene_gain(prior, measured_gains(prior, pilot["base"], pilot["views"], pilot["noise"], networks))
         off = [
-            predict(
-                prior, pilot["base"], gain, cell["views"], cell["steps"], cell["noise"], reference=cell["reference"]
-            ).expected
+            Quality(prior, pilot["base"], gain, reference=cell["reference"])
+            .predict(cell["views"], cell["steps"], cell["noise"])
+            .expected
             - cell["psnr"]
             for cell in own
         ]

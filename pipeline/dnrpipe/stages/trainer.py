@@ -62,17 +62,18 @@ def torch_device(settings: Settings) -> str:
     return settings.device
 
 
-def perceptual_weights(console: Console) -> Any:
-    """VGG16, AlexNet and LPIPS weights from the cache, or None after saying what that means."""
+def perceptual_weights(console: Console | None) -> Any:
+    """VGG16, AlexNet and LPIPS weights from the cache, or None, after telling the console what that means."""
     from dnrtrain.weights import WeightsMissing, load_weights
 
     try:
         return load_weights()
     except WeightsMissing:
-        console.warn(
-            "no VGG16/LPIPS weights on this machine: training drops the perceptual loss and no LPIPS is"
-            " measured; fetch them with `dnrpipe weights`"
-        )
+        if console is not None:
+            console.warn(
+                "no VGG16/LPIPS weights on this machine: training drops the perceptual loss and no LPIPS is"
+                " measured; fetch them with `dnrpipe weights`"
+            )
         return None
 
 

@@ -29,21 +29,16 @@ def override_settings(
     for name in (*enable, *disable, *auto):
         if name not in NAMES:
             raise UserError(f"no effect '{name}'; they are {', '.join(NAMES)}")
-    twice = {name for name in enable if name in disable}
-    if twice:
+    if twice := set(enable) & set(disable):
         raise UserError(f"--enable and --disable {sorted(twice)[0]}: give one of them")
 
     def change(settings: Settings) -> dict[str, Any]:
         if not (enable or disable or auto):
             return {}
-        now = settings.effects
-        dropped = {*enable, *disable, *auto}
-        return {
-            "effects": {
-                "enable": [*(n for n in now.enable if n not in dropped), *dict.fromkeys(enable)],
-                "disable": [*(n for n in now.disable if n not in dropped), *dict.fromkeys(disable)],
-            }
-        }
+        now, dropped = settings.effects, {*enable, *disable, *auto}
+        enabled = [*(n for n in now.enable if n not in dropped), *dict.fromkeys(enable)]
+        disabled = [*(n for n in now.disable if n not in dropped), *dict.fromkeys(disable)]
+        return {"effects": {"enable": enabled, "disable": disabled}}
 
     return change
 
@@ -82,22 +77,18 @@ def measure_plan(run: Run, plan: EffectPlan) -> EffectPlan:
     workspace, settings = run.workspace, run.settings
     choice = variant_for(plan, settings)
     base = trace_config(workspace, plan, choice.variant)
-    rows: list[tuple[EffectName, dict[str, Any]]] = []
+    tasks: dict[EffectName, dict[str, Any]] = {}
     for effect in plan.effects:
         other = _toggled(run, plan, effect)
-        if other is None:
-            continue
-        config = trace_config(workspace, other, choice.variant)
-        if config == base:
+        if other is None or (config := trace_config(workspace, other, choice.variant)) == base:
             continue
         on, off = (base, config) if effect.on else (config, base)
         views = pilot_views(workspace, settings, plan if plan.on("depth-of-field") else other)
-        task = {"kind": "compare", "with_effect": on, "without_effect": off, "views": views, "spp": MEASURE_SPP}
-        rows.append((effect.name, task))
-    tasks = [task for _, task in rows]
-    results = run_pilots(tasks, choice, run.console, "measuring effects", workspace.log("effects"))
+        compare = {"kind": "compare", "with_effect": on, "without_effect": off, "views": views, "spp": MEASURE_SPP}
+        tasks[effect.name] = compare
+    results = run_pilots(list(tasks.values()), choice, run.console, "measuring effects", workspace.log("effects"))
     measured = {}
-    for (name, _), result in zip(rows, results, strict=True):
+    for name, result in zip(tasks, results, strict=True):
         measured[name] = {key: Measured.model_validate(result[key]) for key in ("cost", "error")}
         device = f"mitsuba {choice.variant}"
         run.book("evaluation", "scene", f"effect/{name}", result["seconds"], device=device)
@@ -110,12 +101,9 @@ def _toggled(run: Run, plan: EffectPlan, effect: Effect) -> EffectPlan | None:
     if effect.part == "neural" or not (effect.present or effect.name in FORCEABLE):
         return None
     chosen = run.settings.effects
-    enable: tuple[EffectName, ...] = tuple(name for name in chosen.enable if name != effect.name)
-    disable: tuple[EffectName, ...] = tuple(name for name in chosen.disable if name != effect.name)
-    if effect.on:
-        disable = (*disable, effect.name)
-    else:
-        enable = (*enable, effect.name)
+    enable: list[EffectName] = [name for name in chosen.enable if name != effect.name]
+    disable: list[EffectName] = [name for name in chosen.disable if name != effect.name]
+    (disable if effect.on else enable).append(effect.name)
     return plan_of(run.workspace, run.settings, enable=enable, disable=disable, pilot=plan.pilot)
 
 
@@ -123,19 +111,14 @@ def table(plan: EffectPlan) -> str:
     """The plan as aligned lines: effect, on or off, evidence, cost, error."""
     depth = "not known before its pilot" if plan.max_depth is None else str(plan.max_depth)
     lines = [f"ray tracing: {plan.integrator}, path depth {depth}"]
-    head = ("effect", "", "cost", "error", "evidence")
-    rows: list[tuple[str, str, str, str, str]] = [head]
+    rows = [("effect", "", "cost", "error", "evidence")]
     for effect in plan.effects:
         state = ("on" if effect.on else "off") + (" (user)" if effect.by == "user" else "")
         evidence = effect.evidence[0] + (f" (+{len(effect.evidence) - 1})" if len(effect.evidence) > 1 else "")
         rows.append((effect.name, state, _percent(effect.cost), _percent(effect.error), evidence))
-    widths = [max(len(row[i]) for row in rows) for i in range(4)]
-    for row in rows:
-        cells = [
-            cell.rjust(w) if i in (2, 3) else cell.ljust(w)
-            for i, (cell, w) in enumerate(zip(row, widths, strict=False))
-        ]
-        lines.append("  ".join([*cells, row[4]]).rstrip())
+    a, b, c, d = (max(len(row[i]) for row in rows) for i in range(4))
+    for name, state, cost, error, evidence in rows:
+        lines.append(f"{name:<{a}}  {state:<{b}}  {cost:>{c}}  {error:>{d}}  {evidence}".rstrip())
     if all(effect.cost is None for effect in plan.effects):
         lines.append("cost and error are not measured yet: dnrpipe effects --measure")
     return "\n".join(lines)

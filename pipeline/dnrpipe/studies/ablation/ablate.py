@@ -1,131 +1,193 @@
-"""`dnrpipe ablate` behind its options: settings, the run, and what it writes."""
+"""`dnrpipe ablate` behind its options: the loop over all cells, and what it writes.
+
+<out>/, beside what every study has (`cells.study`)
+  scenes/<scene>.dnr    workspaces
+  pictures/<scene>.png  one test view: reference and rows side by side
+  tables.md  plot.png
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dnrtrain.atomic import write_json, write_text
+from dnrtrain.atomic import write_text
 
 from ...core.console import Console
-from ...core.settings import resolve
-from ...core.workspace import locked
+from ...core.errors import UserError
+from ...core.settings import Settings, resolve
+from ...stages.stage import Run
+from ..cells.cell import STEP1_SHARE
 from ..cells.measure import METRICS, mean_of, pictured
-from ..cells.request import merged
-from ..cells.scenes import find_scenes
-from ..cells.tasks import read_cell
+from ..cells.request import SMOKE_RUN, SMOKE_SCENE, merged
+from ..cells.scenes import (
+    Scene,
+    choose_by_pose,
+    find_scenes,
+    make_bases,
+    prepared,
+    scene_workspace,
+    trace_references,
+    trace_train,
+    without_left_out,
+)
+from ..cells.study import CELL_WORKER, Study
+from ..cells.tasks import CellTask, Step1Task
 from .ablation_plots import contact_sheet, plot
 from .ablation_tables import SCHEMA, markdown
-from .cell_loop import Ablation, Request
-from .rows import choose_rows
+from .rows import Row, choose_rows, needs_base, needs_coarse, settings_of, step1_policy
 
-SMOKE: dict[str, Any] = {
-    "cameras": {"train": 6, "val": 1, "test": 2, "width": 32, "height": 32},
-    "passes": {"raster": "cycles-direct", "coverage_samples": 16},
-    "raytrace": {"spp": 16, "evaluation_spp": 32, "max_depth": 3},
-    "select": {"budget": 3, "step1": {"epochs": 2}},
-    "finetune": {"step2": {"epochs": 4}},
-}
-SMOKE_SCENE, SMOKE_ROWS = "emissive_only", "vanilla,paper"
+SMOKE, SMOKE_ROWS = {"cameras": {"train": 6, "val": 1}, "select": {"budget": 3}}, "vanilla,paper"
 
 
 def run_ablation(
     *,
     scenes: str | None,
     rows: str | None,
-    seeds: int,
     preset: str,
     budget: int | None,
-    seconds: float | None,
-    jobs: int,
     assignments: Sequence[str],
-    out: Path,
     smoke: bool,
     console: Console,
+    **more: Any,
 ) -> dict[str, Any]:
-    """Run what is due and write results.json, tables.md, plot.png and pictures/ into ``out`` -> the results.
+    """`Study.carry_out` with the command's options. more: fields of `Study`.
 
-    Settings come from the preset and these arguments alone, neither from the environment nor from
-    dnrpipe.toml: the command that is kept in the results says all.
-
-    Raises:
-        UserError: unknown names, settings that do not fit. TasksFailed: some cells failed; the others are written.
+    Raises UserError: unknown names, settings that do not fit.
     """
     budgeted = {} if budget is None else {"select": {"budget": budget}}
-    overrides = merged([SMOKE if smoke else {}, budgeted], assignments)
-    request = Request(
-        scenes=find_scenes(scenes or (SMOKE_SCENE if smoke else None)),
+    overrides = merged([*([SMOKE_RUN, SMOKE] if smoke else []), budgeted], assignments)
+    return Ablation(
+        sources=find_scenes(scenes or (SMOKE_SCENE if smoke else None)),
         rows=choose_rows(rows or (SMOKE_ROWS if smoke else "core")),
-        seeds=seeds,
         base=resolve(preset, overrides, environment={}),
         overrides=overrides,
-        seconds=seconds,
-        out=out,
-        jobs=jobs,
-    )
-    ablation = Ablation(request, console)
-    with locked(out, "ablate"):
-        try:
-            ablation.run()
-        finally:
-            results = _write(ablation)
-    return results
+        console=console,
+        **more,
+    ).carry_out()
 
 
-def _gather(ablation: Ablation) -> dict[str, Any]:
-    """Everything that tables and plots need; cells whose file is missing are left out."""
-    request = ablation.request
-    found = []
-    for (scene, row, seed), path in ablation.cells.items():
-        if not path.exists():
-            continue
-        cell = read_cell(path)
+@dataclass(kw_only=True)
+class Ablation(Study[tuple[str, str, int]]):
+    """Cells by (scene, row, seed). overrides: the user's settings, which hold for all rows; ``base`` has them, too."""
+
+    COMMAND, SCHEMA = "ablate", SCHEMA
+    rows: list[Row]
+    overrides: dict[str, Any]
+    scenes: list[Scene] = field(default_factory=list, init=False)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for row in self.rows:  # a row whose settings cannot be is refused before any work is done
+            self.settings_of(row)
+
+    def open_scenes(self) -> None:
+        with self.console.bar("scenes", len(self.sources)) as bar:
+            for source in self.sources:
+                scene = self._open(source)
+                self.references[scene.name] = trace_references(scene, self.base)
+                self.scenes.append(scene)
+                bar.advance(note=scene.name)
+
+    def _open(self, source: Path) -> Scene:
+        workspace = scene_workspace(source, self.out / "scenes" / f"{source.stem}.dnr")
+        return prepared(source.stem, Run(workspace, self.base, self.console), self.COMMAND)
+
+    def plan_cells(self, seed: int) -> None:
+        step1: dict[tuple[str, str], Step1Task] = {}
+        for scene in self.scenes:
+            for row in self.rows:
+                settings = self.settings_of(row, scene)
+                if needs_coarse(row, settings):
+                    seconds = None if row.full_step1 or not self.seconds else STEP1_SHARE * self.seconds
+                    step1[scene.name, row.name] = self.step1_task(scene, settings, step1_policy(row), seed, seconds)
+        self.worker_pool.work(f"step 1, seed {seed}", CELL_WORKER, step1.values())
+        for scene in self.scenes:
+            self._plan_scene(scene, seed, step1)
+
+    def _plan_scene(self, scene: Scene, seed: int, step1: dict[tuple[str, str], Step1Task]) -> None:
+        chosen = {row.name: self._views(scene, row, seed, step1) for row in self.rows}
+        everything = sorted({name for names in chosen.values() for name in names})
+        by_spp: dict[int | None, set[str]] = {}
+        for row in self.rows:
+            by_spp.setdefault(row.spp, set()).update(chosen[row.name])
+        traced = {spp: trace_train(scene, self.base, names, spp) for spp, names in by_spp.items()}
+        bases: dict[str, dict[str, str]] = {}
+        for row in self.rows:
+            settings = self.settings_of(row, scene)
+            kind, based = settings.model.base, needs_base(row, settings)
+            if based and kind not in bases:
+                bases[kind] = make_bases(scene, settings, everything)
+            self.cells[scene.name, row.name, seed] = self.cell_task(
+                scene,
+                settings,
+                seed,
+                {name: traced[row.spp][name] for name in chosen[row.name]},
+                step1.get((scene.name, row.name)) if settings.starts_coarse else None,
+                bases[kind] if based else {},
+                label=row.name,
+                network=row.network,
+                full_step1=row.full_step1,
+                spp=row.spp,
+                picture=seed == 0,
+            )
+
+    def _views(self, scene: Scene, row: Row, seed: int, step1: dict[tuple[str, str], Step1Task]) -> list[str]:
+        if row.views == "rl":
+            return step1[scene.name, row.name].result().selected
+        if row.views == "all":
+            return list(scene.train)
+        budget = row.budget or self.base.select.budget
+        # Farthest points are the same views for every seed.
+        chosen = choose_by_pose(list(scene.train.values()), row.views, budget, seed if row.views == "random" else 0)
+        return [view.name for view in chosen]
+
+    def settings_of(self, row: Row, scene: Scene | None = None) -> Settings:
+        """The row's settings; with a scene, without what its effect plan leaves off."""
+        settings = settings_of(row, self.base, self.overrides)
+        if not row.network and settings.model.base == "none":
+            raise UserError(f"row {row.name}: preset '{settings.preset}' has no base image (model.base is none)")
+        return settings if scene is None else without_left_out(scene.workspace, settings)
+
+    # -- results ---------------------------------------------------------------------------------------
+
+    def compared(self) -> dict[str, Any]:
+        return {
+            "budget": self.base.select.budget,
+            "device": self.device,
+            "threads": self.threads,
+            "rows": {row.name: row.what for row in self.rows},
+        }
+
+    def line(self, place: tuple[str, str, int], task: CellTask) -> dict[str, Any]:
+        cell = task.result()
         training = cell.training
         step1 = training and training.step1
-        found.append(
-            {
-                "scene": scene,
-                "row": row,
-                "seed": seed,
-                "key": cell.key,
-                **{name: mean_of(cell.tests, name) for name in METRICS},
-                "views": len(cell.views),
-                "epochs": training and training.epochs,
-                "steps": training and training.step2.steps,
-                "train_seconds": training and round(training.seconds, 2),
-                "train_cpu_seconds": training and round(training.cpu_seconds, 2),
-                "step1_cpu_seconds": step1 and round(step1.cpu_seconds, 2),
-                "frame_ms": cell.frame_ms and round(cell.frame_ms, 2),
-                "base_ms": cell.base_ms and round(cell.base_ms, 2),
-                "commit": cell.code["commit"],
-            }
-        )
-    return {
-        **request.facts(SCHEMA),
-        "budget": request.base.select.budget,
-        "device": ablation.device,
-        "threads": ablation.threads,
-        "rows": {row.name: row.what for row in request.rows},
-        "cells": found,
-    }
+        return {
+            **dict(zip(("scene", "row", "seed"), place, strict=True)),
+            "key": cell.key,
+            **{name: mean_of(cell.tests, name) for name in METRICS},
+            "views": len(cell.views),
+            "epochs": training and training.epochs,
+            "steps": training and training.step2.steps,
+            "train_seconds": training and round(training.seconds, 2),
+            "train_cpu_seconds": training and round(training.cpu_seconds, 2),
+            "step1_cpu_seconds": step1 and round(step1.cpu_seconds, 2),
+            "frame_ms": cell.frame_ms and round(cell.frame_ms, 2),
+            "base_ms": cell.base_ms and round(cell.base_ms, 2),
+            "commit": cell.code["commit"],
+        }
 
-
-def _write(ablation: Ablation) -> dict[str, Any]:
-    """Results, tables, plot and pictures of the cells that are there."""
-    out, results = ablation.request.out, _gather(ablation)
-    if not results["cells"]:
-        return results
-    write_json(out / "results.json", results)
-    write_text(out / "tables.md", markdown(results))
-    plot(results, out / "plot.png")
-    for scene in results["scenes"]:
-        folder = out / "cells" / scene
-        pictures = [("reference", folder / "truth.png")]
-        for cell in results["cells"]:
-            if cell["scene"] == scene and cell["seed"] == 0:
-                psnr = pictured(read_cell(folder / f"{cell['key']}.json").tests)["psnr"]
-                pictures.append((f"{cell['row']} {psnr:.1f} dB", folder / f"{cell['key']}.png"))
-        if len(pictures) > 1 and all(path.exists() for _, path in pictures):
-            contact_sheet(pictures, out / "pictures" / f"{scene}.png")
-    return results
+    def show(self, results: dict[str, Any]) -> None:
+        out = self.out
+        write_text(out / "tables.md", markdown(results))
+        plot(results, out / "plot.png")
+        for scene in results["scenes"]:
+            pictures = [("reference", out / "cells" / scene / "truth.png")]
+            for (name, row, _), task in self.cells.items():
+                if name == scene and task.picture is not None and task.output.exists():
+                    pictures.append((f"{row} {pictured(task.result().tests)['psnr']:.1f} dB", task.picture))
+            if len(pictures) > 1 and all(path.exists() for _, path in pictures):
+                contact_sheet(pictures, out / "pictures" / f"{scene}.png")

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 import math
+import operator
 import statistics
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..cells.markdown import NONE, made_line, spread, table
-from ..cells.provenance import read_made
+from ..cells.results import NONE, made_line, read_made, spread, table
 from ..cells.scenes import HARD_LIGHT
 from .rows import ROWS
 
 SCHEMA = 1
+read_results = functools.partial(read_made, command="ablate", schema=SCHEMA, part="cells")
 # Wu, Li, Wei: DNRSelect, table I (25 views, NeRF-Synthetic, 800²): PSNR, SSIM, LPIPS.
 PUBLISHED = {
     "full": (28.12, 0.8506, 0.0479),
@@ -38,11 +40,6 @@ COLUMNS: tuple[tuple[str, str, int], ...] = (
 PER_SCENE = (("psnr", "PSNR, dB", 2), ("psnr_mask", "PSNR inside the mask, dB", 2), ("ssim", "SSIM", 4),
              ("lpips_vgg", "LPIPS (VGG)", 4))  # fmt: skip
 BASELINES = ("vanilla", "paper")
-
-
-def read_results(path: Path) -> dict[str, Any]:
-    """``results.json`` of an ablation. Raises UserError: missing, damaged or of another schema."""
-    return read_made(path, "ablate", SCHEMA, "cells")
 
 
 class Figures:
@@ -74,17 +71,15 @@ class Figures:
         keys = [{place[::2]: c["key"] for place, c in self.cells.items() if place[1] == name} for name in (row, other)]
         return keys[0] == keys[1]
 
-    def difference(self, row: str, other: str, metric: str, scenes: Sequence[str]) -> list[float]:
-        """Means over ``scenes`` of row - other, one per seed that both have."""
-        return self._paired(row, other, metric, scenes, lambda a, b: a - b)
-
-    def ratio(self, row: str, other: str, metric: str, scenes: Sequence[str]) -> list[float]:
-        """Means over ``scenes`` of row over other, one per seed that both have."""
-        return self._paired(row, other, metric, scenes, lambda a, b: a / b if b else math.nan)
-
-    def _paired(
-        self, row: str, other: str, metric: str, scenes: Sequence[str], compare: Callable[[float, float], float]
+    def paired(
+        self,
+        row: str,
+        other: str,
+        metric: str,
+        scenes: Sequence[str],
+        compare: Callable[[float, float], float] = operator.sub,
     ) -> list[float]:
+        """Means over ``scenes`` of row - other, one per seed that both have. compare: instead of the difference."""
         found = []
         for seed in self.seeds:
             pairs = [[self._value(scene, name, seed, metric) for name in (row, other)] for scene in scenes]
@@ -95,6 +90,11 @@ class Figures:
     def _value(self, scene: str, row: str, seed: int, metric: str) -> Any:
         """None where there is no such cell, or it was not measured."""
         return self.cells.get((scene, row, seed), {}).get(metric)
+
+
+def ratio(a: float, b: float) -> float:
+    """a / b; NaN where b is 0."""
+    return a / b if b else math.nan
 
 
 def markdown(results: Mapping[str, Any]) -> str:
@@ -153,8 +153,8 @@ def _gains(figures: Figures) -> str:
     for name, scenes in [*[(scene, [scene]) for scene in figures.scenes], ("**mean**", figures.scenes)]:
         line = [name]
         for baseline in baselines:
-            line.append(spread(figures.difference("dnr", baseline, "psnr", scenes), 2, signed=True))
-            line.append(spread(figures.ratio("dnr", baseline, "lpips_vgg", scenes), 2))
+            line.append(spread(figures.paired("dnr", baseline, "psnr", scenes), 2, signed=True))
+            line.append(spread(figures.paired("dnr", baseline, "lpips_vgg", scenes, ratio), 2))
         rows.append(line)
     return f"### `dnr` against its rivals\n\n{table(head, rows)}"
 
@@ -166,7 +166,7 @@ def _paper(figures: Figures) -> str:
         if row not in figures.rows or (other := ROWS[row].against) not in figures.rows:
             continue
         theirs = published[0] - PUBLISHED["full"][0]
-        ours = figures.difference(row, other, "psnr", figures.scenes)
+        ours = figures.paired(row, other, "psnr", figures.scenes)
         rows.append([ROWS[row].what, f"{theirs:+.2f}", *_differences(figures, row, other), _verdict(theirs, ours)])
     if not rows:
         return ""
@@ -176,7 +176,7 @@ def _paper(figures: Figures) -> str:
 
 def _differences(figures: Figures, row: str, other: str) -> list[str]:
     return [
-        spread(figures.difference(row, other, metric, figures.scenes), digits, signed=True)
+        spread(figures.paired(row, other, metric, figures.scenes), digits, signed=True)
         for metric, digits in (("psnr", 2), ("ssim", 4), ("lpips_vgg", 4))
     ]
 
@@ -222,11 +222,5 @@ def _ingredients(figures: Figures) -> str:
     return f"### Ingredients of `dnr`, one changed at a time\n\n{table(head, rows)}"
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Print the tables of a results file."""
-    print(markdown(read_results(Path(arguments[0]))), end="")
-    return 0
-
-
 if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1:]))
+    print(markdown(read_results(Path(sys.argv[1]))), end="")

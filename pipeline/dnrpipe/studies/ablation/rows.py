@@ -16,7 +16,6 @@ from ...core.errors import UserError
 from ...core.settings import Settings, merge
 from ..cells.request import choose_names
 
-Family = Literal["classic", "dnr"]
 ViewChoice = Literal["farthest", "random", "rl", "all"]
 
 # What the classic rows share with the paper in kind, at the sizes that fit the preset's images and views.
@@ -57,7 +56,7 @@ class Row:
 
     name: str
     what: str
-    family: Family
+    family: Literal["classic", "dnr"]
     changes: Mapping[str, Any] = field(default_factory=dict)
     views: ViewChoice = "farthest"
     network: bool = True

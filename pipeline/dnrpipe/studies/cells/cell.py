@@ -9,11 +9,12 @@ import functools
 import json
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from filelock import FileLock
+from pydantic import Field, TypeAdapter
 
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import ContractError
@@ -22,78 +23,44 @@ from dnrtrain.events import Event, Selected
 from ...core.scene_files import read_frame, split_views
 from ...core.settings import Settings
 from ...core.workspace import Workspace
+from ...stages.trainer import perceptual_weights
 from .measure import base_pictures, measure, network_pictures, rendered_ms
-from .scenes import base_file, raster_file
-from .tasks import (
-    CellResult,
-    CellTask,
-    FileWorker,
-    Step1Result,
-    Step1Task,
-    Training,
-    TrainingCost,
-    weights_or_none,
-)
+from .scenes import base_files, raster_file
+from .tasks import CellResult, CellTask, FileWorker, Step1Result, Step1Task, Training, TrainingCost
 
 if TYPE_CHECKING:
-    from dnrtrain.dataset import ViewSet
+    from dnrtrain.dataset import Base, ViewSet
     from dnrtrain.records import Epoch, ModelRecord
 
-CELL_VERSION = 1  # raise when training or measuring changes what a cell holds
+CELL_VERSION = 2  # raise when training or measuring changes what a cell holds, or what fingerprints hash
 STEP1_SHARE = 1 / 3
 """Share of the training time that step 1 may take where all rows train equally long."""
-KEPT_SETS = 8
-"""Sets of views in memory; a cell needs two."""
 
 
 class Worker(FileWorker):
-    """Answers a `Step1Task` or a `CellTask`."""
+    TASK = TypeAdapter(Annotated[Step1Task | CellTask, Field(discriminator="kind")])
 
     def __init__(self, common: dict[str, Any]) -> None:
         super().__init__(common)
-        self.device = common["device"]
-        self.views = functools.lru_cache(maxsize=KEPT_SETS)(load_cell_views)
-        self.weights = weights_or_none()  # fingerprints of cells hold whether there are any
+        self.views = functools.lru_cache(maxsize=8)(load_cell_views)  # a cell needs two
+        self.weights = perceptual_weights(None)  # the parent has told; fingerprints of cells hold whether there are any
 
-    def answer(self, task: dict[str, Any]) -> Step1Result | CellResult:
-        if task["kind"] == "step1":
-            return self._step1(Step1Task.model_validate(task))
-        return self._cell(CellTask.model_validate(task))
-
-    # -- the two kinds of tasks ------------------------------------------------------------------------
+    def answer(self, task: Step1Task | CellTask) -> Step1Result | CellResult:
+        return self._step1(task) if isinstance(task, Step1Task) else self._cell(task)
 
     def _step1(self, task: Step1Task) -> Step1Result:
         """The coarse model on rasterised candidates, and the views its policy chooses."""
         settings = task.settings
         if task.seconds is not None:
-            assert task.pace is not None
-            short = _with_epochs(settings, step1=2)
-            pace = self._pace(task.pace, task.folder, lambda folder: self._train_step1(task, short, folder))
-            limit = max(1, int(task.seconds / pace))
-            settings = _with_epochs(settings, step1=min(limit, settings.select.step1.epochs))
-        events = self._train_step1(task, settings, task.folder)
+            limit = max(1, int(task.seconds / self._pace(task)))
+            settings = _with_epochs(settings, min(limit, settings.select.step1.epochs))
+        events = self._events(task, settings, task.folder)
         selected = next(event for event in events if isinstance(event, Selected))
         return Step1Result(
             key=task.fingerprint,
             selected=selected.selection.views,
             epochs=settings.select.step1.epochs,
             **training_cost(task.folder).model_dump(),
-        )
-
-    def _train_step1(self, task: Step1Task, settings: Settings, folder: Path) -> Iterator[Event]:
-        from dnrtrain.step1 import run_step1
-
-        return run_step1(
-            self.views(task.workspace, "train", raytraced=False, base="none"),
-            None,
-            settings.model,
-            settings.select.step1,
-            policy=task.policy,
-            budget=settings.select.budget,
-            seed=task.seed,
-            device=self.device,
-            checkpoints=folder,
-            fingerprint=task.fingerprint,
         )
 
     def _cell(self, task: CellTask) -> CellResult:
@@ -107,9 +74,6 @@ class Worker(FileWorker):
             shutil.rmtree(task.folder)
         else:
             pictures, frame_ms = base_pictures(test), None
-        base_ms = None
-        if base not in ("none", "raster"):
-            base_ms = rendered_ms([base_file(workspace, base, "test", name) for name in test.names])
         return CellResult(
             key=task.fingerprint,
             scene=task.scene,
@@ -121,7 +85,7 @@ class Worker(FileWorker):
             views=task.views,
             training=training,
             frame_ms=frame_ms,
-            base_ms=base_ms,
+            base_ms=rendered_ms(base_files(workspace, base, "test", test.names)),
             threads=self.threads,
             device=self.device,
             tests=measure(pictures, test, workspace, self.weights, task.picture),
@@ -136,8 +100,7 @@ class Worker(FileWorker):
         settings, coarse = task.settings, task.coarse_cost
         pace = None
         if task.seconds is not None:
-            short = _with_epochs(settings, step2=2)
-            pace = self._pace(task.pace, task.folder, lambda folder: self._train_step2(task, short, folder))
+            pace = self._pace(task)
             spent = STEP1_SHARE * task.seconds if task.full_step1 else self._clock(coarse) if coarse else 0.0
             left = task.seconds - spent
             if left < pace:
@@ -145,8 +108,8 @@ class Worker(FileWorker):
                     f"--seconds {task.seconds:g}: step 1 leaves {max(left, 0.0):.1f} s, and an epoch of step 2"
                     f" takes {pace:.1f} s; give more"
                 )
-            settings = _with_epochs(settings, step2=int(left / pace))
-        for _ in self._train_step2(task, settings, task.folder):
+            settings = _with_epochs(settings, int(left / pace))
+        for _ in self._events(task, settings, task.folder):
             pass
         cost = training_cost(task.folder)
         return Training(
@@ -159,45 +122,40 @@ class Worker(FileWorker):
             perceptual=self.weights is not None,
         )
 
-    def _pace(self, file: Path, folder: Path, train: Callable[[Path], Iterator[Event]]) -> float:
-        """Seconds of one epoch: the second of two (the first warms up), kept in ``file`` for the row's other seeds."""
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with FileLock(f"{file}.lock"):  # cells side by side train by one figure, not by one each
-            if not file.exists():
-                scratch = folder.with_name(f"{folder.name}.pace")
-                for _ in train(scratch):
+    def _pace(self, task: Step1Task | CellTask) -> float:
+        """Seconds of one epoch: the second of two (the first warms up), kept for the row's other seeds."""
+        task.pace.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(f"{task.pace}.lock"):  # cells side by side train by one figure, not by one each
+            if not task.pace.exists():
+                scratch = task.folder.with_name(f"{task.folder.name}.pace")
+                for _ in self._events(task, _with_epochs(task.settings, 2), scratch):
                     pass
-                last = _record(scratch).history[-1]
+                last = finished_record(scratch).history[-1]
                 shutil.rmtree(scratch)
-                write_json(file, self._clock(last))
-        return float(json.loads(file.read_text()))
+                write_json(task.pace, self._clock(last))
+        return float(json.loads(task.pace.read_text()))
 
     def _clock(self, cost: TrainingCost | Epoch) -> float:
         """Seconds of training; on a CPU by processor time, which other work on the machine does not stretch."""
         return cost.cpu_seconds / self.threads if self.device == "cpu" else cost.seconds
 
-    def _train_step2(self, task: CellTask, settings: Settings, folder: Path) -> Iterator[Event]:
+    def _events(self, task: Step1Task | CellTask, settings: Settings, folder: Path) -> Iterator[Event]:
+        """Train the task's step into ``folder``."""
+        from dnrtrain.step1 import run_step1
         from dnrtrain.step2 import run_step2
 
-        return run_step2(
-            self.views(
-                task.workspace,
-                "train",
-                tuple(task.views),
-                raytraced=True,
-                base=settings.model.base,
-                targets=task.targets,
-            ),
-            None,
-            task.coarse or folder,  # not read by a fresh start
-            settings.model,
-            settings.finetune.step2,
-            seed=task.seed,
-            device=self.device,
-            checkpoints=folder,
-            fingerprint=task.fingerprint,
-            weights=self.weights,
+        run: dict[str, Any] = {"seed": task.seed, "device": self.device, "checkpoints": folder}
+        run["fingerprint"] = task.fingerprint
+        model, step1, step2 = settings.model, settings.select.step1, settings.finetune.step2
+        if isinstance(task, Step1Task):
+            views = self.views(task.workspace, "train", raytraced=False, base="none")
+            return run_step1(views, None, model, step1, policy=task.policy, budget=settings.select.budget, **run)
+        names = tuple(task.views)
+        views = self.views(
+            task.workspace, "train", names, raytraced=True, base=settings.model.base, targets=task.targets
         )
+        coarse = task.coarse or folder  # not read by a fresh start
+        return run_step2(views, None, coarse, model, step2, weights=self.weights, **run)
 
 
 def load_cell_views(
@@ -206,18 +164,12 @@ def load_cell_views(
     names: tuple[str, ...] | None = None,
     *,
     raytraced: bool,
-    base: str,
+    base: Base,
     targets: str | None = None,
 ) -> ViewSet:
-    """Views with ray-traced or rasterised targets and their base images.
+    """Views of a workspace with ray-traced or rasterised targets and their base images.
 
-    Args:
-        root: of the workspace.
-        split: train or test.
-        names: of the views, None: all of the split.
-        raytraced: whether targets are ray-traced.
-        base: kind of the base images.
-        targets: folder of the ray-traced pictures, where it is not the split's.
+    names: None for all of the split. targets: folder of the ray-traced pictures, where it is not the split's.
     """
     from dnrtrain.dataset import load_views
 
@@ -225,38 +177,40 @@ def load_cell_views(
     views = {view.name: view for view in split_views(workspace)[split]}
     chosen = [views[name] for name in names or views]
     passes = [workspace.passes(split, view.name) for view in chosen]
-    extra: dict[str, Any] = {}
-    if base == "raster":
-        extra = {"base": base}
-        if split == "test":
-            passes = [raster_file(workspace, view.name) for view in chosen]
-    elif base != "none":
-        extra = {"base": base, "base_files": [base_file(workspace, base, split, view.name) for view in chosen]}
-    images = [workspace.raytraced(targets or split, view.name) for view in chosen] if raytraced else None
-    frame = read_frame(workspace)
-    return load_views(passes, images, frame, cameras=chosen, folder=workspace.scene, **extra)
+    if base == "raster" and split == "test":
+        passes = [raster_file(workspace, view.name) for view in chosen]
+    return load_views(
+        passes,
+        [workspace.raytraced(targets or split, view.name) for view in chosen] if raytraced else None,
+        read_frame(workspace),
+        cameras=chosen,
+        folder=workspace.scene,
+        base=base,
+        base_files=base_files(workspace, base, split, [view.name for view in chosen]) or None,
+    )
 
 
-def _with_epochs(settings: Settings, step1: int | None = None, step2: int | None = None) -> Settings:
+def _with_epochs(settings: Settings, epochs: int) -> Settings:
+    """Of whichever step is trained by them."""
     changed = settings.model_copy(deep=True)
-    changed.select.step1.epochs = step1 or changed.select.step1.epochs
-    changed.finetune.step2.epochs = step2 or changed.finetune.step2.epochs
+    changed.select.step1.epochs = changed.finetune.step2.epochs = epochs
     return changed
 
 
-def _record(folder: Path) -> ModelRecord:
+def finished_record(folder: Path) -> ModelRecord:
+    """Of a training that has just finished."""
     from dnrtrain.checkpoint import read_record
 
     record = read_record(folder)
-    assert record is not None  # its step has just finished
+    assert record is not None
     return record
 
 
 def training_cost(folder: Path) -> TrainingCost:
     """Sums over all epochs, those of an interrupted run included, and what the choice at the end took."""
-    record = _record(folder)
-    names = ("seconds", "cpu_seconds", "steps", "skipped")
-    cost: dict[str, Any] = {name: sum(getattr(epoch, name) for epoch in record.history) for name in names}
-    for name, value in record.choosing.items():
-        cost[name] += value
+    record = finished_record(folder)
+    cost: dict[str, Any] = {
+        name: sum(getattr(epoch, name) for epoch in record.history) + record.choosing.get(name, 0)
+        for name in TrainingCost.model_fields
+    }
     return TrainingCost(**cost)

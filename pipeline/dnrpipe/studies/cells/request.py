@@ -1,57 +1,31 @@
-"""What the command lines of `ablate` and `bench-select` ask for, and what results say of it."""
+"""What the command lines of `ablate` and `bench-select` ask for: settings, and names."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from ...core.errors import UserError
-from ...core.settings import Settings, merge, parse_assignment
-from .provenance import made_by
+from ...core.settings import merge, parse_assignment
 
-
-@dataclass(frozen=True, kw_only=True)
-class StudyRequest:
-    """What to run. base: settings of all cells. seconds: of training, None: the preset's epochs.
-
-    Raises UserError: an amount of work that is none, or ``out`` is a file.
-    """
-
-    scenes: list[Path]
-    seeds: int
-    base: Settings
-    seconds: float | None
-    out: Path
-    jobs: int
-
-    def __post_init__(self) -> None:
-        if self.seconds is not None and not self.seconds > 0:
-            raise UserError(f"--seconds {self.seconds:g}: must be more than 0")
-        if self.seeds < 1 or self.jobs < 0:
-            raise UserError(f"--seeds {self.seeds} --jobs {self.jobs}: at least 1 seed; jobs from 0 (one per core)")
-        if self.out.exists() and not self.out.is_dir():
-            raise UserError(f"--out {self.out}: is a file; name a folder")
-
-    def facts(self, schema: int) -> dict[str, Any]:
-        """What results say of the run, but for what it compares."""
-        base = self.base
-        return {
-            "schema": schema,
-            **made_by(),
-            "preset": base.preset,
-            "resolution": f"{base.cameras.width}x{base.cameras.height}",
-            "seconds": self.seconds,
-            "seeds": self.seeds,
-            "scenes": [path.stem for path in self.scenes],
-            "spp": {"training": base.raytrace.spp, "test": base.raytrace.evaluation_spp},
-        }
+SMOKE_SCENE = "emissive_only"
+SMOKE_RUN: dict[str, Any] = {
+    "cameras": {"test": 2, "width": 32, "height": 32},
+    "passes": {"raster": "cycles-direct", "coverage_samples": 16},
+    "raytrace": {"spp": 16, "evaluation_spp": 32, "max_depth": 3},
+    "select": {"step1": {"epochs": 2}},
+    "finetune": {"step2": {"epochs": 4}},
+}
+"""What ``--smoke`` is about: a small scene, few epochs."""
 
 
 def merged(layers: Sequence[Mapping[str, Any]], assignments: Sequence[str]) -> dict[str, Any]:
-    """Nested settings, later ones first; ``assignments``, KEY=VALUE, before all."""
+    """Nested settings, later ones first; ``assignments``, KEY=VALUE, before all.
+
+    A study's settings come from its preset and from these alone, neither from the environment nor from dnrpipe.toml:
+    the command that is kept in the results says all.
+    """
     found: dict[str, Any] = {}
     for layer in (*layers, *map(parse_assignment, assignments)):
         found = merge(found, layer)
@@ -65,15 +39,9 @@ def choose_names(
     names: Collection[str],
     groups: Mapping[str, Collection[str]],
 ) -> list[str]:
-    """``"vanilla,dnr"``, or groups, in the order of ``names``.
+    """``"vanilla,dnr"``, or groups, in the order of ``names``, which are all there are.
 
-    Args:
-        option: the flag, for messages. kind: what is named, likewise: ``row``.
-        text: what was given.
-        names: all there are.
-        groups: of names.
-
-    Raises UserError: an unknown name, or none.
+    option, kind: the flag and what it names, for messages. Raises UserError: an unknown name, or none.
     """
     found: set[str] = set()
     for name in filter(None, (part.strip() for part in text.split(","))):

@@ -15,6 +15,8 @@ from ...core.ledger import StageName
 from ...core.scene_files import read_raster_choice, split_views
 from ...core.settings import Settings
 from ...core.workspace import Source, Workspace, file_sha256
+from ...effects.store import plan_of
+from ...stages.base_images import RENDERED, base_path, base_views
 from ...stages.pipeline import run_stage
 from ...stages.prepare import draw_passes
 from ...stages.raytrace import trace_views
@@ -32,13 +34,8 @@ HARD_LIGHT = ("interior", "jewels")
 class Scene:
     """One prepared scene of a study.
 
-    Args:
-        name: results are filed by it.
-        workspace: of the scene.
-        console: of the study.
-        train, test: views by name.
-        inputs: hash of passes and cameras.
-        run_id: of the study in the ledger.
+    name: results are filed by it. train, test: views by name. inputs: hash of passes and cameras. run_id: of the study
+    in the ledger.
     """
 
     name: str
@@ -54,14 +51,19 @@ class Scene:
         return Run(self.workspace, settings, self.console, stage, self.run_id)
 
 
-def choose_by_pose(views: Sequence[View], policy: str, budget: int, seed: int) -> list[int]:
-    """Places of the views that a rule of poses alone chooses: ``farthest`` or ``random``."""
+def choose_by_pose(views: Sequence[View], policy: str, budget: int, seed: int) -> list[View]:
+    """The views that a rule of poses alone chooses: ``farthest`` or ``random``."""
     from dnrtrain.selector.policies import untrained
     from dnrtrain.selector.protocol import Candidates
 
     rule = untrained(policy)
     assert rule is not None  # both names above are rules
-    return rule.choose(Candidates.of_views(views), budget, seed).views
+    return [views[place] for place in rule.choose(Candidates.of_views(views), budget, seed).views]
+
+
+def without_left_out(workspace: Workspace, settings: Settings) -> Settings:
+    """The settings without what the scene's effect plan leaves off of the model."""
+    return settings.model_copy(update={"model": plan_of(workspace, settings).model(settings.model)})
 
 
 def scene_workspace(source: Path, root: Path) -> Workspace:
@@ -90,12 +92,7 @@ def find_scenes(text: str | None) -> list[Path]:
 
 
 def prepared(name: str, run: Run, command: str) -> Scene:
-    """The workspace's passes, made where they are missing, without a word.
-
-    Args:
-        name: of the scene in results.
-        run: workspace, settings and the study's console.
-        command: names the study in the ledger.
+    """The workspace's passes, made where they are missing, without a word. command: names the study in the ledger.
 
     Raises UserError: no test views, too few candidates.
     """
@@ -133,9 +130,9 @@ def traced_split(settings: Settings, spp: int | None) -> str:
     return "train" if spp in (None, settings.raytrace.spp) else f"train-{spp}spp"
 
 
-def trace_references(scene: Scene, settings: Settings) -> dict[str, str]:
-    """Path-trace the test views, booked as evaluation -> fingerprint of each view's file."""
-    return _trace(scene.run(settings, "evaluate"), list(scene.test.values()), "test")
+def trace_references(scene: Scene, settings: Settings) -> list[str]:
+    """Path-trace the test views, booked as evaluation -> fingerprints of their files, sorted."""
+    return sorted(_trace(scene.run(settings, "evaluate"), list(scene.test.values()), "test").values())
 
 
 def make_bases(scene: Scene, settings: Settings, train: Sequence[str]) -> dict[str, str]:
@@ -145,10 +142,18 @@ def make_bases(scene: Scene, settings: Settings, train: Sequence[str]) -> dict[s
     """
     workspace = scene.workspace
     if settings.model.base == "raster":
+        choice = read_raster_choice(workspace)
+        assert choice is not None, "stage prepare has chosen one"
+        tasks = draw_passes(
+            scene.run(settings, "prepare"),
+            "rasterised test views",
+            list(scene.test.values()),
+            [raster_file(workspace, name) for name in scene.test],
+            choice.engine,
+            raster=[True] * len(scene.test),
+        )
         drawn = {f"train/{name}": scene.inputs for name in train}  # by `prepare`
-        return drawn | {f"test/{name}": made for name, made in _raster_test_views(scene, settings).items()}
-    from ...stages.base_images import base_views
-
+        return drawn | {f"test/{name}": task["fingerprint"] for name, task in zip(scene.test, tasks, strict=True)}
     chosen = {"train": [scene.train[name] for name in train], "test": list(scene.test.values())}
     made = {}
     for split, views in chosen.items():
@@ -156,36 +161,24 @@ def make_bases(scene: Scene, settings: Settings, train: Sequence[str]) -> dict[s
             scene.run(settings, "evaluate" if split == "test" else "finetune"),
             views,
             split,
-            paths=[base_file(workspace, settings.model.base, split, view.name) for view in views],
+            paths=base_files(workspace, settings.model.base, split, [view.name for view in views]),
         )
         made |= {f"{split}/{view.name}": task["fingerprint"] for view, task in zip(views, tasks, strict=True)}
     return made
 
 
-def base_file(workspace: Workspace, kind: str, split: str, view: str) -> Path:
-    """Where a view's base image lies: the workspace's own place for baked ones, beside it for the kinds it is not."""
-    from ...stages.base_images import base_path
+def base_files(workspace: Workspace, kind: str, split: str, views: Iterable[str]) -> list[Path]:
+    """Where the views' base images lie: the workspace's own place for baked ones, beside it for the kinds it is not.
 
-    return base_path(workspace, split, view) if kind == "baked" else base_path(workspace, f"{kind}-{split}", view)
+    Empty for kinds that are not rendered into files of their own.
+    """
+    folder = split if kind == "baked" else f"{kind}-{split}"
+    return [base_path(workspace, folder, view) for view in views] if kind in RENDERED else []
 
 
 def raster_file(workspace: Workspace, view: str) -> Path:
     """Where a test view's passes with rasterised colour lie (`prepare` leaves that colour out)."""
     return workspace.root / "base" / "raster-test" / f"{view}.exr"
-
-
-def _raster_test_views(scene: Scene, settings: Settings) -> dict[str, str]:
-    chosen = read_raster_choice(scene.workspace)
-    assert chosen is not None, "stage prepare has chosen one"
-    tasks = draw_passes(
-        scene.run(settings, "prepare"),
-        "rasterised test views",
-        list(scene.test.values()),
-        [raster_file(scene.workspace, name) for name in scene.test],
-        chosen.engine,
-        raster=[True] * len(scene.test),
-    )
-    return {name: task["fingerprint"] for name, task in zip(scene.test, tasks, strict=True)}
 
 
 def _trace(run: Run, views: list[View], split: str, spp: int | None = None) -> dict[str, str]:

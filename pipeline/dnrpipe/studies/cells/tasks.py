@@ -6,11 +6,11 @@ Seconds are wall seconds of training; ``cpu_seconds`` are the processor's.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, ClassVar, Literal
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, TypeAdapter
 
 from dnrtrain.atomic import write_json
 
@@ -31,47 +31,46 @@ class StudyTask(PoolTask):
 
     fingerprint: str
     workspace: Path
+    seed: int
 
 
-class FileWorker:
-    """A worker that writes each answer to its task's ``output``. common["threads"]: of torch, 0 = its own choice."""
+class TrainingTask(StudyTask):
+    """Train in ``folder``.
+
+    seconds: of training at most, None: the settings' epochs. pace: file of the seconds of an epoch, where ``seconds``
+    limit them.
+    """
+
+    settings: Settings
+    seconds: float | None
+    pace: Path
+    folder: Path
+
+
+class FileWorker(ABC):
+    """A worker that writes each answer to its task's ``output``.
+
+    common: "threads" of torch, 0 = its own choice, and its "device".
+    """
+
+    TASK: ClassVar[TypeAdapter[Any]]
+    """What it is asked."""
 
     def __init__(self, common: dict[str, Any]) -> None:
         import torch
 
         if common["threads"]:
             torch.set_num_threads(common["threads"])
-        self.threads = torch.get_num_threads()
+        self.threads, self.device = torch.get_num_threads(), common["device"]
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
-        made = self.answer(task).model_dump(mode="json", by_alias=True, exclude_unset=True)
+        made = self.answer(self.TASK.validate_python(task)).model_dump(mode="json", by_alias=True, exclude_unset=True)
         write_json(Path(task["output"]), made)
         return made
 
-    def answer(self, task: dict[str, Any]) -> BaseModel:
+    @abstractmethod
+    def answer(self, task: Any) -> BaseModel:
         """What the file will hold; fields that were not given are left out."""
-        raise NotImplementedError
-
-
-def weights_or_none() -> Any:
-    """Weights of the perceptual metrics, None where there are none, which the parent process has said."""
-    from dnrtrain.weights import WeightsMissing, load_weights
-
-    try:
-        return load_weights()
-    except WeightsMissing:
-        return None
-
-
-Fingerprinted = TypeVar("Fingerprinted", bound=StudyTask)
-
-
-def once(tasks: Iterable[Fingerprinted]) -> list[Fingerprinted]:
-    """The first task of each fingerprint."""
-    found: dict[str, Fingerprinted] = {}
-    for task in tasks:
-        found.setdefault(task.fingerprint, task)
-    return list(found.values())
 
 
 def files_of(folder: Path, fingerprint: str) -> dict[str, Any]:
@@ -80,22 +79,11 @@ def files_of(folder: Path, fingerprint: str) -> dict[str, Any]:
     return {"fingerprint": fingerprint, **made}
 
 
-class Step1Task(StudyTask):
-    """Train step 1 into ``folder`` -> `Step1Result`.
-
-    Args:
-        policy: chooses the views.
-        seconds: of training at most; None: the settings' epochs.
-        pace: file of the seconds of an epoch; needed where ``seconds`` limit them.
-    """
+class Step1Task(TrainingTask):
+    """Train step 1 -> `Step1Result`. policy: chooses the views."""
 
     kind: Literal["step1"] = "step1"
-    settings: Settings
     policy: str
-    seed: int
-    seconds: float | None
-    pace: Path | None = None
-    folder: Path
 
     def result(self) -> Step1Result:
         """What it gave, once it is done."""
@@ -119,37 +107,33 @@ class Step1Result(TrainingCost):
     epochs: int
 
 
-class CellTask(StudyTask):
+class CellTask(TrainingTask):
     """Train step 2, measure all test views -> `CellResult`.
 
     Args:
         network: False measures the base image alone.
-        views: of training.
-        targets: folder under raytraced/ of their pictures.
+        targets: folder under raytraced/ of the training views' pictures.
         coarse, coarse_cost: folder of step 1 and what that took; None where the network starts fresh.
-        seconds: of both steps; None: the settings' epochs.
+        seconds: of both steps.
         full_step1: step 1 counts as its whole share of the seconds, whatever it took.
-        pace: file of the seconds of an epoch, where ``seconds`` limit them.
-        folder: of the model, removed once it is measured.
+        folder: removed once the model is measured.
         picture: where one test view is kept, None: nowhere.
-        code: of `provenance.code_state`.
     """
 
     kind: Literal["cell"] = "cell"
     scene: str
-    seed: int
-    settings: Settings
     network: bool
     views: list[str]
     targets: str = "train"
     coarse: Path | None
     coarse_cost: Step1Result | None
-    seconds: float | None
     full_step1: bool
-    pace: Path
-    folder: Path
     picture: Path | None
     code: dict[str, Any]
+
+    def result(self) -> CellResult:
+        """What it gave, once it is done."""
+        return CellResult.model_validate_json(self.output.read_bytes())
 
 
 class Training(BaseModel):
@@ -168,7 +152,6 @@ class CellResult(BaseModel):
     """A cell's file.
 
     Args:
-        key: the task's fingerprint.
         settings: "model" and "step2", as they were given.
         frame_ms, base_ms: median milliseconds of the network's frame and of a base image.
         tests: a row of metrics per test view.
@@ -191,13 +174,7 @@ class CellResult(BaseModel):
 
     @property
     def base(self) -> str:
-        """Kind of its base images."""
         return self.settings["model"]["base"]
-
-
-def read_cell(path: Path) -> CellResult:
-    """A cell's file."""
-    return CellResult.model_validate_json(path.read_bytes())
 
 
 class ChoiceFile(BaseModel):

@@ -71,25 +71,18 @@ class Ours:
         {name: ms}}."""
         result: dict[str, dict[str, Any]] = {}
         for renderer in self.renderers.values() or (None,):
-            result |= self._frame(renderer, view, clock)
-        return result
-
-    def _frame(self, renderer: BaseRenderer | None, view: View, clock: Clock) -> dict[str, dict[str, Any]]:
-        result: dict[str, dict[str, Any]] = {}
-        channels, parts = self._inputs(renderer, view, clock)
-        rays = "" if renderer is None else f", {renderer.samples} rays"
-        if renderer is not None:
-            alpha = channels["coverage"]
-            straight = (
-                np.stack([channels[f"base.{c}"] for c in "RGB"], axis=-1)
-                / np.maximum(channels["base.A"], 1e-6)[..., None]
-            )
-            picture = np.concatenate([straight * alpha[..., None], alpha[..., None]], axis=-1)
-            result[BASE + rays] = {"picture": self.scene.shown(picture), "parts": dict(parts)}
-        if self.model is not None:
-            data = self._data(view, channels)
-            picture, parts["network"] = clock.time(partial(render_views, self.model, data))
-            result[NEURAL + rays] = {"picture": picture.float(), "parts": parts}
+            channels, parts = self._inputs(renderer, view, clock)
+            rays = "" if renderer is None else f", {renderer.samples} rays"
+            if renderer is not None:
+                alpha = channels["coverage"][..., None]
+                base = np.stack([channels[f"base.{c}"] for c in "RGB"], axis=-1)
+                straight = base / np.maximum(channels["base.A"], 1e-6)[..., None]
+                picture = self.scene.shown(np.concatenate([straight * alpha, alpha], axis=-1))
+                result[BASE + rays] = {"picture": picture, "parts": dict(parts)}
+            if self.model is not None:
+                data = self._data(view, channels)
+                picture, parts["network"] = clock.time(partial(render_views, self.model, data))
+                result[NEURAL + rays] = {"picture": picture.float(), "parts": parts}
         return result
 
     def _inputs(

@@ -1,9 +1,7 @@
 """`dnrpipe frontier`: what accuracy costs in time, measured: our choices, baselines, and the best of all.
 
-measure_frontier     options in; results.json, results.csv and plots out
-sweep                the points as rows of an ablation: views x samples x steps, and other ways to train
-path_tracing_worker  path tracing of the test views with and without a denoiser, in a process of its own
-cycles_worker        Cycles on the test views, measured against its own reference
+measure_frontier     the points as rows of an ablation: views x samples x steps, and other ways to train; baselines
+baseline_worker      path tracing of the test views with and without a denoiser; Cycles, by its own reference
 point_costs          what each point cost before its first frame, and each frame; break-even
 frontier_plots       metrics against total seconds
 frontier_report      the table and the sentences below it

@@ -80,11 +80,7 @@ def _panel(axis: Any, results: FrontierResults, frames: int, metric: Metric) -> 
     axis.set_axisbelow(True)
 
 
-def _front(
-    everything: Iterable[Point | BaselinePoint],
-    frames: int,
-    metric: Metric,
-) -> list[tuple[float, float]]:
+def _front(everything: Iterable[Point | BaselinePoint], frames: int, metric: Metric) -> list[tuple[float, float]]:
     """(seconds, metric) of those that no other of them beats, cheapest first."""
     by_name = {one.name: one for one in everything}
     names = pareto(by_name.values(), frames, metric)

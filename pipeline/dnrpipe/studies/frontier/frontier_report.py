@@ -26,14 +26,13 @@ def markdown(results: FrontierResults) -> str:
 
 def _front(results: FrontierResults, frames: int) -> list[str]:
     everything = results.everything
-    names = pareto(everything.values(), frames)
     lines = [
         f"## {frames} frames",
         "",
         "| what nothing beats | seconds | before the first frame | a frame, ms | dB | SSIM | LPIPS (VGG) | FLIP |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for name in names:
+    for name in pareto(everything.values(), frames):
         one = everything[name]
         lines.append(
             f"| {name} | {total_seconds(one, frames):.1f} | {one.upfront:.1f} |"

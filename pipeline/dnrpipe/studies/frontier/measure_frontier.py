@@ -1,5 +1,8 @@
 """`dnrpipe frontier` behind its options: the sweep, the baselines, and what it writes into ``frontier/``.
 
+Every point is a row of an ablation, so that it shares its workers, coarse models and resuming. Views, references and
+base images are traced once, into the workspace itself.
+
 results.json  results.csv  frontier-<N>.png (one per number of frames)  report.md
 """
 
@@ -7,7 +10,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from dnrtrain.atomic import atomic_path, write_json, write_text
@@ -15,11 +18,14 @@ from dnrtrain.atomic import atomic_path, write_json, write_text
 from ...core.errors import UserError
 from ...core.scene_files import scene_fingerprint, split_views
 from ...core.settings import Settings
-from ...core.workspace import digest
+from ...core.workspace import Workspace, digest
 from ...stages.stage import Run
 from ...workers.view_tasks import worker_count
-from ..ablation.cell_loop import Request
-from ..cells.provenance import made_by
+from ..ablation.ablate import Ablation
+from ..ablation.rows import CLASSIC, ROWS, Row, ViewChoice
+from ..cells.results import made_by
+from ..cells.scenes import Scene, prepared, without_left_out
+from ..cells.study import WorkerPool
 from .frontier_plots import plot
 from .frontier_report import markdown
 from .point_costs import break_evens, pareto, point_of, settle_frames
@@ -32,15 +38,66 @@ from .records import (
     FrontierResults,
     PathTracingTask,
 )
-from .sweep import OTHERS, Frontier, Sweep
 
 BASELINE_VERSION, CYCLES_VERSION = 1, 1
+BASELINE_WORKER = "dnrpipe.studies.frontier.baseline_worker"
 CYCLES = "cycles"
+OTHERS = ("random", "all", "paper")
+"""Other ways to train, compared at the settings' own samples and epochs."""
 SAMPLE_COUNTS = (1, 2, 4, 8, 16, 64)
 COLUMNS: tuple[str, ...] = (
     "name", "kind", "seed", "views", "spp", "steps", "upfront", "frame_ms", "psnr", "ssim", "lpips_vgg", "flip",
     "rival_ms", "break_even",
 )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """budgets (views), samples per pixel, optimiser steps: every combination is trained. also: of OTHERS."""
+
+    budgets: tuple[int, ...]
+    samples: tuple[int, ...]
+    steps: tuple[int, ...]
+    also: tuple[str, ...] = OTHERS
+
+    def rows(self, settings: Settings) -> list[Row]:
+        """All points as rows; the base image alone last. Raises UserError: no paper row at these sizes."""
+        batch = settings.finetune.step2.batch
+        found = [
+            self._row(f"{views} views, {spp} spp, {steps} steps", views, spp, max(1, round(steps * batch / views)))
+            for views in self.budgets
+            for spp in self.samples
+            for steps in self.steps
+        ]
+        spp, epochs = settings.raytrace.spp, settings.finetune.step2.epochs
+        if "random" in self.also:
+            found += [self._row(f"{views} random views", views, spp, epochs, "random") for views in self.budgets]
+        if "all" in self.also:
+            found.append(self._row("all candidates", None, spp, epochs, "all"))
+        if "paper" in self.also:
+            if settings.preset not in CLASSIC:
+                raise UserError(
+                    f"the paper's row has sizes for the presets {', '.join(CLASSIC)}; leave it out of --also"
+                )
+            found.append(replace(ROWS["paper"], budget=max(self.budgets)))
+        if settings.model.base != "none":
+            found.append(Row("base image alone", ROWS["base"].what, "dnr", network=False))
+        return found
+
+    @staticmethod
+    def _row(name: str, views: int | None, spp: int, epochs: int, views_by: ViewChoice = "farthest") -> Row:
+        changes = {"finetune": {"step2": {"epochs": epochs}}}
+        return Row(name, name, "dnr", changes, views_by, budget=views, spp=spp)
+
+
+@dataclass(kw_only=True)
+class Frontier(Ablation):
+    """An ablation of one scene: the workspace that is open."""
+
+    workspace: Workspace
+
+    def _open(self, source: Path) -> Scene:
+        return prepared(source.stem, Run(self.workspace, self.base, self.console), "frontier")
 
 
 def numbers(text: str | None, option: str, default: Sequence[int], most: int | None = None) -> tuple[int, ...]:
@@ -71,16 +128,7 @@ def run_frontier(
     seeds: int,
     jobs: int,
 ) -> FrontierResults:
-    """Measure what is due and write it -> the results.
-
-    Args:
-        run: workspace, settings and console.
-        budgets, spp, iterations: views, samples and optimiser steps of our points, as the options have them.
-        frames: numbers of frames to compare for.
-        also: names of other ways to train, and Cycles.
-        ladder: samples of the baselines.
-        seeds: trainings of every point.
-        jobs: cells side by side; 0: one per core.
+    """Measure what is due and write it -> the results. All but ``run`` are options of the command.
 
     Raises:
         UserError: unknown names, numbers that do not fit. TasksFailed: some cells failed; the others are written.
@@ -88,7 +136,9 @@ def run_frontier(
     workspace, settings = run.workspace, run.settings
     candidates = len(split_views(workspace)["train"])
     counts = numbers(frames, "--frames", (200, 2000))
-    others = _others(also)
+    others = () if also.strip() == "none" else tuple(filter(None, (part.strip() for part in also.split(","))))
+    if unknown := set(others) - {*OTHERS, CYCLES}:
+        raise UserError(f"--also {', '.join(sorted(unknown))}: choose of {', '.join((*OTHERS, CYCLES))}, or none")
     sweep = Sweep(
         budgets=numbers(budgets, "--budgets", (6, 12, settings.select.budget), candidates),
         samples=numbers(spp, "--spp", (16, settings.raytrace.spp)),
@@ -100,8 +150,8 @@ def run_frontier(
     out = workspace.root / "frontier"
     name, base = workspace.root.name.removesuffix(".dnr"), settings.model_copy(deep=True)
     base.select.budget = max((row.budget or 1 for row in rows), default=1)
-    request = Request(
-        scenes=[Path(f"{name}.blend")],
+    swept = Frontier(
+        sources=[Path(f"{name}.blend")],
         rows=rows,
         seeds=seeds,
         base=base,
@@ -109,25 +159,23 @@ def run_frontier(
         seconds=None,
         out=out,
         jobs=jobs,
+        console=run.console,
+        workspace=workspace,
     )
-    swept = Frontier(request, run.console, workspace=workspace)
     swept.run()
+    (scene,) = swept.scenes
     cores = worker_count(0)
-    traced = _trace_baselines(swept, settings, samples, cores)
+    worker_pool = replace(swept.worker_pool, threads=cores, workers=1)
+    traced = _trace_baselines(swept, scene, samples, worker_pool)
     baselines = traced.baselines
     if CYCLES in others:
-        baselines = [*baselines, *_cycles_baselines(swept, settings, samples, cores)]
+        baselines = [*baselines, *_cycles_baselines(swept, scene, samples, worker_pool)]
     points = [
         point
         for seed in range(seeds)
         for row in rows
-        if (row.network or seed == 0) and (point := point_of(swept, row, seed, traced.base_ms, cores))
+        if (row.network or seed == 0) and (point := point_of(swept, scene, row, seed, traced.base_ms, cores))
     ]
-    if seeds > 1:
-        points = [
-            point if point.kind == "base" else point.model_copy(update={"name": f"{point.name}, seed {point.seed}"})
-            for point in points
-        ]
     points = break_evens(settle_frames(points), baselines)
     results = FrontierResults(
         schema_version=SCHEMA,
@@ -138,7 +186,7 @@ def run_frontier(
         sweep=asdict(sweep),
         frames=list(counts),
         cores=cores,
-        test_views=len(swept.scene.test),
+        test_views=len(scene.test),
         evaluation_spp=settings.raytrace.evaluation_spp,
         threads=swept.threads,
         baseline_threads=traced.threads,
@@ -150,32 +198,20 @@ def run_frontier(
     return results
 
 
-def _others(text: str) -> tuple[str, ...]:
-    """Names of other ways to train, and Cycles."""
-    if text.strip() == "none":
-        return ()
-    names = tuple(filter(None, (part.strip() for part in text.split(","))))
-    if unknown := set(names) - {*OTHERS, CYCLES}:
-        raise UserError(f"--also {', '.join(sorted(unknown))}: choose of {', '.join((*OTHERS, CYCLES))}, or none")
-    return names
-
-
-def _trace_baselines(swept: Frontier, settings: Settings, samples: tuple[int, ...], cores: int) -> BaselineFile:
+def _trace_baselines(swept: Ablation, scene: Scene, samples: tuple[int, ...], worker_pool: WorkerPool) -> BaselineFile:
     """Path tracing of the test views, rendered where it is not on disk."""
-    references = sorted(swept.references[swept.scene.name].values())
-    model = swept.settings_of(swept.request.rows[0], swept.scene).model
-    base = settings.base.model_dump()
-    fingerprint = digest([BASELINE_VERSION, references, samples, model.base, base, cores, swept.perceptual])
+    settings = without_left_out(scene.workspace, swept.base)
+    facts = [swept.references[scene.name], samples, settings.model.base, settings.base.model_dump()]
+    fingerprint = digest([BASELINE_VERSION, *facts, worker_pool.threads, swept.perceptual])
     task = PathTracingTask(
         fingerprint=fingerprint,
-        workspace=swept.scene.workspace.root,
-        settings=settings.model_copy(update={"model": model}),
+        workspace=scene.workspace.root,
+        settings=settings,
         samples=list(samples),
-        output=swept.request.out / "rivals" / f"{fingerprint}.json",
+        output=swept.out / "rivals" / f"{fingerprint}.json",
         label="path tracing",
     )
-    worker_pool = replace(swept.worker_pool, threads=cores, workers=1)
-    worker_pool.work("path tracing of the test views", "dnrpipe.studies.frontier.path_tracing_worker", [task])
+    worker_pool.work("path tracing of the test views", BASELINE_WORKER, [task])
     found = BaselineFile.model_validate_json(task.output.read_bytes())
     if lost := sum(one.masked for one in found.baselines if not one.denoised):
         worker_pool.console.warn(f"repaired: {lost} pixels of the path-traced test views were not finite and are black")
@@ -183,17 +219,13 @@ def _trace_baselines(swept: Frontier, settings: Settings, samples: tuple[int, ..
 
 
 def _cycles_baselines(
-    swept: Frontier,
-    settings: Settings,
-    samples: tuple[int, ...],
-    cores: int,
+    swept: Ablation, scene: Scene, samples: tuple[int, ...], worker_pool: WorkerPool
 ) -> list[BaselinePoint]:
     """Cycles on the test views, rendered and measured where that is not on disk."""
-    workspace, views = swept.scene.workspace, split_views(swept.scene.workspace)["test"]
-    reference_spp, folder = settings.raytrace.evaluation_spp, swept.request.out / "rivals"
-    fingerprint = digest(
-        [CYCLES_VERSION, scene_fingerprint(workspace), [v.model_dump() for v in views], samples, reference_spp, cores]
-    )
+    workspace, views = scene.workspace, list(scene.test.values())
+    reference_spp, folder = swept.base.raytrace.evaluation_spp, swept.out / "rivals"
+    facts = [scene_fingerprint(workspace), [v.model_dump() for v in views], samples, reference_spp]
+    fingerprint = digest([CYCLES_VERSION, *facts, worker_pool.threads])
     pictures = folder / f"cycles-{fingerprint}"
     render = CyclesFramesTask(
         scene_dir=workspace.scene,
@@ -204,7 +236,6 @@ def _cycles_baselines(
         output=pictures / "frames.json",
         label="Cycles",
     )
-    worker_pool = replace(swept.worker_pool, threads=cores, workers=1)
     worker_pool.work("Cycles on the test views", "dnrpipe.blender.passes.cycles_frames", [render])
     measure = CyclesMeasureTask(
         workspace=workspace.root,
@@ -214,7 +245,7 @@ def _cycles_baselines(
         output=folder / f"{digest([fingerprint, swept.perceptual])}.json",
         label="Cycles",
     )
-    worker_pool.work("measuring Cycles", "dnrpipe.studies.frontier.cycles_worker", [measure])
+    worker_pool.work("measuring Cycles", BASELINE_WORKER, [measure])
     return BaselineFile.model_validate_json(measure.output.read_bytes()).baselines
 
 

@@ -14,56 +14,51 @@ from collections.abc import Iterable, Sequence
 from typing import Literal
 
 from ...core.ledger import break_even_frames, total, upfront_work
+from ...stages.base_images import RENDERED
+from ..ablation.ablate import Ablation
 from ..ablation.rows import Row
 from ..cells.measure import METRICS, mean_of, written_seconds
-from ..cells.scenes import base_file, traced_split
-from ..cells.tasks import read_cell
+from ..cells.scenes import Scene, base_files, traced_split
 from ..frames.pareto_front import Point as CostAndQuality
 from ..frames.pareto_front import crossover, frontier
 from .records import BaselinePoint, Metric, Point
-from .sweep import Frontier
 
 HIGHER_IS_BETTER: dict[Metric, bool] = {"psnr": True, "ssim": True, "lpips_vgg": False, "flip": False}
 
 
-def point_of(swept: Frontier, row: Row, seed: int, base_ms: float | None, cores: int) -> Point | None:
+def point_of(swept: Ablation, scene: Scene, row: Row, seed: int, base_ms: float | None, cores: int) -> Point | None:
     """A row's cell with its costs; None where the cell is not made yet.
 
-    Args:
-        swept: the sweep that made the cell.
-        row, seed: of the cell.
-        base_ms: of a base image by the baselines' clock; None: as the cell measured it.
-        cores: that ray tracing keeps busy.
+    base_ms: of a base image by the baselines' clock; None: as the cell measured it. cores: that ray tracing keeps busy.
     """
-    path = swept.cells.get((swept.scene.name, row.name, seed))
-    if path is None or not path.exists():
+    task = swept.cells.get((scene.name, row.name, seed))
+    if task is None or not task.output.exists():
         return None
-    cell = read_cell(path)
-    workspace, training = swept.scene.workspace, cell.training
-    based, work = cell.base not in ("none", "raster"), upfront_work(workspace.ledger.read())
-    split = traced_split(swept.request.base, row.spp)
+    cell = task.result()
+    workspace, training = scene.workspace, cell.training
+    work = upfront_work(workspace.ledger.read())
+    split = traced_split(swept.base, row.spp)
     parts: dict[str, float] = {"passes": 0.0, "tracing": 0.0, "light": 0.0, "base images": 0.0, "training": 0.0}
     if training is not None:
-        candidates = {f"train/{name}" for name in swept.scene.train}
+        candidates = {f"train/{name}" for name in scene.train}
         parts["passes"] = total(r for r in work["passes"] if r.name in candidates).cpu_seconds / cores
         parts["tracing"] = sum(written_seconds(workspace.raytraced(split, name)) for name in cell.views) / cores
         parts["training"] = training.cpu_seconds / cell.threads
-        if based:
-            files = [base_file(workspace, cell.base, "train", name) for name in cell.views]
-            parts["base images"] = sum(written_seconds(file) for file in files) / cores
+        files = base_files(workspace, cell.base, "train", cell.views)
+        parts["base images"] = sum(map(written_seconds, files)) / cores
     if cell.base == "baked":
         parts["light"] = total(work["light"]).cpu_seconds / cores
     return Point(
-        name=row.name,
+        name=f"{row.name}, seed {seed}" if swept.seeds > 1 and row.network else row.name,
         kind=_kind(row),
         seed=seed,
         views=len(cell.views),
-        spp=(row.spp or swept.request.base.raytrace.spp) if training else None,
+        spp=(row.spp or swept.base.raytrace.spp) if training else None,
         steps=training and training.step2.steps,
         parts={name: round(value, 3) for name, value in parts.items()},
         upfront=sum(parts.values()),
         network_ms=cell.frame_ms or 0.0,
-        base_ms=(base_ms or cell.base_ms or 0.0) if based else 0.0,
+        base_ms=(base_ms or cell.base_ms or 0.0) if cell.base in RENDERED else 0.0,
         **{name: mean_of(cell.tests, name) for name in METRICS},  # type: ignore[arg-type]
     )
 
@@ -82,16 +77,13 @@ def settle_frames(points: Sequence[Point]) -> list[Point]:
     Points of one model share the network's least milliseconds: they run the same operations, and other work on the
     machine only adds to them.
     """
-    least: dict[bool, float] = {}
-    for point in points:
-        if point.network_ms:
-            paper = point.kind == "paper"
-            least[paper] = min(point.network_ms, least.get(paper, point.network_ms))
-    networks = [least[point.kind == "paper"] if point.network_ms else 0.0 for point in points]
-    return [
-        point.model_copy(update={"frame_ms": point.base_ms + network})
-        for point, network in zip(points, networks, strict=True)
-    ]
+
+    def network_ms(point: Point) -> float:
+        model = point.kind == "paper"
+        return min(p.network_ms for p in points if p.network_ms and (p.kind == "paper") == model)
+
+    frames = [point.base_ms + (network_ms(point) if point.network_ms else 0.0) for point in points]
+    return [point.model_copy(update={"frame_ms": ms}) for point, ms in zip(points, frames, strict=True)]
 
 
 def break_evens(points: Sequence[Point], baselines: Sequence[BaselinePoint]) -> list[Point]:

@@ -13,7 +13,7 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 from ...blender.tasks import CyclesTask
 from ...core.errors import UserError
 from ...core.settings import Settings
-from ..cells.provenance import read_made
+from ..cells.results import read_made
 from ..cells.tasks import PoolTask
 
 SCHEMA = 1
@@ -78,7 +78,6 @@ class Point(Measured):
 
     @property
     def ms(self) -> float:
-        """Milliseconds of a frame."""
         return self.frame_ms
 
 
@@ -96,7 +95,6 @@ class BaselinePoint(Measured):
 
     @property
     def by_cycles(self) -> bool:
-        """Whether Cycles rendered it."""
         return self.name.startswith(CYCLES_PREFIX)
 
 
@@ -104,13 +102,12 @@ CYCLES_PREFIX = "Cycles "
 
 
 class FrontierResults(Record):
-    """``frontier/results.json``. The first fields are of `provenance.made_by`.
+    """``frontier/results.json``. The first fields are of `results.made_by`.
 
     Args:
-        sweep: fields of `sweep.Sweep`.
+        sweep: fields of `measure_frontier.Sweep`.
         frames: numbers of frames that are compared for.
         threads, baseline_threads: of cells, and of path tracing.
-        points, baselines: everything measured.
         pareto: by number of frames, what nothing else beats, cheapest first.
     """
 

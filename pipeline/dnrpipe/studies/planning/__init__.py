@@ -3,7 +3,6 @@
 make_plan     pilot, prediction, choice; writes ``plan/plan.json``
 records       what stands in ``plan/pilot.json`` and ``plan/plan.json``
 pilot         small runs of everything that costs time, kept in ``plan/pilot.json``
-pilot_parts   what the pilot does
 pilot_worker  its training and frames, in a process of their own
 seconds       pilot -> seconds of every stage (straight lines, each with its slope and its start)
 quality       pilot and prior -> PSNR by views, samples and steps

@@ -27,12 +27,8 @@ FILLED = 0.97
 def apply(session: Session, plan: Plan, prior: Prior | None = None) -> Plan:
     """Run the stages with the plan's choice and return the plan as it was carried out, which is written, too.
 
-    ``carried_out`` is the choice once its steps fit the time left; ``actual`` is what it took and gave.
-
-    Args:
-        session: of the workspace; it adopts the plan's settings.
-        plan: with a choice.
-        prior: by default the package's.
+    ``carried_out`` is the choice once its steps fit the time left; ``actual`` is what it took and gave. The session
+    adopts the plan's settings. prior: by default the package's.
     """
     workspace = session.workspace
     before = len(workspace.ledger.read())
@@ -84,10 +80,7 @@ def steps_within(predictor: Predictor, choice: Choice, seconds: float) -> Predic
 
 
 def steps_that_fit(session: Session, plan: Plan, prior: Prior) -> Plan:
-    """The plan with ``carried_out`` where it spends a time.
-
-    With a wanted PSNR, or where all was traced by an earlier run, it stays as it is.
-    """
+    """The plan with ``carried_out``; as it is without a wanted time, with a wanted PSNR, or if all was traced."""
     wanted, answers = plan.wanted.seconds, session.answers
     pilot = read_pilot(session.workspace)
     if wanted is None or plan.wanted.psnr is not None or not answers["raytrace"]["ran"] or pilot is None:

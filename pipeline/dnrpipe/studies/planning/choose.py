@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from .quality import Gain, Prior, predict
+from .quality import Quality
 from .records import Choice, Interval, Pilot, Prediction, Seconds
 from .seconds import TIME_SPREAD, Costs, noise_at
 
@@ -20,24 +21,12 @@ NEAR = 0.02
 
 @dataclass(frozen=True)
 class Predictor:
-    """Costs and quality of any choice.
-
-    Args:
-        pilot: of the workspace.
-        wall, processor: costs by either clock.
-        prior: of all scenes.
-        base, gain, judged, reference: of the pilot; see `quality`.
-        batch: views a step.
-    """
+    """Costs, by either clock, and quality of any choice. batch: views a step."""
 
     pilot: Pilot
     wall: Costs
     processor: Costs
-    prior: Prior
-    base: float
-    gain: Gain
-    judged: float
-    reference: float
+    quality: Quality
     batch: int
 
     def choice(self, views: int, spp: int, steps: int) -> Choice:
@@ -49,42 +38,26 @@ class Predictor:
     def predict(self, choice: Choice) -> Prediction:
         """What the choice is expected to cost and give."""
         assert self.pilot.trace is not None
-        select = self.wall.work.policy_seconds
-        raytrace = self.wall.raytrace(choice.views, choice.spp)
-        finetune = self.wall.finetune(choice.steps, choice.epochs)
-        total = select + raytrace + finetune
-        seconds = Seconds(
-            select=select,
-            raytrace=raytrace,
-            finetune=finetune,
-            evaluate=self.wall.evaluate(),
-            total=Interval(expected=total, low=total / TIME_SPREAD, high=total * TIME_SPREAD),
-        )
-        noise = noise_at(self.pilot.trace, choice.spp)
+        views, steps, epochs = choice.views, choice.steps, choice.epochs
+        stages = {
+            "select": self.wall.work.policy_seconds,
+            "raytrace": self.wall.raytrace(views, choice.spp),
+            "finetune": self.wall.finetune(steps, epochs),
+        }
+        total = sum(stages.values())
+        within = Interval(expected=total, low=total / TIME_SPREAD, high=total * TIME_SPREAD)
         return Prediction(
             choice=choice,
-            seconds=seconds,
-            cpu_seconds=self.processor.raytrace(choice.views, choice.spp)
-            + self.processor.finetune(choice.steps, choice.epochs),
-            psnr=predict(
-                self.prior,
-                self.base,
-                self.gain,
-                choice.views,
-                choice.steps,
-                noise,
-                judged=self.judged,
-                reference=self.reference,
-            ),
+            seconds=Seconds(**stages, evaluate=self.wall.evaluate(), total=within),
+            cpu_seconds=self.processor.raytrace(views, choice.spp) + self.processor.finetune(steps, epochs),
+            psnr=self.quality.predict(views, steps, noise_at(self.pilot.trace, choice.spp)),
         )
 
     def grid(self, candidates: int) -> Iterator[Prediction]:
         """All choices with at most ``candidates`` views."""
         views = sorted({*(n for n in VIEWS if n <= candidates), candidates})
-        for count in views:
-            for spp in SAMPLES:
-                for steps in STEPS:
-                    yield self.predict(self.choice(count, spp, steps))
+        for wanted in itertools.product(views, SAMPLES, STEPS):
+            yield self.predict(self.choice(*wanted))
 
 
 def best_within(grid: list[Prediction], seconds: float) -> Prediction | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from typing import Any
 
 from dnrtrain.selector.names import TRAINED_NAMES
 
@@ -15,12 +16,11 @@ from ...stages.base_images import base_renderer
 from ...stages.stage import Run
 from .choose import Predictor, best_within, budgets, cheapest_reaching
 from .pilot import run_pilot
-from .quality import Gain, Prior, load_prior, measured_gains, scene_gain, views_error, with_noise
-from .records import Choice, Pilot, PilotFacts, Plan, Prediction, PriorFacts, Route, Wanted, read_plan, write_plan
+from .quality import Prior, Quality, load_prior, measured_gains, scene_gain, views_error, with_noise
+from .records import Pilot, PilotFacts, Plan, Prediction, PriorFacts, Route, Wanted, read_plan, write_plan
 from .routes import as_reported, break_even, routes
-from .seconds import Costs, Work, noise_at
+from .seconds import Costs, Work, noise_at, trained_pixels
 
-BLIND_POLICY = "farthest"
 RULE_SECONDS = 2.0
 """Wall seconds allowed for a choice of views that trains nothing."""
 
@@ -37,23 +37,26 @@ def make_plan(run: Run, wanted: Wanted, prior: Prior | None = None) -> Plan:
     candidates = len(split_views(workspace)["train"])
     grid = list(predictor.grid(candidates))
     chosen = _choose(grid, wanted)
+    views, epochs = min(settings.select.budget, candidates), settings.finetune.step2.epochs
+    default = predictor.choice(views, settings.raytrace.spp, epochs * -(-views // predictor.batch))
+    asked: dict[str, Any] = {}
+    if wanted.frames is not None:
+        found, at = whether_to_train(predictor, grid, wanted, chosen)
+        train = found[0].reaches and found[0].name == "neural renderer"
+        asked = {"routes": found, "routes_psnr": at, "break_even": break_even(found), "train": train}
     plan = Plan(
         made=time.time(),
         wanted=wanted,
         pilot=PilotFacts(fingerprint=pilot.fingerprint, seconds=pilot.seconds, load=pilot.load),
         policy=policy_of(workspace, settings),
-        base_psnr=with_noise(predictor.base, predictor.reference),
-        gain=predictor.gain.most,
+        base_psnr=with_noise(predictor.quality.base, predictor.quality.reference),
+        gain=predictor.quality.gain.most,
         chosen=chosen,
         table=budgets(grid),
         prior=PriorFacts(source=prior.source, scenes=prior.scenes, sd=prior.sd),
-        settings_default=predictor.predict(_default(predictor, settings, candidates)),
+        settings_default=predictor.predict(default),
+        **asked,
     )
-    if wanted.frames is not None:
-        found, at = whether_to_train(predictor, grid, wanted, chosen)
-        train = found[0].reaches and found[0].name == "neural renderer"
-        answer = {"routes": found, "routes_psnr": at, "break_even": break_even(found), "train": train}
-        plan = plan.model_copy(update=answer)
     if carried_out := _carried_out(workspace, plan):
         plan = plan.model_copy(update={"carried_out": carried_out})
     write_plan(workspace.root, plan)
@@ -62,51 +65,42 @@ def make_plan(run: Run, wanted: Wanted, prior: Prior | None = None) -> Plan:
 
 def make_predictor(workspace: Workspace, settings: Settings, pilot: Pilot, prior: Prior) -> Predictor:
     """Costs and quality of any choice in this workspace, by its pilot."""
-    assert pilot.frames is not None and pilot.training is not None  # the pilot is complete
+    frames, training, trace = pilot.frames, pilot.training, settings.raytrace
+    assert frames is not None and training is not None and pilot.trace is not None  # the pilot is complete
     plan = plan_of(workspace, settings)
     renderer = base_renderer(workspace, settings, plan)
     light = renderer.light
     due = None if light is None or renderer.light_is_baked else (light["size"], light["spp"])
     width, height = settings.cameras.width, settings.cameras.height
-    patch = settings.finetune.step2.patch or max(width, height)
-    frames, training = pilot.frames, pilot.training
+    splits = split_views(workspace)
+    trains = policy_of(workspace, settings) in TRAINED_NAMES or settings.starts_coarse
+    steps = settings.select.step1.epochs * len(splits["train"])
     work = Work(
         pixels=width * height,
-        trained=min(patch, width) * min(patch, height),
+        trained=trained_pixels(settings, width, height),
         light=due,
-        policy_seconds=_policy_seconds(workspace, settings, training.seconds),
-        tests=len(split_views(workspace).get("test", [])),
-        evaluation_spp=settings.raytrace.evaluation_spp,
+        policy_seconds=steps * training.seconds if trains else RULE_SECONDS,  # steps as long as the pilot's
+        tests=len(splits.get("test", [])),
+        evaluation_spp=trace.evaluation_spp,
     )
+    base, noise = frames.base.psnr, noise_at(pilot.trace, training.spp)
+    networks = zip(training.steps, (point.psnr for point in frames.neural), strict=True)
+    reference = noise_at(pilot.trace, trace.evaluation_spp, raw=not trace.evaluation_denoise)
+    if trace.evaluation_denoise and not trace.denoise:  # the pilot denoised nothing, so it cannot tell
+        reference = 0.0
     return Predictor(
         pilot=pilot,
         wall=Costs(pilot, work, "seconds"),
         processor=Costs(pilot, work, "cpu_seconds"),
-        prior=prior,
-        base=frames.base.psnr,
-        gain=_gain(pilot, prior),
-        judged=views_error(frames.deviation, frames.views, work.tests),
-        reference=_reference_noise(settings, pilot),
+        quality=Quality(
+            prior=prior,
+            base=base,
+            gain=scene_gain(prior, measured_gains(prior, base, training.views, noise, networks)),
+            judged=views_error(frames.deviation, frames.views, work.tests),
+            reference=reference,
+        ),
         batch=settings.finetune.step2.batch,
     )
-
-
-def _gain(pilot: Pilot, prior: Prior) -> Gain:
-    """What is known of the scene's gain after its pilot."""
-    assert pilot.frames is not None and pilot.training is not None and pilot.trace is not None
-    training, frames = pilot.training, pilot.frames
-    noise = noise_at(pilot.trace, training.spp)
-    networks = zip(training.steps, (point.psnr for point in frames.neural), strict=True)
-    return scene_gain(prior, measured_gains(prior, frames.base.psnr, training.views, noise, networks))
-
-
-def _reference_noise(settings: Settings, pilot: Pilot) -> float:
-    """RMSE of the test views' references; 0 where the pilot cannot tell, for it denoised nothing."""
-    assert pilot.trace is not None
-    trace = settings.raytrace
-    if trace.evaluation_denoise and not trace.denoise:
-        return 0.0
-    return noise_at(pilot.trace, trace.evaluation_spp, raw=not trace.evaluation_denoise)
 
 
 def whether_to_train(
@@ -125,19 +119,16 @@ def whether_to_train(
     neural = cheapest_reaching(grid, at)
     width, height = predictor.pilot.size
     scale = predictor.wall.work.pixels / (width * height)
-    part = as_reported(predictor.pilot.frames, predictor.reference)
+    part = as_reported(predictor.pilot.frames, predictor.quality.reference)
     found = routes(part, neural, predictor.wall.light(), scale, at, wanted.frames)
     return found, at
 
 
 def policy_of(workspace: Workspace, settings: Settings) -> str:
-    """The policy that the plan counts on.
-
-    It is the settings', or farthest points in place of a trained one that nobody asked for by name.
-    """
+    """The policy that the plan counts on: the settings', or farthest points for a trained one that nobody named."""
     named = workspace.manifest.overrides.get("select", {}).get("policy")
     trained = settings.select.policy in TRAINED_NAMES
-    return BLIND_POLICY if trained and named is None else settings.select.policy
+    return "farthest" if trained and named is None else settings.select.policy
 
 
 def _choose(grid: list[Prediction], wanted: Wanted) -> Prediction | None:
@@ -173,23 +164,8 @@ def _carried_out(workspace: Workspace, plan: Plan) -> Prediction | None:
         before = read_plan(workspace.root)
     except UserError:  # truncated, or of another version
         return None
-    if before is None or before.chosen is None or plan.chosen is None:
-        return None
-    same = before.wanted == plan.wanted and before.policy == plan.policy
-    same = same and before.pilot.fingerprint == plan.pilot.fingerprint
-    return before.carried_out if same and before.chosen.choice == plan.chosen.choice else None
 
+    def decisive(one: Plan) -> tuple[Any, ...]:
+        return one.wanted, one.policy, one.pilot.fingerprint, one.chosen and one.chosen.choice
 
-def _default(predictor: Predictor, settings: Settings, candidates: int) -> Choice:
-    """The settings as they are."""
-    views = min(settings.select.budget, candidates)
-    steps = settings.finetune.step2.epochs * -(-views // predictor.batch)
-    return predictor.choice(views, settings.raytrace.spp, steps)
-
-
-def _policy_seconds(workspace: Workspace, settings: Settings, step_seconds: float) -> float:
-    """Of the selection. A trained policy's steps are taken to last as long as the pilot's."""
-    trains = policy_of(workspace, settings) in TRAINED_NAMES or settings.finetune.step2.start == "coarse"
-    if not trains:
-        return RULE_SECONDS
-    return settings.select.step1.epochs * len(split_views(workspace)["train"]) * step_seconds
+    return before.carried_out if before is not None and decisive(before) == decisive(plan) else None

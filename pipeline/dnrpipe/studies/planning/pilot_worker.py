@@ -20,7 +20,8 @@ from dnrtrain.contract import View
 from ...core.scene_files import read_frame
 from ...core.settings import Settings
 from ...core.workspace import Workspace
-from ..cells.tasks import weights_or_none
+from ...stages.trainer import perceptual_weights, torch_device
+from ..cells.cell import finished_record
 from .records import Record
 
 if TYPE_CHECKING:
@@ -63,10 +64,8 @@ class FramesTask(Record):
 
     The answer holds fields of `records.FramePart`, and "unknown": pixels that no reference knows.
 
-    Args:
-        folders: of the models.
-        light: file of the baked light, None where there is none.
-        samples, methods: of the baselines.
+    folders: of the models. light: file of the baked light, None where there is none. samples, methods: of the
+    baselines.
     """
 
     kind: Literal["frames"] = "frames"
@@ -93,7 +92,7 @@ class Worker:
         return self._frames(FramesTask.model_validate(task))
 
     def _train(self, task: TrainTask) -> dict[str, Any]:
-        weights = weights_or_none()  # training will do without, too
+        weights = perceptual_weights(None)  # training will do without, too
         found = [
             self._train_one(task, weights, folder, epochs)
             for folder, epochs in zip(task.folders, task.epochs, strict=True)
@@ -101,12 +100,9 @@ class Worker:
         return found[-1] | {"steps": [one["steps"] for one in found], "threads": self.threads}
 
     def _train_one(self, task: TrainTask, weights: Any, folder: Path, epochs: int) -> dict[str, Any]:
-        from dnrtrain.checkpoint import read_record
         from dnrtrain.dataset import load_views
         from dnrtrain.events import EpochEnd
         from dnrtrain.step2 import run_step2
-
-        from ...stages.trainer import torch_device
 
         started = time.monotonic()
         step2 = self.settings.finetune.step2.model_copy(
@@ -142,9 +138,7 @@ class Worker:
                 last = now
         took = time.monotonic() - started
         between, cpu_between = np.maximum(0.0, np.median(gaps, axis=0)).tolist()
-        record = read_record(folder)
-        assert record is not None  # training has just finished
-        history = record.history
+        history = finished_record(folder).history
         later = history[1:] or history  # the first epoch warms up
         steps = sum(entry.steps for entry in later)
         booked = sum(entry.seconds for entry in history)

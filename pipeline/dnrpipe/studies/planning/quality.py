@@ -146,29 +146,23 @@ def without_noise(psnr: float, noise: float) -> float:
     return -10 * math.log10(max(10 ** (-psnr / 10) - noise**2, LEAST_MSE))
 
 
-def predict(
-    prior: Prior,
-    base: float,
-    gain: Gain,
-    views: int,
-    steps: int,
-    noise: float,
-    *,
-    judged: float = 0.0,
-    reference: float = 0.0,
-) -> Interval:
-    """PSNR that a choice is expected to give, dB.
+@dataclass(frozen=True)
+class Quality:
+    """PSNR of any choice on a scene, dB.
 
-    Args:
-        prior: of all scenes.
-        base: PSNR of the base image alone.
-        gain: of `scene_gain`.
-        views, steps: of the choice.
-        noise: RMSE of the training pictures.
-        judged: of `views_error`.
-        reference: RMSE of the references.
+    base: PSNR of the base image alone. judged: of `views_error`. reference: RMSE of the references.
     """
-    added, unsure = gain.at(prior, views, steps)
-    expected = with_noise(base + added, math.hypot(learned_noise(prior, noise, views, steps), reference))
-    spread = NINE_IN_TEN * math.hypot(prior.sd, unsure, judged)
-    return Interval(expected=expected, low=expected - spread, high=expected + spread)
+
+    prior: Prior
+    base: float
+    gain: Gain
+    judged: float = 0.0
+    reference: float = 0.0
+
+    def predict(self, views: int, steps: int, noise: float) -> Interval:
+        """What is expected of training on pictures whose RMSE is ``noise``."""
+        added, unsure = self.gain.at(self.prior, views, steps)
+        learned = learned_noise(self.prior, noise, views, steps)
+        expected = with_noise(self.base + added, math.hypot(learned, self.reference))
+        spread = NINE_IN_TEN * math.hypot(self.prior.sd, unsure, self.judged)
+        return Interval(expected=expected, low=expected - spread, high=expected + spread)

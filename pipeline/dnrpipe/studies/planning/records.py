@@ -221,7 +221,6 @@ class Plan(Record):
         gain: dB that the network adds with many views and steps.
         chosen: None where a table was asked for, or where nothing reaches the target.
         table: what each of a row of budgets buys.
-        settings_default: the settings as they are.
         routes: to the wanted frames at ``routes_psnr``, the cheapest first.
         break_even: frames from which on training is cheaper than path tracing; None where it never is.
         train: whether the neural renderer is the cheapest route.
@@ -254,14 +253,9 @@ class Plan(Record):
         return self.model_dump(mode="json", by_alias=True, exclude=set(OPTIONAL - self.model_fields_set))
 
 
-def plan_path(root: Path) -> Path:
-    """``plan/plan.json`` of a workspace's folder."""
-    return root / FOLDER / "plan.json"
-
-
 def read_plan(root: Path) -> Plan | None:
     """The plan of a workspace's folder, None where there is none. Raises UserError: damaged, or of another version."""
-    path = plan_path(root)
+    path = root / FOLDER / "plan.json"
     try:
         return Plan.model_validate_json(path.read_bytes())
     except FileNotFoundError:
@@ -272,4 +266,4 @@ def read_plan(root: Path) -> Plan | None:
 
 def write_plan(root: Path, plan: Plan) -> None:
     """Write ``plan/plan.json``, atomically."""
-    write_json(plan_path(root), plan.data())
+    write_json(root / FOLDER / "plan.json", plan.data())

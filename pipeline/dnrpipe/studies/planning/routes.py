@@ -48,13 +48,8 @@ def as_reported(part: FramePart, reference: float) -> FramePart:
     def shown(point: FramePoint) -> FramePoint:
         return point.model_copy(update={"psnr": with_noise(point.psnr, reference)})
 
-    return part.model_copy(
-        update={
-            "base": shown(part.base),
-            "neural": [shown(point) for point in part.neural],
-            "rival": [shown(point) for point in part.rival],
-        }
-    )
+    changed = {"neural": list(map(shown, part.neural)), "rival": list(map(shown, part.rival))}
+    return part.model_copy(update={"base": shown(part.base), **changed})
 
 
 def routes(
@@ -72,32 +67,33 @@ def routes(
         neural: the cheapest choice that reaches ``psnr``, None where none does.
         light_seconds: of baking the light.
         scale: pixels of a frame over the pilot's.
-        psnr: dB wanted.
-        frames: number of them.
     """
+
+    def add(name: str, what: str, upfront: float, frame: float, gives: float | None, reaches: bool) -> None:
+        total = upfront + frames * frame
+        found.append(
+            Route(name=name, what=what, upfront=upfront, frame=frame, total=total, psnr=gives, reaches=reaches)
+        )
+
     found: list[Route] = []
     line = baseline_front(part)
-    answer = seconds_for(line, psnr)
-    if answer is None:
+    if (answer := seconds_for(line, psnr)) is None:
         name, seconds, quality = line[-1]
         what = f"its best, {name}, ends at {quality:.1f} dB"
-        found.append(_route("path tracing + denoiser", what, 0.0, seconds * scale, frames, quality, quality >= psnr))
+        add("path tracing + denoiser", what, 0.0, seconds * scale, quality, quality >= psnr)
     else:
         seconds, beyond = answer
         what = "beyond the pilot's samples, extrapolated" if beyond else _between(line, seconds)
-        found.append(_route("path tracing + denoiser", what, 0.0, seconds * scale, frames, psnr, True))
-    base = part.base.psnr
-    alone = part.base.ms / 1000 * scale
-    found.append(
-        _route("base image alone", "baked light, no network", light_seconds, alone, frames, base, base >= psnr)
-    )
+        add("path tracing + denoiser", what, 0.0, seconds * scale, psnr, True)
+    base, alone = part.base.psnr, part.base.ms / 1000 * scale
+    add("base image alone", "baked light, no network", light_seconds, alone, base, base >= psnr)
     frame = part.neural[-1].ms / 1000 * scale
     if neural is None:
-        found.append(_route("neural renderer", "no choice is expected to reach it", 0.0, frame, frames, None, False))
+        add("neural renderer", "no choice is expected to reach it", 0.0, frame, None, False)
     else:
         choice, upfront = neural.choice, neural.seconds.total.expected
         what = f"{choice.views} views, {choice.spp} spp, {choice.steps} steps"
-        found.append(_route("neural renderer", what, upfront, frame, frames, neural.psnr.expected, True))
+        add("neural renderer", what, upfront, frame, neural.psnr.expected, True)
     return sorted(found, key=lambda route: (not route.reaches, route.total))
 
 
@@ -114,8 +110,3 @@ def _between(line: Sequence[tuple[str, float, float]], seconds: float) -> str:
     below = [name for name, at, _ in line if at <= seconds * (1 + 1e-9)]
     above = [name for name, at, _ in line if at > seconds * (1 + 1e-9)]
     return f"about {below[-1]}" if below and not above else f"up to {(above or below)[0]}"
-
-
-def _route(name: str, what: str, upfront: float, frame: float, frames: int, psnr: float | None, ok: bool) -> Route:
-    total = upfront + frames * frame
-    return Route(name=name, what=what, upfront=upfront, frame=frame, total=total, psnr=psnr, reaches=ok)

@@ -17,11 +17,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...core.errors import UserError
+from ...core.settings import Settings
 from .records import Clock, Pilot, TracePart
 
 TIME_SPREAD = 1.4
 """Intervals of seconds reach from 1/1.4 to 1.4 times the prediction: 34 of 40 runs that followed their pilot ended
 within (docs/cost.md). A shared machine's speed drifts by so much from one minute to the next."""
+
+
+def trained_pixels(settings: Settings, width: int, height: int) -> int:
+    """Pixels of a training step on views of that size: of a patch, where the settings have one."""
+    patch = settings.finetune.step2.patch or max(width, height)
+    return min(patch, width) * min(patch, height)
 
 
 @dataclass(frozen=True)

@@ -3,12 +3,10 @@
 pools          sets of candidates: a workspace per scene and pool
 rigs           cameras of the pools that are no spheres
 policies       what competes, as data
-bench_select   options in; results.json, report and plots out
-bench          the resumable loop: selections, ray tracing of the chosen views, cells (those of `dnrpipe ablate`)
+bench_select   the resumable loop: selections, ray tracing of the chosen views, cells; report and plots
 rule_worker    one selection by a rule, in a worker process
 active/        baselines from the literature that train renderers of their own
-figures        numbers of a table from results.json
-intervals      paired differences and their confidence
+figures        numbers of a table from results.json, paired differences and their confidence
 bench_tables   the report in Markdown
 bench_plots    curves against views and against seconds
 """

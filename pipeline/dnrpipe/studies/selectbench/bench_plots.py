@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Mapping
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +19,11 @@ MARKERS = "osD^vPX*<>"
 STYLES = ("-", "--", "-.", ":")
 METRICS = (("psnr", "PSNR, dB"), ("ssim", "SSIM"), ("lpips_vgg", "LPIPS VGG (lower is better)"))
 AXES = {"views": "views", "total_seconds": "selection + ray tracing + training, s"}
-
-
-def look(policy: str) -> dict[str, Any]:
-    """Colour, marker and line style of a policy, the same in every plot."""
-    place = list(CONTENDERS).index(policy)
-    return {
-        "color": COLOURS[place % len(COLOURS)],
-        "marker": MARKERS[place % len(MARKERS)],
-        "linestyle": STYLES[place % len(STYLES)],
-    }
+LOOKS = {
+    policy: {"color": colour, "marker": marker, "linestyle": style}
+    for policy, colour, marker, style in zip(CONTENDERS, cycle(COLOURS), cycle(MARKERS), cycle(STYLES), strict=False)
+}
+"""Of each policy, the same in every plot."""
 
 
 def plot(results: Mapping[str, Any], path: Path, across: str) -> None:
@@ -58,7 +54,7 @@ def plot(results: Mapping[str, Any], path: Path, across: str) -> None:
                 if points:
                     x, y, error = zip(*points, strict=True)
                     axis.errorbar(
-                        x, y, yerr=error, label=policy, capsize=2, markersize=4, linewidth=1.2, **look(policy)
+                        x, y, yerr=error, label=policy, capsize=2, markersize=4, linewidth=1.2, **LOOKS[policy]
                     )
             axis.set_title(f"{pool}: {title}", fontsize=9)
             axis.set_xlabel(AXES[across])

@@ -5,26 +5,21 @@ With several files, runs on other scenes with the same pools, one table of all o
 
 from __future__ import annotations
 
+import functools
 import statistics
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..cells.markdown import NONE, made_line, spread, table
-from ..cells.provenance import read_made
-from .figures import SPHERICAL, Figures
-from .intervals import LEVEL, Difference
+from ..cells.results import NONE, made_line, read_made, spread, table
+from .figures import LEVEL, SPHERICAL, Difference, Figures
 from .pools import POOLS
 
 SCHEMA = 1
+read_results = functools.partial(read_made, command="bench-select", schema=SCHEMA, part="pools")
 METRICS = (("psnr", "PSNR", 2), ("psnr_mask", "PSNR in mask", 2), ("ssim", "SSIM", 4), ("lpips_vgg", "LPIPS VGG", 4))
 TIMES = (("select_seconds", "selection, s", 2), ("total_seconds", "total, s", 0))
-
-
-def read_results(path: Path) -> dict[str, Any]:
-    """``results.json`` of a benchmark. Raises UserError: missing, damaged or of another schema."""
-    return read_made(path, "bench-select", SCHEMA, "pools")
 
 
 def markdown(results: Mapping[str, Any], *, pictures: bool = True) -> str:
@@ -151,12 +146,6 @@ def _per_scene(figures: Figures, pool: str, budget: int) -> str:
     return f"PSNR by scene, `{pool}`, {budget} views:\n\n{table(['scene', *[f'`{p}`' for p in present]], rows)}"
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Print the report of a results file, or of several together."""
-    runs = [read_results(Path(argument)) for argument in arguments]
-    print(together(runs) if len(runs) > 1 else markdown(runs[0], pictures=False), end="")
-    return 0
-
-
 if __name__ == "__main__":
-    raise SystemExit(main(sys.argv[1:]))
+    files = [read_results(Path(argument)) for argument in sys.argv[1:]]
+    print(together(files) if len(files) > 1 else markdown(files[0], pictures=False), end="")

@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from ...core.settings import Settings, merge
 from ..cells.request import choose_names
+from ..cells.tasks import StudyTask
 
 LEARNED = "rl-paper"
 """The policy that the trainer's step 1 trains."""
@@ -61,6 +62,24 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "rewards": tuple(c.name for c in _CONTENDERS if c.policy == LEARNED),
     "all": tuple(CONTENDERS),
 }
+
+
+@dataclass(frozen=True)
+class ActiveSettings:
+    """members: renderers of policy ensemble, at least 2; variance trains one. rounds: batches in which views are added
+    to the first third of the budget. epochs: each renderer's passes over the views chosen so far."""
+
+    members: int = 3
+    rounds: int = 2
+    epochs: int = 10
+
+
+class ActiveTask(StudyTask):
+    """Choose views of a pool by active learning -> `SelectionResult`. folder: of its trainings, removed at the end."""
+
+    settings: Settings
+    policy: str
+    folder: Path
 
 
 def choose_policies(text: str) -> list[Contender]:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-import resource
+import functools
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pydantic import TypeAdapter
+
 from ...core.scene_files import split_views
 from ...core.workspace import Workspace
+from ...raytrace.tasks import costs_since
 from ..cells.tasks import FileWorker, SelectionResult, StudyTask
 
 if TYPE_CHECKING:
@@ -20,33 +23,24 @@ class RuleTask(StudyTask):
 
     policy: str
     budget: int
-    seed: int
 
 
 class Worker(FileWorker):
-    """Answers a `RuleTask`.
-
-    A pool's visibility is made once per process; what that took is part of every selection that looks at it, as if
-    it had made it itself.
-    """
+    TASK = TypeAdapter(RuleTask)
 
     def __init__(self, common: dict[str, Any]) -> None:  # without torch
-        self.place: Path | None = None
-        self.visibility, self.spent = None, (0.0, 0.0)
+        pass
 
-    def answer(self, task: dict[str, Any]) -> SelectionResult:
-        return self._choose(RuleTask.model_validate(task))
-
-    def _choose(self, task: RuleTask) -> SelectionResult:
+    def answer(self, task: RuleTask) -> SelectionResult:
         from dnrtrain.selector.policies import untrained
         from dnrtrain.selector.protocol import Candidates
 
         views = split_views(Workspace.open(task.workspace))["train"]
         policy = untrained(task.policy)
         assert policy is not None  # a trained one is chosen by step 1
-        visibility, spent = self._look(task.workspace) if policy.needs_visibility else (None, (0.0, 0.0))
+        visibility, wall, cpu = _look(task.workspace) if policy.needs_visibility else (None, 0.0, 0.0)
         candidates = Candidates.of_views(views, visibility)
-        wall, cpu = time.perf_counter(), time.process_time()
+        started = time.monotonic() - wall, time.process_time() - cpu
         choice = policy.choose(candidates, task.budget, task.seed)
         return SelectionResult(
             key=task.fingerprint,
@@ -54,19 +48,20 @@ class Worker(FileWorker):
             gains=choice.gains,
             why=choice.why,
             details=choice.details,
-            seconds=time.perf_counter() - wall + spent[0],
-            cpu_seconds=time.process_time() - cpu + spent[1],
-            peak_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+            **costs_since(*started),
         )
 
-    def _look(self, place: Path) -> tuple[SurfaceVisibility, tuple[float, float]]:
-        """What the pool's candidates see, and the (wall, processor) seconds that looking took."""
-        from dnrtrain.selector.visibility import read_visibility
 
-        if self.place != place or self.visibility is None:
-            workspace = Workspace.open(place)
-            views = split_views(workspace)["train"]
-            wall, cpu = time.perf_counter(), time.process_time()
-            self.visibility = read_visibility([workspace.passes("train", view.name) for view in views], views)
-            self.place, self.spent = place, (time.perf_counter() - wall, time.process_time() - cpu)
-        return self.visibility, self.spent
+@functools.lru_cache(maxsize=1)
+def _look(place: Path) -> tuple[SurfaceVisibility, float, float]:
+    """What a pool's candidates see, and the wall and processor seconds that looking took.
+
+    It is done once per process; its seconds are part of every selection that looks, as if that had done it itself.
+    """
+    from dnrtrain.selector.visibility import read_visibility
+
+    workspace = Workspace.open(place)
+    views = split_views(workspace)["train"]
+    wall, cpu = time.perf_counter(), time.process_time()
+    visibility = read_visibility([workspace.passes("train", view.name) for view in views], views)
+    return visibility, time.perf_counter() - wall, time.process_time() - cpu

@@ -1,6 +1,5 @@
 """Baselines from the literature: active learning on rasterised images, benchmarked, not offered by `dnrpipe select`.
 
-settings       how many renderers are trained, how long
 batches        the policy: train on the views chosen so far, look where that leaves doubts, choose on
 ensemble       doubt is disagreement of several renderers
 variance       doubt is a learned variance

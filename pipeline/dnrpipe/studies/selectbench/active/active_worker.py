@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import shutil
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from dnrtrain.checkpoint import load_model
 from dnrtrain.dataset import ViewSet
@@ -19,28 +21,21 @@ from dnrtrain.step1 import run_step1
 
 from ...cells.cell import load_cell_views, training_cost
 from ...cells.tasks import FileWorker, SelectionResult
+from ..policies import ActiveSettings, ActiveTask
 from .batches import choose_actively
-from .settings import ActiveSettings, ActiveTask
 
-CLOCKS = ("seconds", "cpu_seconds")
+CLOCKS = {"seconds": time.monotonic, "cpu_seconds": time.process_time}
 
 
 class Worker(FileWorker):
-    """Answers an `ActiveTask`."""
-
-    def __init__(self, common: dict[str, Any]) -> None:
-        super().__init__(common)
-        self.device = common["device"]
+    TASK = TypeAdapter(ActiveTask)
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
         made = super().__call__(task)
         shutil.rmtree(Path(task["folder"]), ignore_errors=True)
         return made
 
-    def answer(self, task: dict[str, Any]) -> SelectionResult:
-        return self._choose(ActiveTask.model_validate(task))
-
-    def _choose(self, task: ActiveTask) -> SelectionResult:
+    def answer(self, task: ActiveTask) -> SelectionResult:
         settings = task.settings
         views = load_cell_views(task.workspace, "train", raytraced=False, base="none")
         members = Members(
@@ -58,6 +53,7 @@ class Worker(FileWorker):
         )
 
 
+@dataclass
 class Members:
     """Coarse renderers that a policy trains for itself: runs of step 1 without an agent, each in a folder of its own.
 
@@ -65,38 +61,31 @@ class Members:
         views: all candidates, targets = rasterised images.
         model: the renderer's settings; its ``coarse()`` part is trained.
         step1: learning rates and precision; epochs are those of ``settings``.
-        settings: how many renderers, in how many batches.
-        seed: of all weights and orders.
-        device: torch's.
-        folder: of the runs. An interrupted one is continued.
-        fingerprint: of the caller's inputs.
+        folder: of the runs. An interrupted one is continued where ``fingerprint`` is the same.
     """
 
-    def __init__(
-        self,
-        views: ViewSet,
-        model: ModelSettings,
-        step1: Step1Settings,
-        settings: ActiveSettings,
-        seed: int,
-        device: str,
-        folder: Path,
-        fingerprint: str,
-    ) -> None:
-        self.views, self.model, self.settings, self.seed = views.to(device), model, settings, seed
-        self.device, self.folder, self.fingerprint = device, folder, fingerprint
-        self.step1 = step1.model_copy(update={"epochs": settings.epochs, "validation_views": 0})
+    views: ViewSet
+    model: ModelSettings
+    step1: Step1Settings
+    settings: ActiveSettings
+    seed: int
+    device: str
+    folder: Path
+    fingerprint: str
+
+    def __post_init__(self) -> None:
+        self.views = self.views.to(self.device)
+        self.step1 = self.step1.model_copy(update={"epochs": self.settings.epochs, "validation_views": 0})
         self.folders: list[Path] = []
         self.trained = dict.fromkeys(CLOCKS, 0.0)
         """What the epochs of this process took."""
 
     def choose(self, policy: str, budget: int) -> tuple[Choice, dict[str, float]]:
         """The choice, and its wall and process seconds, those of interrupted runs included."""
-        clocks = (time.monotonic, time.process_time)
-        started = [clock() for clock in clocks]
+        started = [clock() for clock in CLOCKS.values()]
         choice = choose_actively(policy, self.views, budget, self.seed, self.settings, self.train)
         cost = {}
-        for name, clock, start in zip(CLOCKS, clocks, started, strict=True):
+        for (name, clock), start in zip(CLOCKS.items(), started, strict=True):
             looking = max(0.0, clock() - start - self.trained[name])
             cost[name] = looking + sum(getattr(training_cost(folder), name) for folder in self.folders)
         return choice, cost

@@ -21,20 +21,15 @@ from dnrtrain.selector.pool import canonical_order, complete_useful
 from dnrtrain.selector.protocol import Candidates, Choice
 from dnrtrain.selector.visibility import visibility_of
 
-from .ensemble import Disagreement, Spread
-from .pieces import Pieces, pieces_of
-from .settings import ActiveSettings
-from .variance import PredictedVariance, Reduction
+from ..policies import ActiveSettings
+from .ensemble import Disagreement
+from .pieces import Doubt, Observed, Pieces, pieces_of
+from .variance import PredictedVariance
 
 Train = Callable[[list[int], int, int], DNR]
 """train(views, batch, member): a new coarse renderer, trained on these candidates."""
-
-
-KINDS: dict[str, type[Disagreement] | type[PredictedVariance]] = {
-    "ensemble": Disagreement,
-    "variance": PredictedVariance,
-}
-"""What is unsure, and what one more view would make of it, by policy."""
+KINDS: dict[str, type[Doubt]] = {"ensemble": Disagreement, "variance": PredictedVariance}
+"""By policy."""
 
 
 def sizes(budget: int, rounds: int) -> list[int]:
@@ -53,15 +48,10 @@ def choose_actively(
 ) -> Choice:
     """Choose ``budget`` of the views. Gains of the first third are 0: k-medoids counts in another measure.
 
-    Args:
-        policy: a key of KINDS.
-        views: all candidates, targets = rasterised images.
-        budget: number of views to choose.
-        seed: of the variance head.
-        settings: how many renderers, in how many batches.
-        train: makes a renderer.
+    policy: a key of KINDS. views: all candidates, targets = rasterised images. seed: of the variance head.
     """
-    kind, count = KINDS[policy], KINDS[policy].models(settings)
+    kind = KINDS[policy]
+    count = kind.MODELS or settings.members
     visibility = visibility_of(views)
     # Their places in ``views`` travel with the candidates: the pool's rules put them in another order.
     known = Candidates(views.camera_positions, views.camera_directions, visibility, np.arange(len(views)))
@@ -75,7 +65,7 @@ def choose_actively(
         models = [train(chosen, number, member) for member in range(count)]
         doubt = kind(models, views, chosen, seed + number)
         table = [pieces_of(views, view, doubt.unsure(view)) for view in range(len(views))]
-        more = complete_useful(known, chosen, size, _by(kind.batch([table[i] for i in order]), table))
+        more = complete_useful(known, chosen, size, _by(kind.BATCH([table[i] for i in order]), table))
         batches.append({"trained_on": len(chosen), "chosen": len(more.views), **doubt.facts()})
         for gain, reason in zip(more.gains, more.why, strict=True):
             why.append(f"batch {number}: {reason or kind.WORD.format(gain)}")
@@ -87,7 +77,7 @@ def choose_actively(
     return Choice(chosen, gains, why, details)
 
 
-def _by(batch: Reduction | Spread, table: list[Pieces]) -> Callable[[Candidates, list[int], int], Choice]:
+def _by(batch: Observed, table: list[Pieces]) -> Callable[[Candidates, list[int], int], Choice]:
     def choose(some: Candidates, kept: list[int], count: int) -> Choice:
         assert some.facts is not None  # given above
         others = [i for i in range(len(some)) if i not in set(kept)]

@@ -13,54 +13,12 @@ a direction that the batch has is divided by 1 + its views of it, so that a batc
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 import torch
 
 from dnrtrain.aggregator import Inside
-from dnrtrain.dataset import ViewSet
-from dnrtrain.model import DNR
 
-from .pieces import Observed, Pieces, cells_of, seen_cells
-from .settings import ActiveSettings
-
-
-class Disagreement:
-    """Of members on all views. ``kept`` are the views of their training."""
-
-    MEASURE: ClassVar[str] = (
-        "mean over the picture of the members' variance (display RGB) + 1 on unseen surface, less what its batch has"
-    )
-    WORD: ClassVar[str] = "adds {:.2e} of disagreement and unseen surface"
-
-    def __init__(self, members: list[DNR], views: ViewSet, kept: list[int], seed: int) -> None:
-        self.members, self.views, self.seen = members, views, seen_cells(views, kept)
-        self.pixels, self.variance, self.unseen = 0, 0.0, 0
-
-    @staticmethod
-    def models(settings: ActiveSettings) -> int:
-        return settings.members
-
-    @torch.no_grad()
-    def unsure(self, view: int) -> np.ndarray:
-        batch = self.views.batch([view])
-        pictures = torch.cat([member(batch).rgb.clamp(0.0, 1.0) for member in self.members])
-        spread = pictures.var(dim=0, correction=0, keepdim=True).mean(dim=1, keepdim=True)
-        varies = Inside(batch.mask).gather(spread)[:, 0].cpu().numpy().astype(np.float64)
-        unseen = ~self.seen[cells_of(self.views, view)]
-        self.pixels += len(varies)
-        self.variance += float(varies.sum())
-        self.unseen += int(unseen.sum())
-        return varies + unseen
-
-    def facts(self) -> dict[str, float]:
-        count = max(1, self.pixels)
-        return {"disagreement": float(np.sqrt(self.variance / count)), "unseen": self.unseen / count}
-
-    @staticmethod
-    def batch(table: list[Pieces]) -> Spread:
-        return Spread(table)
+from .pieces import Doubt, Observed, Pieces
 
 
 class Spread(Observed):
@@ -68,3 +26,24 @@ class Spread(Observed):
 
     def gain(self, pieces: Pieces) -> float:
         return float((pieces.unsure / (1.0 + self.observed[pieces.keys])).sum())
+
+
+class Disagreement(Doubt):
+    MEASURE = (
+        "mean over the picture of the members' variance (display RGB) + 1 on unseen surface, less what its batch has"
+    )
+    WORD = "adds {:.2e} of disagreement and unseen surface"
+    BATCH = Spread
+
+    @torch.no_grad()
+    def unsure(self, view: int) -> np.ndarray:
+        batch = self.views.batch([view])
+        pictures = torch.cat([member(batch).rgb.clamp(0.0, 1.0) for member in self.models])
+        spread = pictures.var(dim=0, correction=0, keepdim=True).mean(dim=1, keepdim=True)
+        varies = Inside(batch.mask).gather(spread)[:, 0].cpu().numpy().astype(np.float64)
+        self.variance += float(varies.sum())
+        return varies + self.unseen_pixels(view)
+
+    def facts(self) -> dict[str, float]:
+        count = max(1, self.pixels)
+        return {"disagreement": float(np.sqrt(self.variance / count)), "unseen": self.unseen / count}

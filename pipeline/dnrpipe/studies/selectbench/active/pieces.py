@@ -6,12 +6,15 @@ piece tell about the same: that is how policies that look at pixels keep from ch
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from dnrtrain.dataset import ViewSet
+from dnrtrain.model import DNR
 from dnrtrain.selector.geometry import BINS, direction_bins
 from dnrtrain.selector.visibility import GRID
 
@@ -64,7 +67,7 @@ def seen_cells(views: ViewSet, some: Iterable[int]) -> np.ndarray:
     return seen
 
 
-class Observed:
+class Observed(ABC):
     """How often the views taken so far show each piece; 1 is a view of it with the mean number of pixels."""
 
     def __init__(self, table: list[Pieces]) -> None:
@@ -82,3 +85,38 @@ class Observed:
     def take(self, pieces: Pieces) -> None:
         """Count a view."""
         self.observed[pieces.keys] += self.observations(pieces)
+
+    @abstractmethod
+    def gain(self, pieces: Pieces) -> float:
+        """What taking a view would add."""
+
+
+class Doubt(ABC):
+    """What is unsure in the pixels of all views, by renderers that were trained on the views ``kept``.
+
+    BATCH: what one more view would make of it. MODELS: how many renderers it takes, None: `ActiveSettings.members`.
+    """
+
+    MEASURE: ClassVar[str]
+    WORD: ClassVar[str]
+    BATCH: ClassVar[type[Observed]]
+    MODELS: ClassVar[int | None] = None
+
+    def __init__(self, models: list[DNR], views: ViewSet, kept: list[int], seed: int) -> None:
+        self.models, self.views, self.seen = models, views, seen_cells(views, kept)
+        self.pixels, self.variance, self.unseen = 0, 0.0, 0
+
+    @abstractmethod
+    def unsure(self, view: int) -> np.ndarray:
+        """Of each pixel inside the view's mask, [P]; counts them."""
+
+    @abstractmethod
+    def facts(self) -> dict[str, float]:
+        """Means over the pixels that were counted."""
+
+    def unseen_pixels(self, view: int) -> np.ndarray:
+        """Whether each pixel shows surface that no view of the training sees, bool [P]; counts them."""
+        unseen = ~self.seen[cells_of(self.views, view)]
+        self.pixels += len(unseen)
+        self.unseen += int(unseen.sum())
+        return unseen

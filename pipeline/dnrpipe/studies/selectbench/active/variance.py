@@ -18,8 +18,6 @@ counted on the pixels of *all* candidates. Where no view of the training sees th
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -31,8 +29,7 @@ from dnrtrain.renderer import SLOPE
 from dnrtrain.schedule import adam, guarded_step, learning_rate, require_target
 from dnrtrain.textures import spherical_harmonics
 
-from .pieces import COUNT, Observed, Pieces, cells_of, seen_cells
-from .settings import ActiveSettings
+from .pieces import COUNT, Doubt, Observed, Pieces
 
 HIDDEN = 32
 STEPS = 400
@@ -107,42 +104,6 @@ def _sample(dnr: DNR, views: ViewSet, random: np.random.Generator) -> tuple[Tens
     return torch.cat(features), torch.cat(errors)
 
 
-class PredictedVariance:
-    """Of one renderer and its head on all views. ``kept`` are the views of their training."""
-
-    MEASURE: ClassVar[str] = "expected decrease of the predicted variance of display RGB, mean over all surface pixels"
-    WORD: ClassVar[str] = "lowers the predicted variance by {:.2e}"
-
-    def __init__(self, models: list[DNR], views: ViewSet, kept: list[int], seed: int) -> None:
-        (self.dnr,) = models
-        self.views, self.seen = views, seen_cells(views, kept)
-        self.head = train_head(self.dnr, views.subset(kept), seed)
-        self.pixels, self.variance, self.unseen = 0, 0.0, 0
-
-    @staticmethod
-    def models(settings: ActiveSettings) -> int:
-        return 1
-
-    @torch.no_grad()
-    def unsure(self, view: int) -> np.ndarray:
-        features, _ = features_of(self.dnr, self.views.batch([view]))
-        variance = self.head(features).exp().cpu().numpy().astype(np.float64)
-        unseen = ~self.seen[cells_of(self.views, view)]
-        self.pixels += len(variance)
-        self.variance += float(variance[~unseen].sum())
-        self.unseen += int(unseen.sum())
-        return np.where(unseen, UNKNOWN, variance)
-
-    def facts(self) -> dict[str, float]:
-        known = max(1, self.pixels - self.unseen)
-        deviation = float(np.sqrt(self.variance / known))
-        return {"standard_deviation": deviation, "unseen": self.unseen / max(1, self.pixels)}
-
-    @staticmethod
-    def batch(table: list[Pieces]) -> Reduction:
-        return Reduction(table)
-
-
 class Reduction(Observed):
     """Σ over pieces of the variance that all candidates have there · (1/(1 + s) − 1/(1 + s + the view's own))."""
 
@@ -157,3 +118,27 @@ class Reduction(Observed):
         before = 1.0 + self.observed[pieces.keys]
         after = before + self.observations(pieces)
         return float((self.variance[pieces.keys] * (1.0 / before - 1.0 / after)).sum())
+
+
+class PredictedVariance(Doubt):
+    """Of one renderer and its head."""
+
+    MEASURE = "expected decrease of the predicted variance of display RGB, mean over all surface pixels"
+    WORD = "lowers the predicted variance by {:.2e}"
+    BATCH, MODELS = Reduction, 1
+
+    def __init__(self, models: list[DNR], views: ViewSet, kept: list[int], seed: int) -> None:
+        super().__init__(models, views, kept, seed)
+        self.head = train_head(models[0], views.subset(kept), seed)
+
+    @torch.no_grad()
+    def unsure(self, view: int) -> np.ndarray:
+        features, _ = features_of(self.models[0], self.views.batch([view]))
+        variance = self.head(features).exp().cpu().numpy().astype(np.float64)
+        unseen = self.unseen_pixels(view)
+        self.variance += float(variance[~unseen].sum())
+        return np.where(unseen, UNKNOWN, variance)
+
+    def facts(self) -> dict[str, float]:
+        deviation = float(np.sqrt(self.variance / max(1, self.pixels - self.unseen)))
+        return {"standard_deviation": deviation, "unseen": self.unseen / max(1, self.pixels)}

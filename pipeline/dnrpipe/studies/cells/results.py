@@ -1,4 +1,4 @@
-"""What a results file says of its making: command, commit, date, machine, versions."""
+"""What a results file says of its making, and Markdown helpers of the studies' tables."""
 
 from __future__ import annotations
 
@@ -7,16 +7,21 @@ import json
 import os
 import platform
 import shlex
+import statistics
 import subprocess
 import sys
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from ...core.errors import UserError
+from ...workers.view_tasks import worker_count
 
 PACKAGES = ("dnrpipe", "torch", "numpy", "mitsuba", "bpy", "flip-evaluator")
+NONE = "–"
 SOURCE = Path(__file__).resolve().parents[4]
 
 
@@ -40,8 +45,13 @@ def made_by() -> dict[str, Any]:
         "command": shlex.join(["dnrpipe", *sys.argv[1:]]),
         **code_state(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "machine": machine(),
-        "versions": versions(),
+        "machine": {
+            "processor": _processor(),
+            "cores": worker_count(0),  # that this process may use
+            "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
+            "system": f"{platform.system()} {platform.machine()}",
+        },
+        "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
     }
 
 
@@ -52,27 +62,10 @@ def code_state() -> dict[str, Any]:
     return {"commit": commit, "dirty": bool(_git("status", "--porcelain", "--untracked-files=no")) if commit else None}
 
 
-def machine() -> dict[str, Any]:
-    """Processor, cores that this process may use, memory in GiB, operating system."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return {
-        "processor": _processor(),
-        "cores": cores,
-        "memory_gib": round(memory / 2**30, 1),
-        "system": f"{platform.system()} {platform.machine()}",
-    }
-
-
-def versions() -> dict[str, str | None]:
-    """Versions of Python and of what decides the figures; None where not installed."""
-    found: dict[str, str | None] = {"python": platform.python_version()}
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = None
-    return found
+def _version(package: str) -> str | None:
+    with suppress(PackageNotFoundError):
+        return version(package)
+    return None
 
 
 def _processor() -> str:
@@ -91,3 +84,35 @@ def _git(*arguments: str) -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()
+
+
+# -- Markdown ----------------------------------------------------------------------------------------------
+
+
+def spread(values: Sequence[float], digits: int, *, signed: bool = False) -> str:
+    """``mean ± standard deviation`` (of the sample) over seeds; the mean alone where there is one seed."""
+    if not values:
+        return NONE
+    text = f"{statistics.fmean(values):{'+' if signed else ''}.{digits}f}"
+    return f"{text} ± {statistics.stdev(values):.{digits}f}" if len(values) > 1 else text
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table; all columns but the first are right-aligned."""
+    lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def made_line(results: Mapping[str, Any]) -> str:
+    """How the results were made: command, date, commit and those of its cells where they differ, machine, preset."""
+    box, state = results["machine"], f"commit {(results['commit'] or 'unknown')[:12]}"
+    if results["dirty"]:
+        state += " with changes"
+    commits = sorted({cell["commit"] for cell in results["cells"] if cell["commit"]})
+    if len(commits) > 1:
+        state += f" (cells of {len(commits)} commits: {', '.join(commit[:12] for commit in commits)})"
+    return (
+        f"`{results['command']}`, {results['date'][:10]}, {state}; {box['processor']},"
+        f" {box['cores']} cores, torch {results['versions']['torch']}. Preset"
+        f" {results['preset']}, {results['resolution']}"
+    )
