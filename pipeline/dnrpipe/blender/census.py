@@ -134,7 +134,7 @@ def _world_emits(world: Any) -> bool:
     colour, strength = (find_input(surface.node, name) for name in ("Color", "Strength"))
     for socket in (colour, strength):
         source = None if socket is None else resolve(socket)
-        if source is not None and not source.linked and not np.any(np.ravel(source.default)[:3] > 0):
+        if source is not None and not source.linked and max(source.colour) <= 0:
             return False
     return True
 

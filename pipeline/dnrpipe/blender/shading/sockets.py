@@ -11,6 +11,7 @@ import bpy
 Scope = tuple[Any, ...]
 """The group nodes entered on the way to a node, outermost first."""
 
+LUMINANCE = (0.2126, 0.7152, 0.0722)
 MAX_HOPS = 1000  # a tree that links in circles is invalid; Blender may still load one
 UNDEFINED = "NodeUndefined"
 """``bl_idname`` of every node whose type this Blender does not know: it is of an add-on, or of a newer Blender."""
@@ -30,8 +31,29 @@ class Source:
 
     @property
     def default(self) -> Any:
-        """The unlinked input's own value."""
+        """The unlinked input's own value; of a group's input, of another type than asked for."""
         return getattr(self.socket, "default_value", None)
+
+    @property
+    def number(self) -> float:
+        """`default` as Cycles converts it for a number: a colour's luminance, a vector's mean; 0 of what has none."""
+        value = self.default
+        if isinstance(value, bool | int | float):
+            return float(value)
+        parts = self.colour
+        weights = LUMINANCE if self.socket.type == "RGBA" else (1 / 3, 1 / 3, 1 / 3)
+        return sum(part * weight for part, weight in zip(parts, weights, strict=True))
+
+    @property
+    def colour(self) -> tuple[float, float, float]:
+        """`default` as Cycles converts it for a colour: a number three times; black of what is none."""
+        value = self.default
+        if isinstance(value, bool | int | float):
+            return float(value), float(value), float(value)
+        if self.socket.type not in {"RGBA", "VECTOR", "ROTATION"} or value is None:
+            return 0.0, 0.0, 0.0  # texts, menus, objects, shaders, sockets of unknown type
+        x, y, z = (*(float(part) for part in value), 0.0, 0.0)[:3]
+        return x, y, z
 
 
 def find_input(node: Any, *names: str) -> Any | None:
@@ -48,7 +70,7 @@ def find_input(node: Any, *names: str) -> Any | None:
 
 
 def computes(node: Any) -> bool:
-    """Whether a node has values at all. Cycles drops nodes of unknown type and groups without tree, with their links."""
+    """Whether a node has values at all. Cycles drops those of unknown type and groups without tree."""
     return node.bl_idname != UNDEFINED and not (node.type == "GROUP" and node.node_tree is None)
 
 

@@ -1,0 +1,67 @@
+"""Any file goes through the whole conversion; whatever is left out or approximated is named."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+bpy = pytest.importorskip("bpy")
+
+from tests import nasty_images, nasty_materials, nasty_objects  # noqa: E402
+
+from dnrpipe.blender.geometry.frozen import load_geometry  # noqa: E402
+from dnrpipe.blender.inspection import inspect  # noqa: E402
+from dnrpipe.blender.prepare import prepare  # noqa: E402
+from dnrpipe.blender.tasks import InspectTask  # noqa: E402
+from dnrpipe.core.scene_records import SceneSummary  # noqa: E402
+
+CONVERTS = nasty_materials.CONVERTS | nasty_images.CONVERTS | nasty_objects.CONVERTS
+
+
+def refuse(text: str) -> Any:
+    raise AssertionError(f"{text} in a JSON file")
+
+
+def said_of(folder: Path, warnings: list[str]) -> str:
+    """Warnings and findings as one text; checks the files on the way."""
+    files = {
+        name: json.loads((folder / name).read_text(), parse_constant=refuse) for name in ("frame.json", "summary.json")
+    }
+    assert files
+    census = json.loads((folder / "census.json").read_text(), parse_constant=refuse)
+    rows = [
+        f"{row['kind']}: {row['feature']} (object '{row['object']}', material '{row['material']}'): {row['note']}"
+        for row in census["findings"]
+    ]
+    assert all("\n" not in line for line in warnings)
+    return "\n".join([*warnings, *rows])
+
+
+@pytest.mark.parametrize("name", CONVERTS)
+def test_converts_and_says_what_it_did(name: str, tmp_path: Path) -> None:
+    builder, words = CONVERTS[name]
+    scene = tmp_path / "scene"
+    summary = prepare(builder(tmp_path), scene)
+    assert isinstance(summary, SceneSummary)
+    text = said_of(scene, summary.warnings)
+    for word in words:
+        assert word in text, text
+    text.encode("utf-8")
+    meshes = load_geometry(scene / "geometry.npz")
+    assert meshes and all(np.isfinite(mesh.positions).all() for mesh in meshes)
+    root = ET.parse(scene / "scene.xml").getroot()
+    numbers = [part for element in root.iter() for part in element.get("value", "").split()]
+    assert not {"nan", "inf", "-inf"} & set(numbers)
+
+
+@pytest.mark.robustness
+@pytest.mark.parametrize("name", nasty_materials.SWEEPS)
+def test_every_node_in_every_place(name: str, tmp_path: Path) -> None:
+    path = nasty_materials.SWEEPS[name][0](tmp_path)
+    prepare(path, tmp_path / "scene")
+    inspect(InspectTask(source=path, folder=tmp_path / "bundle", bake_size=64))
