@@ -9,7 +9,7 @@ from typing import Any
 from dnrpipe.core.scene_records import MaterialFacts
 
 from .baking.trees import IMPLICIT_GENERATED
-from .shading.sockets import find_input, resolve, surface_source, walk
+from .shading.sockets import find_input, output_node, resolve, surface_source, walk
 
 PROCEDURAL = {*IMPLICIT_GENERATED, "TEX_MUSGRAVE", "TEX_WHITE_NOISE"}
 """Texture nodes without image."""
@@ -65,8 +65,8 @@ def _reachable(tree: Any) -> Iterator[Any]:
 
     A group counts whole: which of its outputs is used is not followed.
     """
-    output = None if tree is None else tree.get_output_node("CYCLES")
-    todo, seen, groups = ([] if output is None else [output]), set(), set()
+    output, inside = output_node(tree)
+    todo, seen, groups = ([] if output is None else [*inside, output]), set(), set()
     while todo:
         node = todo.pop()
         if node.as_pointer() in seen:

@@ -129,8 +129,6 @@ class BakeCache:
             if node.type == "ATTRIBUTE" and node.attribute_type != "GEOMETRY":
                 name = f"attribute '{node.attribute_name}' of the {node.attribute_type.lower()}"
                 findings.add("ignored", name, "only attributes of the mesh are kept: 0 is used", material=material)
-            if node.type == "SCRIPT":
-                findings.add("ignored", "Script node", "Open Shading Language is not run", material=material)
         if len(self.atlas.parts(material)) > MAX_OWN and any(is_object_space(entry.node) for entry in nodes):
             note = f"on more than {MAX_OWN} objects: baked as if their axes were the world's"
             findings.add("approximated", "object-space nodes", note, material=material)

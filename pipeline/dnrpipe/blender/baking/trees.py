@@ -69,6 +69,9 @@ class TreeCopier:
                 encode.inputs[1].default_value = encode.inputs[2].default_value = (0.5, 0.5, 0.5)
                 value = encode.outputs[0]
         tree.links.new(value, emission.inputs["Color"])
+        for group in self._groups.values():
+            for node in [node for node in group.nodes if node.type == "OUTPUT_MATERIAL"]:
+                group.nodes.remove(node)
         for owned in [tree, *self._groups.values()]:
             self._substitute(owned)
         _target(tree, self.image)

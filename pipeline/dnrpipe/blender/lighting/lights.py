@@ -16,7 +16,7 @@ import numpy as np
 
 from ..bundle import xmltree
 from ..findings import Findings
-from ..shading.sockets import Scope, resolve
+from ..shading.sockets import Scope, resolve, surface_source
 from ..shading.textures import ImageReader, Textured, TextureStore
 from ..shading.values import Evaluator
 
@@ -99,9 +99,8 @@ def _strength(light: Any, name: str, findings: Findings) -> np.ndarray:
 
 def _node_colour(tree: bpy.types.NodeTree, name: str, findings: Findings) -> np.ndarray:
     """Emission colour x strength of a lamp's node tree; what varies becomes its mean, with a finding."""
-    output = tree.get_output_node("CYCLES")
-    source = resolve(output.inputs["Surface"]) if output else None
-    if source is None or not source.linked:
+    source = surface_source(tree)
+    if source is None:
         return np.zeros(3)
     if source.node.type != "EMISSION":
         findings.add("approximated", "lamp nodes", "only an Emission node is understood", object=name)

@@ -11,7 +11,7 @@ from typing import Any
 import bpy
 
 from ..findings import Findings, first_of, printable
-from ..shading.sockets import UNDEFINED, computes
+from ..shading.sockets import NOT_IN_CYCLES, UNDEFINED, computes
 from .names import data_collections, node_trees
 
 SHAPELESS_IMAGES = {"GENERATED", "VIEWER"}  # sources without a file
@@ -93,11 +93,13 @@ def note_missing(findings: Findings) -> None:
             continue  # the pictures are taken before it
         for node in tree.nodes:
             if not computes(node):
-                what = "its type is unknown here (needs its add-on)" if node.bl_idname == UNDEFINED else "has no tree"
+                unknown, not_here = node.bl_idname == UNDEFINED, NOT_IN_CYCLES.get(node.type)
+                what = "its type is unknown here (needs its add-on)" if unknown else not_here or "has no tree"
                 place = {"material": owner.name_full} if isinstance(owner, bpy.types.Material) else {}
                 named = "" if place else f" of '{owner.name_full}'"
+                kind = "ignored" if not_here else "missing"
                 findings.add(
-                    "missing", f"node '{node.name}'{named}", f"{what}: its links are dropped, as in Cycles", **place
+                    kind, f"node '{node.name}'{named}", f"{what}: its links are dropped, as in Cycles", **place
                 )
 
 
