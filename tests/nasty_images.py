@@ -287,8 +287,8 @@ CONVERTS: dict[str, Case] = {
     "sequences": (sequences, ("movie.mp4", "animated image", "UDIM image 'udim.1001.png'")),
     "inner images": (inner_images, ("image 'Render Result'", "compositor")),
     "alpha modes": (alpha_modes, ("box image projection",)),
-    "unknown colour space": (unknown_colour_space, ("colour space", "plate")),
-    "unknown view": (unknown_view, ()),
+    "unknown colour space": (unknown_colour_space, ('image colorspace "MYSPAC" not found',)),
+    "unknown view": (unknown_view, ('scene view "ODT" not found, setting to "Standard"',)),
     "odd view": (odd_view, ()),
     "everywhere": (everywhere, ()),
 }

@@ -653,15 +653,15 @@ def zones(folder: Path) -> Path:
 def volumes(folder: Path) -> Path:
     """Volumes that glow, vary, take a grid's density, mix with themselves, and are no volumes at all."""
     plain()
-    for kind in ("PrincipledVolume", "VolumeScatter", "VolumeAbsorption", "VolumeCoefficients", "BsdfDiffuse"):
+    for kind in ("VolumePrincipled", "VolumeScatter", "VolumeAbsorption", "VolumeCoefficients", "BsdfDiffuse"):
         made, tree, _ = tree_of(kind)
         node, output = tree.nodes.new(f"ShaderNode{kind}"), output_of(tree)
         tree.links.new(node.outputs[0], output.inputs["Volume"])
         density = next((socket for socket in node.inputs if socket.name == "Density"), None)
         if density is not None:
-            source = "ShaderNodeVolumeInfo" if kind == "PrincipledVolume" else "ShaderNodeTexNoise"
+            source = "ShaderNodeVolumeInfo" if kind == "VolumePrincipled" else "ShaderNodeTexNoise"
             tree.links.new(tree.nodes.new(source).outputs[0], density)
-        if kind == "PrincipledVolume":
+        if kind == "VolumePrincipled":
             node.inputs["Emission Strength"].default_value = 3
         cube(kind, made)
     made, tree, _ = tree_of("emitting volume")

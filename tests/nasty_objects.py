@@ -423,7 +423,7 @@ def odd_pictures(folder: Path) -> Path:
     scene.unit_settings.scale_length = 1e-9
     scene.frame_start, scene.frame_end = -500, 500
     scene.frame_set(-499)
-    scene.cycles.film_exposure = 4
+    render.engine, scene.cycles.film_exposure = "CYCLES", 4
     scene.gravity = (NAN, NAN, NAN)
     return save(folder / "odd_pictures.blend")
 

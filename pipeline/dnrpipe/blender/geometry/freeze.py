@@ -103,6 +103,7 @@ def freeze_scene(scene: bpy.types.Scene) -> Frozen:
             f"scene '{scene.name}', view layer '{layer.name}': no surface is visible in renders; "
             "unhide an object or enable its collection"
         )
+    _override_materials(outcome, layer)
     fit_instances(outcome.meshes, outcome.repairs, outcome.findings)
     return outcome
 
@@ -123,6 +124,8 @@ def freeze(depsgraph: bpy.types.Depsgraph) -> Frozen:
         if not (instance.show_self or instance.show_particles):
             continue
         matrix = np.array(instance.matrix_world, np.float64)
+        holder = obj if instance.parent is None else instance.parent
+        seen = _seen_by_camera(obj, holder, depsgraph.view_layer, findings)
         persistent = tuple(instance.persistent_id) if instance.is_instance else ()
         for key, read in _surfaces(obj, instance.show_self, instance.show_particles, findings):
             if key not in cache:
@@ -132,7 +135,7 @@ def freeze(depsgraph: bpy.types.Depsgraph) -> Frozen:
                     digest = local.digest()
                     cache[key] = unique.setdefault(digest, local), digest
             if (found := cache[key]) is not None:
-                placed.append(Placed(obj.name_full, persistent, matrix, *found, obj.visible_camera))
+                placed.append(Placed(obj.name_full, persistent, matrix, *found, seen))
     repairs: dict[str, int] = dict.fromkeys(REPAIRS, 0)
     ids: dict[str, int] = {}
     taken: set[str] = set()
@@ -153,6 +156,30 @@ def freeze(depsgraph: bpy.types.Depsgraph) -> Frozen:
         note = f"{len(ids):,} objects; from number {MOST_IDS:,} on they share one id"
         findings.add("approximated", "object ids", note)
     return Frozen(meshes, repairs, [], findings)
+
+
+def _seen_by_camera(
+    obj: bpy.types.Object, holder: bpy.types.Object, layer: bpy.types.ViewLayer, findings: Findings
+) -> bool:
+    """Whether camera rays see an object, ``holder`` being what instances it (or itself), as Cycles decides.
+
+    Holdouts, by themselves or by their collection, are a finding and stay surfaces.
+    """
+    own = holder.original
+    if own.is_holdout or own.holdout_get(view_layer=layer):
+        findings.add("ignored", "holdout object", "an ordinary surface", object=obj.name_full)
+        return True
+    return obj.visible_camera and holder.visible_camera and not own.indirect_only_get(view_layer=layer)
+
+
+def _override_materials(frozen: Frozen, layer: bpy.types.ViewLayer) -> None:
+    """The view layer's own material, where it has one, instead of all others."""
+    if layer.material_override is None:
+        return
+    name = layer.material_override.name_full
+    for mesh in frozen.meshes:
+        mesh.materials = [name] * len(mesh.materials)
+    frozen.findings.add("exact", "material override", f"'{name}' stands for every material, as the view layer says")
 
 
 def _surfaces(

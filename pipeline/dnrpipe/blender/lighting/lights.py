@@ -329,17 +329,24 @@ def _frame(axis: np.ndarray) -> np.ndarray:
     return np.stack([x, np.cross(axis, x), axis], axis=1)
 
 
+def is_portal(light: Any) -> bool:
+    """Whether a lamp is a portal: it shows Cycles where light enters, and does not shine."""
+    return light.type == "AREA" and bool(light.cycles.is_portal)
+
+
 def visible_lights(scene: bpy.types.Scene) -> Iterator[tuple[Any, np.ndarray]]:
     """Lamp objects that renders see, instances included, with their world matrices (float64 [4, 4])."""
     layer = next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
     hidden = _hidden_objects(layer.layer_collection)
     depsgraph = layer.depsgraph if layer.depsgraph is not None else bpy.context.evaluated_depsgraph_get()
     for obj in sorted(layer.objects, key=lambda o: o.name):
-        if obj.type == "LIGHT" and not obj.hide_render and obj.name not in hidden:
+        if obj.type == "LIGHT" and not obj.hide_render and obj.name not in hidden and not is_portal(obj.data):
             evaluated = obj.evaluated_get(depsgraph)
             yield evaluated, np.array(evaluated.matrix_world, dtype=np.float64)
     for instance in depsgraph.object_instances:
         if instance.is_instance and instance.object.type == "LIGHT" and instance.show_self:
+            if is_portal(instance.object.data):
+                continue
             parent = instance.parent
             if parent is not None and (parent.hide_render or parent.name in hidden):
                 continue
@@ -363,7 +370,7 @@ def _hidden_objects(collection: bpy.types.LayerCollection) -> set[str]:
 
 
 def report_ray_visibility(names: Iterable[str], findings: Findings) -> None:
-    """A finding for each object that is hidden from some rays, a shadow catcher, a holdout, or has linked light.
+    """A finding for each object that is hidden from some rays, a shadow catcher, or has linked light.
 
     names: objects of the frozen scene. Camera rays are not among them: those are obeyed.
     """
@@ -375,7 +382,5 @@ def report_ray_visibility(names: Iterable[str], findings: Findings) -> None:
             findings.add("ignored", "ray visibility", f"{', '.join(hidden)} rays see it", object=name)
         if obj.is_shadow_catcher:
             findings.add("ignored", "shadow catcher", "an ordinary surface", object=name)
-        if obj.is_holdout:
-            findings.add("ignored", "holdout object", "an ordinary surface", object=name)
         if _is_linked(obj):
             findings.add("ignored", "light linking", "it lights and shades everything", object=name)

@@ -23,6 +23,7 @@ STAND_INS = {
     "font": "its text takes Blender's own font",
     "volume": "its volume is absent",
     "cache": "what it animates stays as it was saved",
+    "IES file": "its lamp shines alike in all directions",
 }
 """What stands for a missing file, by kind."""
 
@@ -140,6 +141,10 @@ def _others() -> Iterator[Reference]:
     for library in bpy.data.libraries:
         if not library.packed_file:
             yield Reference("linked library", library.name, Path(bpy.path.abspath(library.filepath)))
+    for owner, tree in node_trees():
+        for node in tree.nodes:
+            if node.type == "TEX_IES" and node.mode == "EXTERNAL" and node.filepath:
+                yield Reference("IES file", node.name, Path(bpy.path.abspath(node.filepath, library=owner.library)))
     used_fonts = [font for font in bpy.data.fonts if font.users]
     for kind, blocks in (("font", used_fonts), ("volume", bpy.data.volumes), ("cache", bpy.data.cache_files)):
         for block in blocks:
