@@ -142,6 +142,8 @@ def changed(folder: Path) -> Path:
     shown("painted", on_disk)
     generated = bpy.data.images.new("generated", 3, 3, float_buffer=True)
     generated.pixels = [float("nan"), float("inf"), 1e30, 1] * 9
+    generated.file_format = "OPEN_EXR"
+    generated.pack()
     shown("generated", generated)
     grid = bpy.data.images.new("grid", 8, 8)
     grid.generated_type = "COLOR_GRID"

@@ -14,13 +14,23 @@ bpy = pytest.importorskip("bpy")
 
 from tests import nasty_images, nasty_materials, nasty_objects  # noqa: E402
 
+from dnrpipe.blender.geometry import atlas  # noqa: E402
 from dnrpipe.blender.geometry.frozen import load_geometry  # noqa: E402
 from dnrpipe.blender.inspection import inspect  # noqa: E402
+from dnrpipe.blender.lighting import world_images  # noqa: E402
 from dnrpipe.blender.prepare import prepare  # noqa: E402
 from dnrpipe.blender.tasks import InspectTask  # noqa: E402
 from dnrpipe.core.scene_records import SceneSummary  # noqa: E402
 
 CONVERTS = nasty_materials.CONVERTS | nasty_images.CONVERTS | nasty_objects.CONVERTS
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Planar charts and small pictures of worlds: packing by shape takes a second per file, and is tested elsewhere."""
+    monkeypatch.setattr(atlas, "SMART_MESHES", 0)
+    monkeypatch.setattr(world_images, "SIZE", (64, 32))
+    monkeypatch.setattr(world_images, "SAMPLES", 1)
 
 
 def refuse(text: str) -> Any:
