@@ -14,15 +14,18 @@ bpy = pytest.importorskip("bpy")
 
 from tests import nasty_images, nasty_materials, nasty_objects  # noqa: E402
 
+from dnrpipe.blender.baking import bake  # noqa: E402
 from dnrpipe.blender.geometry import atlas  # noqa: E402
 from dnrpipe.blender.geometry.frozen import load_geometry  # noqa: E402
 from dnrpipe.blender.inspection import inspect  # noqa: E402
 from dnrpipe.blender.lighting import world_images  # noqa: E402
 from dnrpipe.blender.prepare import prepare  # noqa: E402
-from dnrpipe.blender.tasks import InspectTask  # noqa: E402
+from dnrpipe.blender.tasks import BakeCommon, BakeOptions, BakeTask, InspectTask, PendingBakes  # noqa: E402
 from dnrpipe.core.scene_records import SceneSummary  # noqa: E402
 
 CONVERTS = nasty_materials.CONVERTS | nasty_images.CONVERTS | nasty_objects.CONVERTS
+
+SLOW = {"sky", "many slots", "alpha modes", "deep parents"}
 
 
 @pytest.fixture(autouse=True)
@@ -52,7 +55,9 @@ def said_of(folder: Path, warnings: list[str]) -> str:
     return "\n".join([*warnings, *rows])
 
 
-@pytest.mark.parametrize("name", CONVERTS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.robustness) if name in SLOW else name for name in CONVERTS]
+)
 def test_converts_and_says_what_it_did(name: str, tmp_path: Path) -> None:
     builder, words = CONVERTS[name]
     scene = tmp_path / "scene"
@@ -67,6 +72,45 @@ def test_converts_and_says_what_it_did(name: str, tmp_path: Path) -> None:
     root = ET.parse(scene / "scene.xml").getroot()
     numbers = [part for element in root.iter() for part in element.get("value", "").split()]
     assert not {"nan", "inf", "-inf"} & set(numbers)
+
+
+def with_bakes(path: Path, folder: Path) -> SceneSummary:
+    """The whole conversion, with everything baked that is not computed."""
+    options = BakeOptions(folder=folder / "bakes", size=64)
+    options.folder.mkdir(parents=True)
+    made = prepare(path, folder / "scene", bakes=options)
+    if isinstance(made, PendingBakes):
+        common = BakeCommon(
+            source=path,
+            frame=made.frame,
+            geometry=folder / "scene" / "geometry.npz",
+            folder=options.folder,
+            size=options.size,
+            threads=1,
+        )
+        worker = bake.Worker(common.data())
+        for layer in made.layers:
+            worker(BakeTask(layer=layer, output=options.folder).data())
+        made = prepare(path, folder / "scene", bakes=options)
+    assert isinstance(made, SceneSummary)
+    return made
+
+
+@pytest.mark.parametrize("name", ["foreign texture", "typed groups", "zones", "many outputs"])
+def test_converts_with_bakes(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bake, "SAMPLES", 1)
+    builder, words = nasty_materials.CONVERTS[name]
+    summary = with_bakes(builder(tmp_path), tmp_path)
+    text = said_of(tmp_path / "scene", summary.warnings)
+    for word in words:
+        assert word in text, text
+
+
+@pytest.mark.robustness
+@pytest.mark.parametrize("name", nasty_materials.SWEEPS)
+def test_every_node_is_baked(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bake, "SAMPLES", 1)
+    with_bakes(nasty_materials.SWEEPS[name][0](tmp_path), tmp_path)
 
 
 @pytest.mark.robustness
