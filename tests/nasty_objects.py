@@ -375,6 +375,37 @@ def moved_by_frame(folder: Path) -> Path:
     return save(folder / "moved_by_frame.blend")
 
 
+def hidden_in_viewport(folder: Path) -> Path:
+    """Lamps and cameras that hang on others, hidden by eye, by screen, by collection; all of them are rendered."""
+    scene = plain()
+    cube()
+    for name in ("eye", "screen", "parents too", "collection", "collection by eye", "driven", "camera", "excluded"):
+        is_camera = name in {"camera", "excluded"}
+        data = bpy.data.cameras.new(name) if is_camera else bpy.data.lights.new(name, "POINT")
+        if not is_camera:
+            data.shadow_soft_size = 0.1
+        parent, obj = link(f"parent of {name}", None), link(name, data)
+        obj.parent, parent.location, obj.location = parent, (1, 2, 3), (10, 0, 0)
+        if name == "eye":
+            obj.hide_set(True)
+        elif name in {"screen", "parents too", "driven", "camera"}:
+            obj.hide_viewport = True
+            parent.hide_viewport = name == "parents too"
+        else:
+            collection(name, parent, obj).hide_viewport = name == "collection"
+            layer = scene.view_layers[0].layer_collection.children[name]
+            layer.hide_viewport, layer.exclude = name == "collection by eye", name == "excluded"
+        if name == "driven":
+            data.driver_add("energy").driver.expression = "frame * 100"
+    lamp = bpy.data.objects.new("instanced", bpy.data.lights.new("instanced", "POINT"))
+    lamp.data.shadow_soft_size = 0.1
+    inner = bpy.data.collections.new("inner")
+    inner.objects.link(lamp)
+    holder = place("holder", inner)
+    holder.location, holder.hide_viewport = (11, 2, 3), True
+    return save(folder / "hidden_in_viewport.blend")
+
+
 # ---------------------------------------------------------------- cameras and pictures
 
 
@@ -572,6 +603,7 @@ CONVERTS: dict[str, Case] = {
     "geometry nodes": (geometry_nodes, ("volume", "point cloud")),
     "heavy modifiers": (heavy_modifiers, ()),
     "moved by frame": (moved_by_frame, ("motion blur", "child of the moving", "deformed")),
+    "hidden in viewport": (hidden_in_viewport, ()),
     "odd cameras": (odd_cameras, ()),
     "odd pictures": (odd_pictures, ("pixel aspect", "render border", "freestyle", "simplify", "film exposure")),
     "layers": (layers, ("shadow catcher", "object 'held out'")),

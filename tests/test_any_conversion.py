@@ -74,6 +74,25 @@ def test_converts_and_says_what_it_did(name: str, tmp_path: Path) -> None:
     assert not {"nan", "inf", "-inf"} & set(numbers)
 
 
+def test_what_the_viewport_hides_is_where_renders_see_it(tmp_path: Path) -> None:
+    """Blender evaluates for scripts what the viewport shows; lamps and cameras elsewhere stayed at the origin."""
+    summary = prepare(nasty_objects.hidden_in_viewport(tmp_path), tmp_path / "scene")
+    assert isinstance(summary, SceneSummary)
+    root = ET.parse(tmp_path / "scene" / "scene.xml").getroot()
+    lamps = {element.get("id", ""): element for element in root.iter("shape") if element.get("type") == "sphere"}
+    names = ("eye", "screen", "parents_too", "collection", "collection_by_eye", "driven", "instanced")
+    assert sorted(lamps) == sorted(f"light-{name}" for name in names)
+    radiance = {}
+    for name, lamp in lamps.items():
+        center, colour = lamp.find("point"), lamp.find(".//rgb")
+        assert center is not None and colour is not None
+        assert [float(center.get(axis, "")) for axis in "xyz"] == pytest.approx([11, 2, 3]), name
+        radiance[name] = float(colour.get("value", "").split()[0])
+    assert radiance["light-driven"] == pytest.approx(10 * radiance["light-eye"], rel=1e-4)  # 100 W, and 10
+    places = {camera.name: [row[3] for row in camera.c2w[:3]] for camera in summary.cameras}
+    assert places["camera"] == pytest.approx([11, 2, 3]) == places["excluded"]
+
+
 def with_bakes(path: Path, folder: Path) -> SceneSummary:
     """The whole conversion, with everything baked that is not computed."""
     options = BakeOptions(folder=folder / "bakes", size=64)

@@ -33,6 +33,8 @@ class Frozen:
     repairs: dict[str, int]
     warnings: list[str]
     findings: Findings = field(default_factory=Findings)
+    lit_by: set[str] = field(default_factory=set)
+    """Full names of lamps that renders see, and of the objects that instance lamps."""
 
 
 class _FreezeEngine(bpy.types.RenderEngine):
@@ -103,6 +105,7 @@ def freeze_scene(scene: bpy.types.Scene) -> Frozen:
             f"scene '{scene.name}', view layer '{layer.name}': no surface is visible in renders; "
             "unhide an object or enable its collection"
         )
+    _show_lamps(scene, layer, outcome.lit_by)
     _override_materials(outcome, layer)
     fit_instances(outcome.meshes, outcome.repairs, outcome.findings)
     return outcome
@@ -119,8 +122,12 @@ def freeze(depsgraph: bpy.types.Depsgraph) -> Frozen:
     unique: dict[bytes, LocalMesh] = {}  # one mesh for all that evaluate to the same content
     placed: list[Placed] = []
     findings = Findings()
+    lit_by: set[str] = set()
     for instance in depsgraph.object_instances:
         obj = instance.object
+        if obj.type == "LIGHT":
+            lit_by.add(obj.name_full if instance.parent is None else instance.parent.name_full)
+            continue
         if not (instance.show_self or instance.show_particles):
             continue
         matrix = np.array(instance.matrix_world, np.float64)
@@ -155,7 +162,7 @@ def freeze(depsgraph: bpy.types.Depsgraph) -> Frozen:
     if len(ids) > MOST_IDS:
         note = f"{len(ids):,} objects; from number {MOST_IDS:,} on they share one id"
         findings.add("approximated", "object ids", note)
-    return Frozen(meshes, repairs, [], findings)
+    return Frozen(meshes, repairs, [], findings, lit_by)
 
 
 def _seen_by_camera(
@@ -170,6 +177,28 @@ def _seen_by_camera(
         findings.add("ignored", "holdout object", "an ordinary surface", object=obj.name_full)
         return True
     return obj.visible_camera and holder.visible_camera and not own.indirect_only_get(view_layer=layer)
+
+
+def _show_lamps(scene: bpy.types.Scene, layer: bpy.types.ViewLayer, names: set[str]) -> None:
+    """Show in the viewport the lamps that renders see: for scripts, Blender evaluates nothing else.
+
+    Whole collections stay hidden: what else they hold may be heavy.
+    """
+    depsgraph = layer.depsgraph
+    shown = {instance.object.name_full for instance in depsgraph.object_instances} if depsgraph is not None else set()
+    hidden = [obj for obj in layer.objects if obj.name_full in names - shown]
+    for obj in hidden:
+        try:
+            obj.hide_viewport = False
+            obj.hide_set(False, view_layer=layer)
+        except (AttributeError, RuntimeError):  # linked data keep their library's settings
+            continue
+        if not obj.visible_get(view_layer=layer) and obj.name not in scene.collection.objects:
+            scene.collection.objects.link(obj)
+            layer.update()
+            obj.hide_set(False, view_layer=layer)
+    if hidden:
+        scene.frame_set(scene.frame_current, subframe=scene.frame_subframe)  # drivers of what was hidden
 
 
 def _override_materials(frozen: Frozen, layer: bpy.types.ViewLayer) -> None:

@@ -108,7 +108,7 @@ def _node_colour(tree: bpy.types.NodeTree, name: str, findings: Findings) -> np.
     trial = Findings()
     evaluator = Evaluator(None, ImageReader(trial), trial)
     colour = evaluator.colour(source.node.inputs["Color"], source.scope)
-    strength = _falloff(source.node.inputs["Strength"], source.scope, name, findings)
+    strength = _falloff(source.node.inputs["Strength"], source.scope, name, evaluator, findings)
     if strength is None:
         strength = evaluator.scalar(source.node.inputs["Strength"], source.scope).scalar
     for finding in trial:
@@ -118,7 +118,7 @@ def _node_colour(tree: bpy.types.NodeTree, name: str, findings: Findings) -> np.
     return np.asarray(colour.mean, dtype=np.float64) * strength
 
 
-def _falloff(socket: Any, scope: Scope, name: str, findings: Findings) -> float | None:
+def _falloff(socket: Any, scope: Scope, name: str, evaluator: Evaluator, findings: Findings) -> float | None:
     """Strength of a Light Falloff node (its quadratic output is how light falls off anyway); None for other nodes."""
     source = resolve(socket, scope)
     if not source.linked or source.node.type != "LIGHT_FALLOFF":
@@ -126,7 +126,7 @@ def _falloff(socket: Any, scope: Scope, name: str, findings: Findings) -> float 
     if source.socket.name != "Quadratic":
         feature = f"{source.socket.name.lower()} light falloff"
         findings.add("approximated", feature, "falls off with the square of the distance", object=name)
-    return float(source.node.inputs["Strength"].default_value)
+    return evaluator.scalar(source.node.inputs["Strength"], source.scope).scalar
 
 
 def _note_ignored(obj: Any, light: Any, findings: Findings) -> None:
