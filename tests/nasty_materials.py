@@ -681,6 +681,7 @@ def odd_lamps(folder: Path) -> Path:
         for which in ("plain", "negative", "zero", "nodes", "portal", "linked", "instanced"):
             lamp = bpy.data.lights.new(f"{kind} {which}", kind)
             lamp.energy = -5 if which == "negative" else 5
+            lamp.cycles.max_bounces = 0 if which == "instanced" else 1024
             if which == "zero":
                 for name in ("size", "size_y", "shadow_soft_size", "angle", "spread", "spot_blend"):
                     if hasattr(lamp, name):
@@ -794,6 +795,12 @@ def _no_output(tree: Any, background: Any, folder: Path) -> None:
     tree.nodes.clear()
 
 
+def _unseen(tree: Any, background: Any, folder: Path) -> None:
+    del tree, folder
+    background.inputs["Color"].default_value = (1, 1, 1, 1)
+    bpy.context.scene.world.cycles_visibility.diffuse = False
+
+
 def _surface_shader(tree: Any, background: Any, folder: Path) -> None:
     """A Principled BSDF as the world's shader, and a Light Path and camera data in it."""
     del background, folder
@@ -826,13 +833,14 @@ CONVERTS: dict[str, Case] = {
     "many slots": (many_slots, ()),
     "zones": (zones, ("material 'repeat shader'", "material 'menu shader'")),
     "volumes": (volumes, ("volume emission", "Diffuse BSDF node as a volume")),
-    "odd lamps": (odd_lamps, ("its area is 0", "light linking", "portal", "constant light falloff")),
+    "odd lamps": (odd_lamps, ("its area is 0", "light linking", "portal", "constant light falloff", "max bounces")),
     "ies lamp": (ies_lamp, ("gone.ies",)),
     "mirror ball": (with_world("mirror ball", _mirror_ball), ("environment image",)),
     "missing hdri": (with_world("missing hdri", _missing_hdri), ("image 'gone.png'",)),
     "no hdri": (with_world("no hdri", _no_image), ("no image chosen",)),
     "world outputs": (with_world("world outputs", _two_outputs), ()),
     "fog": (with_world("fog", _fog), ("world 'fog' volume",)),
+    "world unseen": (with_world("world unseen", _unseen), ("ray visibility", "diffuse rays")),
     "sky": (with_world("sky", _sky), ()),
     "world unlinked": (with_world("world unlinked", _nothing_linked), ("no light",)),
     "world without output": (with_world("world without output", _no_output), ("no light",)),

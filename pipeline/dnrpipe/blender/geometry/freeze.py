@@ -184,9 +184,7 @@ def _show_lamps(scene: bpy.types.Scene, layer: bpy.types.ViewLayer, names: set[s
 
     Whole collections stay hidden: what else they hold may be heavy.
     """
-    depsgraph = layer.depsgraph
-    shown = {instance.object.name_full for instance in depsgraph.object_instances} if depsgraph is not None else set()
-    hidden = [obj for obj in layer.objects if obj.name_full in names - shown]
+    hidden = [obj for obj in layer.objects if obj.name_full in names and not obj.visible_get(view_layer=layer)]
     for obj in hidden:
         try:
             obj.hide_viewport = False

@@ -32,6 +32,8 @@ POINT_RADIUS = 1e-3
 """Radius, in radii of the scene, of a sphere that stands for a point."""
 SPOT_TEXELS = 513
 """Side of the image that carries a spot's cross-section."""
+FEW_BOUNCES = 8
+"""Bounces of a lamp's light below which a limit shows in the picture."""
 KINDS = {
     "visible_diffuse": "diffuse",
     "visible_glossy": "glossy",
@@ -135,6 +137,9 @@ def _note_ignored(obj: Any, light: Any, findings: Findings) -> None:
     hidden = [ray for ray in ("diffuse", "glossy", "transmission") if not getattr(obj, f"visible_{ray}")]
     if hidden:
         findings.add("ignored", "lamp's ray visibility", f"{', '.join(hidden)} rays see it", object=obj.name)
+    if light.cycles.max_bounces < FEW_BOUNCES:
+        note = f"its light bounces more than {light.cycles.max_bounces} time(s)"
+        findings.add("ignored", "lamp's max bounces", note, object=obj.name)
     if _is_linked(obj):
         findings.add("ignored", "light linking", "the lamp lights everything", object=obj.name)
 

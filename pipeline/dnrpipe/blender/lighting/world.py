@@ -40,6 +40,10 @@ def export_world(
     world = scene.world
     if world is None:
         return
+    rays = ("diffuse", "glossy", "transmission")
+    hidden = [ray for ray in rays if not getattr(world.cycles_visibility, ray)]
+    if hidden:
+        findings.add("ignored", f"world '{world.name}' ray visibility", f"{', '.join(hidden)} rays see it")
     tree = world.node_tree
     if tree is None:
         _constant(root, np.array(world.color))

@@ -10,6 +10,8 @@ from typing import Any
 
 import bpy
 
+from dnrpipe.core.scene_records import FindingKind
+
 from ..findings import Findings, first_of, printable
 from ..shading.sockets import NOT_IN_CYCLES, UNDEFINED, computes
 from .names import data_collections, node_trees
@@ -94,14 +96,20 @@ def note_missing(findings: Findings) -> None:
             continue  # the pictures are taken before it
         for node in tree.nodes:
             if not computes(node):
-                unknown, not_here = node.bl_idname == UNDEFINED, NOT_IN_CYCLES.get(node.type)
-                what = "its type is unknown here (needs its add-on)" if unknown else not_here or "has no tree"
+                kind, why = _why_dropped(node)
                 place = {"material": owner.name_full} if isinstance(owner, bpy.types.Material) else {}
                 named = "" if place else f" of '{owner.name_full}'"
-                kind = "ignored" if not_here else "missing"
-                findings.add(
-                    kind, f"node '{node.name}'{named}", f"{what}: its links are dropped, as in Cycles", **place
-                )
+                findings.add(kind, f"node '{node.name}'{named}", why, **place)
+
+
+def _why_dropped(node: Any) -> tuple[FindingKind, str]:
+    """Kind of finding, and why the links of a node that does not compute are dropped."""
+    dropped = "its links are dropped, as in Cycles"
+    if node.bl_idname == UNDEFINED:
+        return "missing", f"its type is unknown here (needs its add-on): {dropped}, which still sees a tree inside"
+    if node.type in NOT_IN_CYCLES:
+        return "ignored", f"{NOT_IN_CYCLES[node.type]}: {dropped}"
+    return "missing", f"has no tree: {dropped}"
 
 
 def external_files(path: Path) -> list[Path]:
