@@ -115,14 +115,28 @@ def with_bakes(path: Path, folder: Path) -> SceneSummary:
     return made
 
 
-@pytest.mark.parametrize("name", ["foreign texture", "typed groups", "zones", "many outputs"])
+@pytest.mark.parametrize("name", ["foreign texture", "typed groups", "zones", "many outputs", "attributes"])
 def test_converts_with_bakes(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bake, "SAMPLES", 1)
-    builder, words = nasty_materials.CONVERTS[name]
+    builder, words = CONVERTS[name]
     summary = with_bakes(builder(tmp_path), tmp_path)
     text = said_of(tmp_path / "scene", summary.warnings)
     for word in words:
         assert word in text, text
+
+
+def test_what_is_baked_in_magenta_is_named(tmp_path: Path) -> None:
+    summary = with_bakes(nasty_images.sequences(tmp_path), tmp_path)
+    text = said_of(tmp_path / "scene", summary.warnings)
+    for word in ("frame_0002.png'; magenta", "frame_0090.png'; magenta", "movie.mp4'; magenta", "animated image"):
+        assert word in text, text
+    assert "frame_0007.png'; magenta" not in text  # that one is there
+
+
+@pytest.mark.robustness
+@pytest.mark.parametrize("name", [name for name in CONVERTS if name not in {"sequences", "changed", "alpha modes"}])
+def test_converts_with_bakes_too(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    test_converts_with_bakes(name, tmp_path, monkeypatch)
 
 
 @pytest.mark.robustness

@@ -13,7 +13,7 @@ from .lighting.lights import is_portal
 
 SIMULATED = {"CLOTH", "SOFT_BODY", "FLUID", "DYNAMIC_PAINT", "OCEAN", "PARTICLE_SYSTEM", "MESH_SEQUENCE_CACHE", "BUILD"}
 """Modifiers that change with the frame without keys."""
-ENGINES = {"CYCLES", "BLENDER_EEVEE", "BLENDER_EEVEE_NEXT", "BLENDER_WORKBENCH"}
+ENGINES = {"CYCLES", "BLENDER_EEVEE", "BLENDER_EEVEE_NEXT"}
 LAYER_SWITCHES = {
     "use_sky": "sky",
     "use_solid": "surfaces",
@@ -43,7 +43,7 @@ def _settings(scene: bpy.types.Scene) -> Iterator[tuple[Any, str, str]]:
     if render.use_simplify:
         yield "ignored", "simplify", "subdivision, hair and volumes are those of a render without it"
     if render.engine not in ENGINES:
-        yield "approximated", "render engine", "not known here: converted as Cycles renders the file"
+        yield "approximated", "render engine", "another than Cycles or EEVEE: converted as Cycles renders the file"
     if render.engine == "CYCLES" and abs(scene.cycles.film_exposure - 1) > 1e-6:
         yield "ignored", "film exposure", f"pictures are not multiplied by {scene.cycles.film_exposure:g}"
     if scene.compositing_node_group is not None and render.use_compositing:
