@@ -452,6 +452,74 @@ def every_node_fed_by_fresnel(folder: Path) -> Path:
     return every_node(folder, feed=lambda tree: tree.nodes.new("ShaderNodeFresnel"))
 
 
+def every_setting(folder: Path) -> Path:
+    """Every choice of every node's menus, with a procedural first number."""
+    plain()
+    common = {prop.identifier for prop in bpy.types.Node.bl_rna.properties}
+    for name in node_classes():
+        if not name.startswith("ShaderNode") or name.startswith("ShaderNodeOutput"):
+            continue
+        kind = getattr(bpy.types, name).bl_rna
+        menus = [prop for prop in kind.properties if prop.type == "ENUM" and prop.identifier not in common]
+        for menu in menus:
+            for choice in [item.identifier for item in menu.enum_items]:
+                made, tree, principled = tree_of(f"{name}.{menu.identifier}.{choice}")
+                node = tree.nodes.new(name)
+                try:
+                    setattr(node, menu.identifier, choice)
+                except (TypeError, AttributeError):
+                    continue  # not for this choice of others
+                out = next((socket for socket in node.outputs if socket.enabled), None)
+                if out is None:
+                    continue
+                number = next((socket for socket in node.inputs if socket.type == "VALUE" and socket.enabled), None)
+                if number is not None:
+                    tree.links.new(tree.nodes.new("ShaderNodeTexNoise").outputs[0], number)
+                if out.type == "SHADER":
+                    tree.links.new(out, output_of(tree).inputs["Volume" if "Volume" in name else "Surface"])
+                else:
+                    tree.links.new(out, principled.inputs["Base Color"])
+                cube(made.name, made)
+    return save(folder / "every_setting.blend")
+
+
+def extreme_numbers(folder: Path) -> Path:
+    """Every shader with all its inputs negative, 0, very large, and too large."""
+    plain()
+    shaders = [name for name in node_classes() if getattr(bpy.types, name).__name__ in SHADERS or "Bsdf" in name]
+    for number in (-1, -5, 0, 1e14, 1e20):
+        for name in shaders:
+            made, tree, _ = tree_of(f"{name} {number:g}")
+            node = tree.nodes.new(name)
+            for socket in node.inputs:
+                size = {"VALUE": 0, "RGBA": 4, "VECTOR": 3}.get(socket.type)
+                if size is not None and socket.name not in {"Normal", "Tangent", "Coat Normal"}:
+                    socket.default_value = (number,) * size if size else number
+            tree.links.new(node.outputs[0], output_of(tree).inputs["Volume" if "Volume" in name else "Surface"])
+            cube(made.name, made)
+    return save(folder / "extreme_numbers.blend")
+
+
+SHADERS = {
+    *("ShaderNodeSubsurfaceScattering", "ShaderNodeEmission", "ShaderNodeBackground", "ShaderNodeHoldout"),
+    *("ShaderNodeVolumeAbsorption", "ShaderNodeVolumeScatter", "ShaderNodeVolumePrincipled"),
+    *("ShaderNodeVolumeCoefficients", "ShaderNodeEeveeSpecular"),
+}
+
+
+def one_dimensional(folder: Path) -> Path:
+    """Procedural textures over one number, which have no Vector input."""
+    plain()
+    for kind in ("Noise", "Voronoi", "WhiteNoise"):
+        made, tree, principled = tree_of(kind)
+        node = tree.nodes.new(f"ShaderNodeTex{kind}")
+        setattr(node, "voronoi_dimensions" if kind == "Voronoi" else "noise_dimensions", "1D")
+        tree.links.new(tree.nodes.new("ShaderNodeTexCoord").outputs["Object"], node.inputs["W"])
+        tree.links.new(node.outputs["Color"], principled.inputs["Base Color"])
+        cube(kind, made)
+    return save(folder / "one_dimensional.blend")
+
+
 def only_eevee(folder: Path) -> Path:
     """Shader to RGB into a ramp into an Emission, as toon shaders do; the Specular BSDF."""
     plain()
@@ -831,6 +899,8 @@ CONVERTS: dict[str, Case] = {
     "edge cases": (edge_cases, ("UV layer 'nowhere'",)),
     "displaced": (displaced, ("true displacement", "material 'vector'")),
     "many slots": (many_slots, ()),
+    "extreme numbers": (extreme_numbers, ("beyond 1e+15", "ShaderNodeBackground 1e+20")),
+    "one-dimensional": (one_dimensional, ()),
     "zones": (zones, ("material 'repeat shader'", "material 'menu shader'")),
     "volumes": (volumes, ("volume emission", "Diffuse BSDF node as a volume")),
     "odd lamps": (odd_lamps, ("its area is 0", "light linking", "portal", "constant light falloff", "max bounces")),
@@ -850,6 +920,7 @@ CONVERTS: dict[str, Case] = {
 
 SWEEPS: dict[str, Case] = {
     "every node": (every_node, ()),
+    "every setting": (every_setting, ()),
     "every node fed by noise": (every_node_fed_by_noise, ()),
     "every node fed by an image": (every_node_fed_by_an_image, ()),
     "every node fed by Fresnel": (every_node_fed_by_fresnel, ()),

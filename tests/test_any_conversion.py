@@ -115,7 +115,9 @@ def with_bakes(path: Path, folder: Path) -> SceneSummary:
     return made
 
 
-@pytest.mark.parametrize("name", ["foreign texture", "typed groups", "zones", "many outputs", "attributes"])
+@pytest.mark.parametrize(
+    "name", ["foreign texture", "typed groups", "zones", "many outputs", "attributes", "one-dimensional"]
+)
 def test_converts_with_bakes(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bake, "SAMPLES", 1)
     builder, words = CONVERTS[name]

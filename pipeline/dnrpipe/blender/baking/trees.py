@@ -12,7 +12,7 @@ from typing import Any
 
 import bpy
 
-from ..shading.sockets import walk
+from ..shading.sockets import find_input, walk
 from ..tasks import Tap
 
 GENERATED, OBJECT, OBJECT_NORMAL = "dnrpipe.generated", "dnrpipe.object", "dnrpipe.object_normal"
@@ -123,8 +123,9 @@ class TreeCopier:
             return
         self._substituted.add(tree.as_pointer())
         for node in list(tree.nodes):
-            if node.type in IMPLICIT_GENERATED and not node.inputs["Vector"].is_linked:
-                tree.links.new(_attribute(tree, GENERATED, "Vector"), node.inputs["Vector"])
+            place = find_input(node, "Vector") if node.type in IMPLICIT_GENERATED else None  # None: one-dimensional
+            if place is not None and not place.is_linked:
+                tree.links.new(_attribute(tree, GENERATED, "Vector"), place)
             elif node.type == "TEX_COORD":
                 if node.object is None:
                     _replace(tree, node, "Object", _attribute, OBJECT, "Vector")

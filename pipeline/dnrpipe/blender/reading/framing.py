@@ -62,7 +62,7 @@ def usable(obj: Any) -> bool:
     if obj is None or obj.type != "CAMERA" or obj.data is None:
         return False
     numbers = [getattr(obj.data, name) for name in ("lens", "sensor_width", "sensor_height", "shift_x", "shift_y")]
-    return np.isfinite(numbers).all() and invertible(np.array(obj.matrix_world, np.float64), least=1e-6)
+    return bool(np.isfinite(numbers).all()) and invertible(np.array(obj.matrix_world, np.float64), least=1e-6)
 
 
 def _framing_distance(scene: bpy.types.Scene, center: np.ndarray, points: Iterable[np.ndarray]) -> tuple[float, float]:

@@ -11,7 +11,7 @@ from ..findings import first_of
 from .names import node_trees
 
 SHOWN = 4
-LARGEST = 1e30  # Blender stores an infinite number as the largest float, 3.4e38: products with it overflow
+LARGEST = 1e15  # Blender stores an infinite number as the largest float, 3.4e38; products of two must not overflow
 LAMP_NUMBERS = ("energy", "shadow_soft_size", "size", "size_y", "angle", "spot_size", "spot_blend", "exposure")
 
 
@@ -44,7 +44,7 @@ def repair_shaders() -> list[str]:
             numbers.append(f"{light.name_full}: color")
     found = {
         "shader link(s) run in a circle and are cut": cut,
-        "number(s) are not finite (NaN, infinite) and are replaced": numbers,
+        f"number(s) are not finite (NaN, infinite, beyond {LARGEST:g}) and are replaced": numbers,
     }
     return [f"{len(where)} {what}: {first_of(where, SHOWN, '; ')}" for what, where in found.items() if where]
 
