@@ -869,6 +869,13 @@ def _unseen(tree: Any, background: Any, folder: Path) -> None:
     bpy.context.scene.world.cycles_visibility.diffuse = False
 
 
+def _no_profile(tree: Any, background: Any, folder: Path) -> None:
+    del folder
+    ies = tree.nodes.new("ShaderNodeTexIES")
+    tree.links.new(ies.outputs[0], background.inputs["Color"])
+    tree.links.new(ies.outputs[0], background.inputs["Strength"])
+
+
 def _surface_shader(tree: Any, background: Any, folder: Path) -> None:
     """A Principled BSDF as the world's shader, and a Light Path and camera data in it."""
     del background, folder
@@ -910,6 +917,7 @@ CONVERTS: dict[str, Case] = {
     "no hdri": (with_world("no hdri", _no_image), ("no image chosen",)),
     "world outputs": (with_world("world outputs", _two_outputs), ()),
     "fog": (with_world("fog", _fog), ("world 'fog' volume",)),
+    "world of no profile": (with_world("world of no profile", _no_profile), ("no light profile",)),
     "world unseen": (with_world("world unseen", _unseen), ("ray visibility", "diffuse rays")),
     "sky": (with_world("sky", _sky), ()),
     "world unlinked": (with_world("world unlinked", _nothing_linked), ("no light",)),
