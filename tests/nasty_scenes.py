@@ -649,7 +649,7 @@ OPENS: dict[str, tuple[Builder, tuple[str, ...]]] = {
     "odd materials": (odd_materials, ("movie.mp4",)),
     "odd render settings": (odd_render_settings, ()),
     "circular": (circular, ("1 shader link(s) run in a circle", "circular: ")),
-    "not finite": (not_finite, ("not finite (NaN, infinite) and are replaced", "Base Color")),
+    "not finite": (not_finite, ("not finite (NaN, infinite, beyond 1e+15) and are replaced", "Base Color")),
     "foreign add-ons": (foreign_add_ons, ()),
     "background set": (background_set, ("'front', is converted",)),
     "default world": (default_world, ("default world",)),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import bpy
@@ -16,8 +18,37 @@ MAX_FRAMES = 500
 
 
 def scene_cameras(scene: bpy.types.Scene) -> list[SceneCamera]:
-    """Every camera of the scene that can see, at the current frame."""
-    return [describe(obj).model_copy(update={"active": obj == scene.camera}) for obj in scene.objects if usable(obj)]
+    """Every camera of the scene that can see, at the current frame; those hidden in the viewport too."""
+    cameras = [obj for obj in scene.objects if obj.type == "CAMERA"]
+    if scene.camera is not None and scene.camera not in cameras:
+        cameras.append(scene.camera)
+    with _alone(scene, cameras) as helper:
+        helper.frame_set(scene.frame_current, subframe=scene.frame_subframe)
+        evaluated = [(obj, obj.evaluated_get(helper.view_layers[0].depsgraph)) for obj in cameras]
+        seeing = [(describe(found), obj == scene.camera) for obj, found in evaluated if usable(found)]
+    return [camera.model_copy(update={"active": active}) for camera, active in seeing]
+
+
+@contextmanager
+def _alone(scene: bpy.types.Scene, cameras: Sequence[Any]) -> Iterator[Any]:
+    """A scene that holds the cameras alone, with what they depend on, and hides none from its viewport.
+
+    Blender evaluates for scripts what the viewport shows: elsewhere a hidden camera stays at the origin.
+    """
+    helper: Any = bpy.data.scenes.new("dnrpipe.cameras")
+    hidden = [camera for camera in cameras if camera.hide_viewport]
+    try:
+        for name in ("frame_map_old", "frame_map_new", "fps", "fps_base"):
+            setattr(helper.render, name, getattr(scene.render, name))
+        for camera in cameras:
+            helper.collection.objects.link(camera)
+        for camera in hidden:
+            camera.hide_viewport = False
+        yield helper
+    finally:
+        for camera in hidden:
+            camera.hide_viewport = True
+        bpy.data.scenes.remove(helper)
 
 
 def camera_animation(scene: bpy.types.Scene, max_frames: int = MAX_FRAMES) -> list[SceneCamera]:
@@ -29,12 +60,8 @@ def camera_animation(scene: bpy.types.Scene, max_frames: int = MAX_FRAMES) -> li
     if not _may_move(scene):
         return []
     step = max(1, math.ceil((scene.frame_end - scene.frame_start + 1) / max_frames))
-    helper: Any = bpy.data.scenes.new("dnrpipe.cameras")
-    try:
-        for name in ("frame_map_old", "frame_map_new"):
-            setattr(helper.render, name, getattr(scene.render, name))
-        for bound in {scene.camera, *(marker.camera for marker in scene.timeline_markers)} - {None}:
-            helper.collection.objects.link(bound)
+    bound = {scene.camera, *(marker.camera for marker in scene.timeline_markers)} - {None}
+    with _alone(scene, list(bound)) as helper:
         frames = []
         for frame in range(scene.frame_start, scene.frame_end + 1, step):
             camera: Any = _camera_at(scene, frame)
@@ -42,8 +69,6 @@ def camera_animation(scene: bpy.types.Scene, max_frames: int = MAX_FRAMES) -> li
             evaluated = None if camera is None else camera.evaluated_get(helper.view_layers[0].depsgraph)
             if evaluated is not None and usable(evaluated):
                 frames.append(describe(evaluated).model_copy(update={"frame": frame}))
-    finally:
-        bpy.data.scenes.remove(helper)
     seen = [camera.model_copy(update={"frame": 0, "name": ""}) for camera in frames]
     return frames if any(camera != seen[0] for camera in seen) else []
 

@@ -19,6 +19,7 @@ from .geometry.frozen import FrozenMesh
 from .lighting.lights import visible_lights
 from .reading.missing import SHAPELESS_IMAGES
 from .reading.names import find_material
+from .settings_left_out import moving_objects, note_settings
 from .shading.sockets import find_input, resolve, surface_source, walk
 
 NAMES_PER_MATERIAL = 8  # objects listed as examples for each material
@@ -28,14 +29,15 @@ def take_census(scene: bpy.types.Scene, findings: Findings, meshes: Sequence[Fro
     """Count the objects, materials, lights, images and special features that renders of ``scene`` see.
 
     meshes: the frozen geometry, so that nothing is evaluated twice. Adds missing images to the findings as
-    ``missing``, and motion blur as ``ignored``; freezing reports hair and volumes. The census holds all findings so
-    far.
+    ``missing``, motion blur and render settings as ``ignored``; freezing reports hair and volumes. The census holds
+    all findings so far.
     """
     instances, triangles, by_object = _counts(meshes)
     types = Counter(obj.type for obj in render_layer(scene).objects if not obj.hide_render)
     users = _users(meshes)
     found = {name: find_material(name) for name in sorted(filter(None, users))}
     described = {name: describe_material(material, users[name]) for name, material in found.items() if material}
+    note_settings(scene, findings)
     volumes = sorted(obj.name for obj in scene.objects if obj.type == "VOLUME" and not obj.hide_render)
     return Census(
         scene=scene.name,
@@ -134,7 +136,7 @@ def _world_emits(world: Any) -> bool:
     colour, strength = (find_input(surface.node, name) for name in ("Color", "Strength"))
     for socket in (colour, strength):
         source = None if socket is None else resolve(socket)
-        if source is not None and not source.linked and not np.any(np.ravel(source.default)[:3] > 0):
+        if source is not None and not source.linked and max(source.colour) <= 0:
             return False
     return True
 
@@ -184,10 +186,10 @@ def _hair(scene: bpy.types.Scene) -> list[str]:
 
 
 def _motion(scene: bpy.types.Scene, findings: Findings) -> list[str]:
-    """Objects that would be blurred by their motion: animated ones, where the scene asks for motion blur."""
-    if not scene.render.use_motion_blur:
+    """Objects that would be blurred by their motion, where the scene and its view layer ask for motion blur."""
+    if not (scene.render.use_motion_blur and render_layer(scene).use_motion_blur):
         return []
-    moving = sorted(obj.name for obj in scene.objects if obj.animation_data and obj.animation_data.action)
+    moving = moving_objects(scene)
     for name in moving:
         findings.add("ignored", "motion blur", f"frozen at frame {scene.frame_current}", object=name)
     return moving

@@ -9,7 +9,7 @@ from typing import Any
 from dnrpipe.core.scene_records import MaterialFacts
 
 from .baking.trees import IMPLICIT_GENERATED
-from .shading.sockets import find_input, resolve, surface_source, walk
+from .shading.sockets import find_input, output_node, resolve, surface_source, walk
 
 PROCEDURAL = {*IMPLICIT_GENERATED, "TEX_MUSGRAVE", "TEX_WHITE_NOISE"}
 """Texture nodes without image."""
@@ -65,8 +65,8 @@ def _reachable(tree: Any) -> Iterator[Any]:
 
     A group counts whole: which of its outputs is used is not followed.
     """
-    output = None if tree is None else tree.get_output_node("CYCLES")
-    todo, seen, groups = ([] if output is None else [output]), set(), set()
+    output, inside = output_node(tree)
+    todo, seen, groups = ([] if output is None else [*inside, output]), set(), set()
     while todo:
         node = todo.pop()
         if node.as_pointer() in seen:
@@ -88,7 +88,7 @@ def _active(node: Any, *names: str, off: float = 0.0) -> bool:
     if socket is None:
         return False
     source = resolve(socket)
-    return source.linked or abs(float(source.default) - off) > 1e-6
+    return source.linked or abs(source.number - off) > 1e-6
 
 
 def _specular(node: Any) -> bool:
@@ -103,7 +103,7 @@ def _emits(node: Any) -> bool:
     if colour is None or (find_input(node, *strength) is not None and not _active(node, *strength)):
         return False
     source = resolve(colour)
-    return source.linked or any(v > 0 for v in list(source.default)[:3])
+    return source.linked or any(v > 0 for v in source.colour)
 
 
 def _roughness(node: Any) -> float | None:
@@ -117,11 +117,11 @@ def _roughness(node: Any) -> float | None:
         source = None if socket is None else resolve(socket)
         if source is not None and source.linked:
             return None
-        values.append(0.0 if source is None else float(source.default))
+        values.append(0.0 if source is None else source.number)
     return min(values)
 
 
 def _ior(node: Any) -> float:
     socket = find_input(node, "IOR")
     source = None if socket is None else resolve(socket)
-    return 1.45 if source is None or source.linked else float(source.default)
+    return 1.45 if source is None or source.linked else source.number

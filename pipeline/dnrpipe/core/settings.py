@@ -269,7 +269,7 @@ def resolve(
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         if first["type"] == "value_error" and isinstance(first["input"], Mapping):  # settings that exclude each other
-            raise UserError(f"setting {where}: {first['ctx']['error']}") from None
+            raise UserError(f"setting {where}: {first.get('ctx', {}).get('error')}") from None
         raise UserError(f"setting {where}: {first['msg'].lower()}, got {first['input']!r}") from None
 
 

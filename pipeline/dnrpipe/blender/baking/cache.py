@@ -12,11 +12,14 @@ import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+import bpy
 import numpy as np
 
 from ..findings import Findings
 from ..geometry.frozen import ATLAS_LAYER, FrozenMesh
+from ..reading.missing import is_file
 from ..shading.sockets import Source
 from ..shading.textures import Placement, Textured
 from ..tasks import MaterialTaps, Tap, ValueKind
@@ -118,6 +121,8 @@ class BakeCache:
                 note = f"depends on the ray, which a bake has not: {VIEW_DEPENDENT[node.type]} is used"
                 findings.add("approximated", f"{node.bl_label} node", note, material=material)
         for node in (entry.node for entry in nodes):
+            if getattr(node, "image", None) is not None:
+                _warn_of_image(node, material, findings)
             in_use = {output.name for output in node.outputs if output.is_linked}
             if node.type == "TEX_COORD":
                 for name in sorted(in_use & set(FROM_CAMERA)):
@@ -129,8 +134,6 @@ class BakeCache:
             if node.type == "ATTRIBUTE" and node.attribute_type != "GEOMETRY":
                 name = f"attribute '{node.attribute_name}' of the {node.attribute_type.lower()}"
                 findings.add("ignored", name, "only attributes of the mesh are kept: 0 is used", material=material)
-            if node.type == "SCRIPT":
-                findings.add("ignored", "Script node", "Open Shading Language is not run", material=material)
         if len(self.atlas.parts(material)) > MAX_OWN and any(is_object_space(entry.node) for entry in nodes):
             note = f"on more than {MAX_OWN} objects: baked as if their axes were the world's"
             findings.add("approximated", "object-space nodes", note, material=material)
@@ -166,3 +169,32 @@ class BakeCache:
                     digest.update(np.ascontiguousarray(array).data)
             self._meshes[id(mesh)] = digest.hexdigest()
         return self._meshes[id(mesh)]
+
+
+def _warn_of_image(node: Any, material: str, findings: Findings) -> None:
+    """What Cycles bakes in magenta, and which frame of an animated image it bakes."""
+    image = node.image
+    name = f"image '{image.name}'"
+    if image.source in {"SEQUENCE", "MOVIE"}:
+        findings.add("approximated", f"animated {name}", "one frame is used", material=material)
+    if image.source == "SEQUENCE":  # Blender counts only while it draws
+        node.image_user.frame_current = _frame_shown(node.image_user, bpy.context.scene.frame_current)
+    path = Path(bpy.path.abspath(image.filepath_from_user(image_user=node.image_user), library=image.library))
+    lost = image.source == "SEQUENCE" and not image.packed_files and not is_file(path)
+    if lost or (image.source != "TILED" and not _is_readable(image)):
+        note = f"cannot read '{path if lost else image.filepath or image.name}'; magenta stands for it"
+        findings.add("missing", name, note, material=material)
+
+
+def _frame_shown(user: Any, now: int) -> int:
+    """Number in the file name of a sequence's image at a frame of the scene (Blender's BKE_image_user_frame_get)."""
+    count, frame = max(user.frame_duration, 1), now - user.frame_start
+    return user.frame_offset + 1 + (frame % count if user.use_cyclic else min(max(frame, 0), count - 1))
+
+
+def _is_readable(image: Any) -> bool:
+    if image.has_data:
+        return True
+    readable = len(image.pixels) > 0  # reads the file
+    image.buffers_free()
+    return readable

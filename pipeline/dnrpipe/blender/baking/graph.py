@@ -27,6 +27,7 @@ FROM_CAMERA = {"Camera": "camera", "Window": "window", "Reflection": "reflection
 AROUND = {"AMBIENT_OCCLUSION", "BEVEL"}
 """Nodes that look at the geometry around the point."""
 PER_OBJECT = {"OBJECT_INFO"}
+NESTED = 4  # settings within settings of a node (a curve mapping's curves are 2 deep); some point in circles
 SKIPPED = {property.identifier for property in bpy.types.Node.bl_rna.properties} | {"object"}
 
 
@@ -87,7 +88,7 @@ class GraphHasher:
         if camera is not None and any(output.is_linked and output.name in FROM_CAMERA for output in node.outputs):
             yield [_plain(row) for row in camera.matrix_world]
 
-    def _properties(self, holder: Any, skipped: set[str]) -> Iterator[Any]:
+    def _properties(self, holder: Any, skipped: set[str], depth: int = 0) -> Iterator[Any]:
         for prop in holder.bl_rna.properties:
             name = prop.identifier
             if name in skipped or name == "rna_type":
@@ -95,11 +96,11 @@ class GraphHasher:
             if prop.type in {"BOOLEAN", "INT", "FLOAT", "ENUM", "STRING"}:
                 yield name, _plain(getattr(holder, name))
             elif prop.type == "POINTER":
-                yield name, self._pointer(getattr(holder, name))
+                yield name, self._pointer(getattr(holder, name), depth)
             elif prop.type == "COLLECTION" and name in {"elements", "points", "curves"}:
-                yield name, [list(self._properties(item, set())) for item in getattr(holder, name)]
+                yield name, [list(self._properties(item, set(), depth + 1)) for item in getattr(holder, name)]
 
-    def _pointer(self, value: Any) -> Any:
+    def _pointer(self, value: Any, depth: int) -> Any:
         if value is None:
             return None
         if isinstance(value, bpy.types.Image):
@@ -108,7 +109,11 @@ class GraphHasher:
             return "tree"  # its nodes are walked
         if isinstance(value, bpy.types.ID):
             return value.name_full
-        return list(self._properties(value, set()))
+        if isinstance(value, bpy.types.Node):
+            return value.name  # of a zone's other end; nodes point at each other
+        if depth >= NESTED:
+            return None
+        return list(self._properties(value, set(), depth + 1))
 
     def _image(self, image: Any) -> str:
         key = image.name_full

@@ -23,6 +23,8 @@ from .trees import (
     OBJECT_NORMAL,
     OBJECT_NUMBERS,
     attribute_names,
+    baked_name,
+    colour_name,
 )
 
 MAX_OWN = 24
@@ -103,8 +105,8 @@ def _uv_layers(data: bpy.types.Mesh, meshes: Sequence[FrozenMesh], names: set[st
     """The atlas; every mesh's own render layer as one; and the layers that nodes name."""
     wanted = {ATLAS_LAYER: [mesh.atlas for mesh in meshes]}
     wanted[ACTIVE_UV] = [_layer(mesh, mesh.uv_layers, mesh.active_uv, 2) for mesh in meshes]
-    for name in sorted({name for mesh in meshes for name in mesh.uv_layers} & names):
-        wanted[name] = [_layer(mesh, mesh.uv_layers, name, 2) for mesh in meshes]
+    for name in sorted({name for mesh in meshes for name in mesh.uv_layers if baked_name(name) in names}):
+        wanted[baked_name(name)] = [_layer(mesh, mesh.uv_layers, name, 2) for mesh in meshes]
     for name, parts in wanted.items():
         _attribute(data, name, "FLOAT2", np.concatenate(parts)[order])
     data.uv_layers[ATLAS_LAYER].active = True
@@ -118,8 +120,10 @@ def _layer(mesh: FrozenMesh, layers: Mapping[str, np.ndarray], name: str | None,
 
 
 def _colours(data: bpy.types.Mesh, meshes: Sequence[FrozenMesh], names: set[str], order: np.ndarray) -> None:
-    present = {name for mesh in meshes for name in mesh.colors} & names - {ACTIVE_COLOUR}
-    wanted = {name: [_layer(mesh, mesh.colors, name, 4) for mesh in meshes] for name in sorted(present)}
+    wanted = {}
+    for name in sorted({name for mesh in meshes for name in mesh.colors} - {ACTIVE_COLOUR}):
+        for alias in {baked_name(name), colour_name(name)} & names:
+            wanted[alias] = [_layer(mesh, mesh.colors, name, 4) for mesh in meshes]
     if any(mesh.active_color for mesh in meshes):
         wanted[ACTIVE_COLOUR] = [_layer(mesh, mesh.colors, mesh.active_color, 4) for mesh in meshes]
     for name, parts in wanted.items():

@@ -12,7 +12,7 @@ from typing import Any
 
 import bpy
 
-from ..shading.sockets import walk
+from ..shading.sockets import find_input, walk
 from ..tasks import Tap
 
 GENERATED, OBJECT, OBJECT_NORMAL = "dnrpipe.generated", "dnrpipe.object", "dnrpipe.object_normal"
@@ -37,6 +37,11 @@ CONSTANTS: dict[tuple[str, str], float] = {
 }
 """What stands for an output that a bake cannot know; 0 where nothing is named. See values.FRESNEL_AVERAGE."""
 UNKNOWABLE = {"FRESNEL", "LAYER_WEIGHT", "LIGHT_PATH", "PARTICLE_INFO", "HAIR_INFO", "POINT_INFO"}
+BLENDERS_OWN = {
+    *("position", "material_index", "sharp_face", "sharp_edge", "custom_normal", "crease_vert", "crease_edge"),
+    *("bevel_weight_vert", "bevel_weight_edge", "freestyle_face", "freestyle_edge", "id", "radius", "velocity"),
+}
+"""Attributes that mean something to Blender: a colour of that name ends the process."""
 SOCKETS = {"RGBA": "NodeSocketColor", "VECTOR": "NodeSocketVector"}
 
 
@@ -69,6 +74,9 @@ class TreeCopier:
                 encode.inputs[1].default_value = encode.inputs[2].default_value = (0.5, 0.5, 0.5)
                 value = encode.outputs[0]
         tree.links.new(value, emission.inputs["Color"])
+        for group in self._groups.values():
+            for node in [node for node in group.nodes if node.type == "OUTPUT_MATERIAL"]:
+                group.nodes.remove(node)
         for owned in [tree, *self._groups.values()]:
             self._substitute(owned)
         _target(tree, self.image)
@@ -115,8 +123,9 @@ class TreeCopier:
             return
         self._substituted.add(tree.as_pointer())
         for node in list(tree.nodes):
-            if node.type in IMPLICIT_GENERATED and not node.inputs["Vector"].is_linked:
-                tree.links.new(_attribute(tree, GENERATED, "Vector"), node.inputs["Vector"])
+            place = find_input(node, "Vector") if node.type in IMPLICIT_GENERATED else None  # None: one-dimensional
+            if place is not None and not place.is_linked:
+                tree.links.new(_attribute(tree, GENERATED, "Vector"), place)
             elif node.type == "TEX_COORD":
                 if node.object is None:
                     _replace(tree, node, "Object", _attribute, OBJECT, "Vector")
@@ -128,13 +137,25 @@ class TreeCopier:
                 _replace(tree, node, "Alpha", _attribute, OBJECT_COLOUR, "Alpha")
                 _replace(tree, node, "Object Index", _channel, OBJECT_NUMBERS, 0)
                 _replace(tree, node, "Random", _channel, OBJECT_NUMBERS, 1)
-            elif node.type == "VERTEX_COLOR" and not node.layer_name:
-                node.layer_name = ACTIVE_COLOUR
-            elif node.type == "ATTRIBUTE" and node.attribute_type == "GEOMETRY" and not node.attribute_name:
-                node.attribute_name = ACTIVE_COLOUR
+            elif node.type == "VERTEX_COLOR":
+                node.layer_name = colour_name(node.layer_name) or ACTIVE_COLOUR
+            elif node.type == "ATTRIBUTE" and node.attribute_type == "GEOMETRY":
+                node.attribute_name = baked_name(node.attribute_name) or ACTIVE_COLOUR
+            elif node.type in {"UVMAP", "NORMAL_MAP", "TANGENT"}:
+                node.uv_map = baked_name(node.uv_map)
             elif node.type in UNKNOWABLE:
                 for output in node.outputs:
                     _replace(tree, node, output.name, _value, CONSTANTS.get((node.type, output.name), 0.0))
+
+
+def baked_name(name: str) -> str:
+    """What an attribute of the mesh is called on the mesh that is baked."""
+    return f"dnrpipe.own.{name}" if name in BLENDERS_OWN or name.startswith(".") else name
+
+
+def colour_name(name: str) -> str:
+    """What a colour is called there that a Color Attribute node reads: one that finds a UV layer ends the process."""
+    return f"dnrpipe.colour.{name}" if name else ""
 
 
 def attribute_names(material: Any) -> set[str]:

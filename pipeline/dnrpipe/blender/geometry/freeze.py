@@ -33,6 +33,8 @@ class Frozen:
     repairs: dict[str, int]
     warnings: list[str]
     findings: Findings = field(default_factory=Findings)
+    lit_by: set[str] = field(default_factory=set)
+    """Full names of lamps that renders see, and of the objects that instance lamps."""
 
 
 class _FreezeEngine(bpy.types.RenderEngine):
@@ -103,6 +105,8 @@ def freeze_scene(scene: bpy.types.Scene) -> Frozen:
             f"scene '{scene.name}', view layer '{layer.name}': no surface is visible in renders; "
             "unhide an object or enable its collection"
         )
+    _show_lamps(scene, layer, outcome.lit_by)
+    _override_materials(outcome, layer)
     fit_instances(outcome.meshes, outcome.repairs, outcome.findings)
     return outcome
 
@@ -118,11 +122,17 @@ def freeze(depsgraph: bpy.types.Depsgraph) -> Frozen:
     unique: dict[bytes, LocalMesh] = {}  # one mesh for all that evaluate to the same content
     placed: list[Placed] = []
     findings = Findings()
+    lit_by: set[str] = set()
     for instance in depsgraph.object_instances:
         obj = instance.object
+        if obj.type == "LIGHT":
+            lit_by.add(obj.name_full if instance.parent is None else instance.parent.name_full)
+            continue
         if not (instance.show_self or instance.show_particles):
             continue
         matrix = np.array(instance.matrix_world, np.float64)
+        holder = obj if instance.parent is None else instance.parent
+        seen = _seen_by_camera(obj, holder, depsgraph.view_layer, findings)
         persistent = tuple(instance.persistent_id) if instance.is_instance else ()
         for key, read in _surfaces(obj, instance.show_self, instance.show_particles, findings):
             if key not in cache:
@@ -132,7 +142,7 @@ def freeze(depsgraph: bpy.types.Depsgraph) -> Frozen:
                     digest = local.digest()
                     cache[key] = unique.setdefault(digest, local), digest
             if (found := cache[key]) is not None:
-                placed.append(Placed(obj.name_full, persistent, matrix, *found, obj.visible_camera))
+                placed.append(Placed(obj.name_full, persistent, matrix, *found, seen))
     repairs: dict[str, int] = dict.fromkeys(REPAIRS, 0)
     ids: dict[str, int] = {}
     taken: set[str] = set()
@@ -152,7 +162,51 @@ def freeze(depsgraph: bpy.types.Depsgraph) -> Frozen:
     if len(ids) > MOST_IDS:
         note = f"{len(ids):,} objects; from number {MOST_IDS:,} on they share one id"
         findings.add("approximated", "object ids", note)
-    return Frozen(meshes, repairs, [], findings)
+    return Frozen(meshes, repairs, [], findings, lit_by)
+
+
+def _seen_by_camera(
+    obj: bpy.types.Object, holder: bpy.types.Object, layer: bpy.types.ViewLayer, findings: Findings
+) -> bool:
+    """Whether camera rays see an object, ``holder`` being what instances it (or itself), as Cycles decides.
+
+    Holdouts, by themselves or by their collection, are a finding and stay surfaces.
+    """
+    own = holder.original
+    if own.is_holdout or own.holdout_get(view_layer=layer):
+        findings.add("ignored", "holdout object", "an ordinary surface", object=obj.name_full)
+        return True
+    return obj.visible_camera and holder.visible_camera and not own.indirect_only_get(view_layer=layer)
+
+
+def _show_lamps(scene: bpy.types.Scene, layer: bpy.types.ViewLayer, names: set[str]) -> None:
+    """Show in the viewport the lamps that renders see: for scripts, Blender evaluates nothing else.
+
+    Whole collections stay hidden: what else they hold may be heavy.
+    """
+    hidden = [obj for obj in layer.objects if obj.name_full in names and not obj.visible_get(view_layer=layer)]
+    for obj in hidden:
+        try:
+            obj.hide_viewport = False
+            obj.hide_set(False, view_layer=layer)
+        except (AttributeError, RuntimeError):  # linked data keep their library's settings
+            continue
+        if not obj.visible_get(view_layer=layer) and obj.name not in scene.collection.objects:
+            scene.collection.objects.link(obj)
+            layer.update()
+            obj.hide_set(False, view_layer=layer)
+    if hidden:
+        scene.frame_set(scene.frame_current, subframe=scene.frame_subframe)  # drivers of what was hidden
+
+
+def _override_materials(frozen: Frozen, layer: bpy.types.ViewLayer) -> None:
+    """The view layer's own material, where it has one, instead of all others."""
+    if layer.material_override is None:
+        return
+    name = layer.material_override.name_full
+    for mesh in frozen.meshes:
+        mesh.materials = [name] * len(mesh.materials)
+    frozen.findings.add("exact", "material override", f"'{name}' stands for every material, as the view layer says")
 
 
 def _surfaces(

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..bundle import xmltree
 from ..findings import Findings
-from ..shading.sockets import Scope, resolve
+from ..shading.sockets import Scope, resolve, surface_source
 from ..shading.textures import ImageReader, Textured, TextureStore
 from ..shading.values import Evaluator
 
@@ -32,6 +32,8 @@ POINT_RADIUS = 1e-3
 """Radius, in radii of the scene, of a sphere that stands for a point."""
 SPOT_TEXELS = 513
 """Side of the image that carries a spot's cross-section."""
+FEW_BOUNCES = 8
+"""Bounces of a lamp's light below which a limit shows in the picture."""
 KINDS = {
     "visible_diffuse": "diffuse",
     "visible_glossy": "glossy",
@@ -99,9 +101,8 @@ def _strength(light: Any, name: str, findings: Findings) -> np.ndarray:
 
 def _node_colour(tree: bpy.types.NodeTree, name: str, findings: Findings) -> np.ndarray:
     """Emission colour x strength of a lamp's node tree; what varies becomes its mean, with a finding."""
-    output = tree.get_output_node("CYCLES")
-    source = resolve(output.inputs["Surface"]) if output else None
-    if source is None or not source.linked:
+    source = surface_source(tree)
+    if source is None:
         return np.zeros(3)
     if source.node.type != "EMISSION":
         findings.add("approximated", "lamp nodes", "only an Emission node is understood", object=name)
@@ -109,7 +110,7 @@ def _node_colour(tree: bpy.types.NodeTree, name: str, findings: Findings) -> np.
     trial = Findings()
     evaluator = Evaluator(None, ImageReader(trial), trial)
     colour = evaluator.colour(source.node.inputs["Color"], source.scope)
-    strength = _falloff(source.node.inputs["Strength"], source.scope, name, findings)
+    strength = _falloff(source.node.inputs["Strength"], source.scope, name, evaluator, findings)
     if strength is None:
         strength = evaluator.scalar(source.node.inputs["Strength"], source.scope).scalar
     for finding in trial:
@@ -119,7 +120,7 @@ def _node_colour(tree: bpy.types.NodeTree, name: str, findings: Findings) -> np.
     return np.asarray(colour.mean, dtype=np.float64) * strength
 
 
-def _falloff(socket: Any, scope: Scope, name: str, findings: Findings) -> float | None:
+def _falloff(socket: Any, scope: Scope, name: str, evaluator: Evaluator, findings: Findings) -> float | None:
     """Strength of a Light Falloff node (its quadratic output is how light falls off anyway); None for other nodes."""
     source = resolve(socket, scope)
     if not source.linked or source.node.type != "LIGHT_FALLOFF":
@@ -127,7 +128,7 @@ def _falloff(socket: Any, scope: Scope, name: str, findings: Findings) -> float 
     if source.socket.name != "Quadratic":
         feature = f"{source.socket.name.lower()} light falloff"
         findings.add("approximated", feature, "falls off with the square of the distance", object=name)
-    return float(source.node.inputs["Strength"].default_value)
+    return evaluator.scalar(source.node.inputs["Strength"], source.scope).scalar
 
 
 def _note_ignored(obj: Any, light: Any, findings: Findings) -> None:
@@ -136,6 +137,9 @@ def _note_ignored(obj: Any, light: Any, findings: Findings) -> None:
     hidden = [ray for ray in ("diffuse", "glossy", "transmission") if not getattr(obj, f"visible_{ray}")]
     if hidden:
         findings.add("ignored", "lamp's ray visibility", f"{', '.join(hidden)} rays see it", object=obj.name)
+    if light.cycles.max_bounces < FEW_BOUNCES:
+        note = f"its light bounces more than {light.cycles.max_bounces} time(s)"
+        findings.add("ignored", "lamp's max bounces", note, object=obj.name)
     if _is_linked(obj):
         findings.add("ignored", "light linking", "the lamp lights everything", object=obj.name)
 
@@ -330,17 +334,24 @@ def _frame(axis: np.ndarray) -> np.ndarray:
     return np.stack([x, np.cross(axis, x), axis], axis=1)
 
 
+def is_portal(light: Any) -> bool:
+    """Whether a lamp is a portal: it shows Cycles where light enters, and does not shine."""
+    return light.type == "AREA" and bool(light.cycles.is_portal)
+
+
 def visible_lights(scene: bpy.types.Scene) -> Iterator[tuple[Any, np.ndarray]]:
     """Lamp objects that renders see, instances included, with their world matrices (float64 [4, 4])."""
     layer = next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
     hidden = _hidden_objects(layer.layer_collection)
     depsgraph = layer.depsgraph if layer.depsgraph is not None else bpy.context.evaluated_depsgraph_get()
     for obj in sorted(layer.objects, key=lambda o: o.name):
-        if obj.type == "LIGHT" and not obj.hide_render and obj.name not in hidden:
+        if obj.type == "LIGHT" and not obj.hide_render and obj.name not in hidden and not is_portal(obj.data):
             evaluated = obj.evaluated_get(depsgraph)
             yield evaluated, np.array(evaluated.matrix_world, dtype=np.float64)
     for instance in depsgraph.object_instances:
         if instance.is_instance and instance.object.type == "LIGHT" and instance.show_self:
+            if is_portal(instance.object.data):
+                continue
             parent = instance.parent
             if parent is not None and (parent.hide_render or parent.name in hidden):
                 continue
@@ -364,7 +375,7 @@ def _hidden_objects(collection: bpy.types.LayerCollection) -> set[str]:
 
 
 def report_ray_visibility(names: Iterable[str], findings: Findings) -> None:
-    """A finding for each object that is hidden from some rays, a shadow catcher, a holdout, or has linked light.
+    """A finding for each object that is hidden from some rays, a shadow catcher, or has linked light.
 
     names: objects of the frozen scene. Camera rays are not among them: those are obeyed.
     """
@@ -376,7 +387,5 @@ def report_ray_visibility(names: Iterable[str], findings: Findings) -> None:
             findings.add("ignored", "ray visibility", f"{', '.join(hidden)} rays see it", object=name)
         if obj.is_shadow_catcher:
             findings.add("ignored", "shadow catcher", "an ordinary surface", object=name)
-        if obj.is_holdout:
-            findings.add("ignored", "holdout object", "an ordinary surface", object=name)
         if _is_linked(obj):
             findings.add("ignored", "light linking", "it lights and shades everything", object=name)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from mathutils import Euler
 
-from ..shading.sockets import find_input, resolve, walk
+from ..shading.sockets import LUMINANCE, find_input, resolve, walk
 from .world_images import render_close_up
 
 WITH_DISC = {"NISHITA", "SINGLE_SCATTERING", "MULTIPLE_SCATTERING"}
@@ -83,8 +83,16 @@ def plain_colour(source: Any) -> np.ndarray | None:
     """Value of a constant socket as [3], or None."""
     if source.linked and source.node.type not in {"RGB", "VALUE"}:
         return None
-    value = source.node.outputs[0].default_value if source.linked else source.default
+    value = source.node.outputs[0].default_value if source.linked else source.colour
     return np.full(3, float(value)) if isinstance(value, int | float) else np.array(value[:3], dtype=np.float64)
+
+
+def plain_number(source: Any) -> float | None:
+    """Value of a constant socket as a number, or None."""
+    if not source.linked:
+        return source.number
+    found = plain_colour(source)
+    return None if found is None else float(found @ np.array(LUMINANCE))
 
 
 def rotation(socket: Any, scope: Any) -> np.ndarray | None:

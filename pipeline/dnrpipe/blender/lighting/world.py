@@ -13,7 +13,7 @@ from ..findings import Findings
 from ..shading.sockets import find_input, resolve, surface_source, walk
 from ..shading.textures import ImageReader, TextureStore, finite_texels, srgb_to_linear
 from .lights import far_disc
-from .sky_sun import find_sun, measure, plain_colour, rotation, without_disc
+from .sky_sun import find_sun, measure, plain_colour, plain_number, rotation, without_disc
 from .world_images import SIZE, render_equirect
 
 ENVMAP_TO_BLENDER = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]], dtype=np.float64)
@@ -40,6 +40,10 @@ def export_world(
     world = scene.world
     if world is None:
         return
+    rays = ("diffuse", "glossy", "transmission")
+    hidden = [ray for ray in rays if not getattr(world.cycles_visibility, ray)]
+    if hidden:
+        findings.add("ignored", f"world '{world.name}' ray visibility", f"{', '.join(hidden)} rays see it")
     tree = world.node_tree
     if tree is None:
         _constant(root, np.array(world.color))
@@ -52,16 +56,16 @@ def export_world(
     if source.node.type == "BACKGROUND":
         strength = resolve(source.node.inputs["Strength"], source.scope)
         colour = resolve(source.node.inputs["Color"], source.scope)
-        amount = plain_colour(strength)
+        amount = plain_number(strength)
         if amount is not None:
             plain = plain_colour(colour)
             if plain is not None:
                 _constant(root, plain * amount)
                 return
-            if np.allclose(amount, 0):
+            if abs(amount) < 1e-8:
                 return
             if colour.node.type == "TEX_ENVIRONMENT" and _hdri(
-                root, colour.node, colour.scope, float(amount[0]), store, images, findings, world.name
+                root, colour.node, colour.scope, amount, store, images, findings, world.name
             ):
                 return
     _rendered(world, root, store, findings, center, radius)

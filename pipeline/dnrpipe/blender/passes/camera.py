@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import bpy
 import mathutils
 import numpy as np
@@ -84,6 +86,6 @@ def _depth_of_field(camera: bpy.types.Object) -> Lens | None:
     if dof.focus_object is not None:
         matrix = np.array(rigid(camera.matrix_world))
         distance = abs(float((matrix[:3, 3] - np.array(dof.focus_object.matrix_world.translation)) @ matrix[:3, 2]))
-    if distance <= 0:
+    if not 0 < distance < math.inf:  # the object may be lost (NaN)
         return None
     return {"aperture_radius": camera.data.lens / (2000 * dof.aperture_fstop), "focus_distance": distance}

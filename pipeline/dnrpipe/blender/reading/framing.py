@@ -58,10 +58,11 @@ def framing_pose(center: np.ndarray, distance: float) -> np.ndarray:
 
 
 def usable(obj: Any) -> bool:
-    """Whether an object is a camera with a finite, invertible matrix."""
+    """Whether an object is a camera with a finite lens and a finite, invertible matrix."""
     if obj is None or obj.type != "CAMERA" or obj.data is None:
         return False
-    return invertible(np.array(obj.matrix_world, np.float64), least=1e-6)
+    numbers = [getattr(obj.data, name) for name in ("lens", "sensor_width", "sensor_height", "shift_x", "shift_y")]
+    return bool(np.isfinite(numbers).all()) and invertible(np.array(obj.matrix_world, np.float64), least=1e-6)
 
 
 def _framing_distance(scene: bpy.types.Scene, center: np.ndarray, points: Iterable[np.ndarray]) -> tuple[float, float]:

@@ -112,9 +112,9 @@ def _is_default_world(world: Any) -> bool:
         return False
     colour = resolve(source.node.inputs["Color"], source.scope)
     strength = resolve(source.node.inputs["Strength"], source.scope)
-    if colour.linked or strength.linked or abs(float(strength.default) - 1) > 1e-3:
+    if colour.linked or strength.linked or abs(strength.number - 1) > 1e-3:
         return False
-    return bool(np.allclose(list(colour.default)[:3], DEFAULT_WORLD, atol=1e-3))
+    return bool(np.allclose(colour.colour, DEFAULT_WORLD, atol=1e-3))
 
 
 def _surfaces(meshes: Sequence[FrozenMesh]) -> bool:
@@ -130,4 +130,4 @@ def _emits(node: bpy.types.Node, colour: str, strength: str) -> bool:
     if None in inputs:
         return False
     bright, strong = (resolve(socket) for socket in inputs)
-    return (bright.linked or max(list(bright.default)[:3]) > 0) and (strong.linked or float(strong.default) > 0)
+    return (bright.linked or max(bright.colour) > 0) and (strong.linked or strong.number > 0)

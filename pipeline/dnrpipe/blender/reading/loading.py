@@ -13,7 +13,7 @@ from dnrpipe.core.errors import UserError
 from dnrpipe.core.scene_records import Bounds
 
 from ..findings import Findings
-from ..geometry.freeze import Frozen
+from ..geometry.freeze import Frozen, render_layer
 from ..geometry.frozen import FrozenMesh
 from ..visible import freeze_visible
 from .framing import ensure_camera
@@ -57,6 +57,10 @@ def load_scene(source: Path, *, strict: bool = False) -> Loaded:
         raise type(error)(f"{source}: {error}") from None
     bounds = scene_bounds(frozen.meshes)
     warnings += frozen.warnings
+    world = render_layer(scene).world_override
+    if world is not None:
+        scene.world = world
+        warnings.append(f"world '{world.name}' stands for the scene's own, as the view layer says")
     warnings += ensure_camera(scene, np.array(bounds.center), (mesh.extent() for mesh in frozen.meshes))
     lit = has_light(scene, frozen.meshes)
     warnings += ensure_light(scene, frozen.meshes)

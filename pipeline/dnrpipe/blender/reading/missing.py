@@ -10,8 +10,10 @@ from typing import Any
 
 import bpy
 
+from dnrpipe.core.scene_records import FindingKind
+
 from ..findings import Findings, first_of, printable
-from ..shading.sockets import UNDEFINED, computes
+from ..shading.sockets import NOT_IN_CYCLES, UNDEFINED, computes
 from .names import data_collections, node_trees
 
 SHAPELESS_IMAGES = {"GENERATED", "VIEWER"}  # sources without a file
@@ -23,6 +25,7 @@ STAND_INS = {
     "font": "its text takes Blender's own font",
     "volume": "its volume is absent",
     "cache": "what it animates stays as it was saved",
+    "IES file": "its lamp shines alike in all directions",
 }
 """What stands for a missing file, by kind."""
 
@@ -93,12 +96,20 @@ def note_missing(findings: Findings) -> None:
             continue  # the pictures are taken before it
         for node in tree.nodes:
             if not computes(node):
-                what = "its type is unknown here (needs its add-on)" if node.bl_idname == UNDEFINED else "has no tree"
+                kind, why = _why_dropped(node)
                 place = {"material": owner.name_full} if isinstance(owner, bpy.types.Material) else {}
                 named = "" if place else f" of '{owner.name_full}'"
-                findings.add(
-                    "missing", f"node '{node.name}'{named}", f"{what}: its links are dropped, as in Cycles", **place
-                )
+                findings.add(kind, f"node '{node.name}'{named}", why, **place)
+
+
+def _why_dropped(node: Any) -> tuple[FindingKind, str]:
+    """Kind of finding, and why the links of a node that does not compute are dropped."""
+    dropped = "its links are dropped, as in Cycles"
+    if node.bl_idname == UNDEFINED:
+        return "missing", f"its type is unknown here (needs its add-on): {dropped}, which still sees a tree inside"
+    if node.type in NOT_IN_CYCLES:
+        return "ignored", f"{NOT_IN_CYCLES[node.type]}: {dropped}"
+    return "missing", f"has no tree: {dropped}"
 
 
 def external_files(path: Path) -> list[Path]:
@@ -138,6 +149,10 @@ def _others() -> Iterator[Reference]:
     for library in bpy.data.libraries:
         if not library.packed_file:
             yield Reference("linked library", library.name, Path(bpy.path.abspath(library.filepath)))
+    for owner, tree in node_trees():
+        for node in tree.nodes:
+            if node.type == "TEX_IES" and node.mode == "EXTERNAL" and node.filepath:
+                yield Reference("IES file", node.name, Path(bpy.path.abspath(node.filepath, library=owner.library)))
     used_fonts = [font for font in bpy.data.fonts if font.users]
     for kind, blocks in (("font", used_fonts), ("volume", bpy.data.volumes), ("cache", bpy.data.cache_files)):
         for block in blocks:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Callable
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import bpy
 
 from dnrpipe.core.errors import NothingVisible, UserError
 
+from ..findings import first_of
 from .missing import missing_files, missing_warnings, strict_refusal
 from .names import repair_names
 from .repairing import repair_shaders
@@ -82,14 +87,43 @@ def open_blend(path: Path) -> list[str]:
     if not head.startswith(BLEND_MAGIC):
         raise UserError(f"{path}: is not a Blender file (starts with {head!r}); save it from Blender again")
     try:
-        bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False, use_scripts=False)
+        with _heard() as said:
+            bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False, use_scripts=False)
     except RuntimeError as error:
         reason = " ".join(str(error).removeprefix("Error: ").split())
         if "Big Endian" in reason:
             unread = f"which Blender {_version(bpy.app.version)} no longer reads; save it from Blender 4.5 or older"
             raise UserError(f"{path}: saved on a big-endian machine, {unread}") from None
         raise UserError(f"{path}: damaged or truncated .blend; save it from Blender again ({reason})") from None
-    return _version_warnings()
+    return _version_warnings() + _colour_warnings("".join(said))
+
+
+@contextmanager
+def _heard() -> Iterator[list[str]]:
+    """What Blender prints meanwhile, also passed on: of colour spaces that it does not know it says nothing else."""
+    said: list[str] = []
+    sys.stdout.flush()
+    kept = os.dup(1)
+    with tempfile.TemporaryFile() as file:
+        os.dup2(file.fileno(), 1)
+        try:
+            yield said
+        finally:
+            os.dup2(kept, 1)
+            os.close(kept)
+            file.seek(0)
+            content = file.read()
+            said.append(content.decode("utf-8", "replace"))
+            os.write(1, content)
+
+
+def _colour_warnings(said: str) -> list[str]:
+    """One line for colour spaces, displays, view transforms and looks of another OpenColorIO configuration."""
+    lines = [line.partition("color_management | WARNING ")[2].strip() for line in said.splitlines()]
+    unknown = list(dict.fromkeys(line.rstrip(".") for line in lines if "not found" in line))
+    if not unknown:
+        return []
+    return [f"colour management of another configuration than Blender's own is replaced: {first_of(unknown, 5, '; ')}"]
 
 
 def _head(path: Path) -> bytes:

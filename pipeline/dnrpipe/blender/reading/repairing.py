@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import bpy
@@ -11,7 +12,7 @@ from ..findings import first_of
 from .names import node_trees
 
 SHOWN = 4
-LARGEST = 1e30  # Blender stores an infinite number as the largest float, 3.4e38: products with it overflow
+LARGEST = 1e15  # Blender stores an infinite number as the largest float, 3.4e38; products of two must not overflow
 LAMP_NUMBERS = ("energy", "shadow_soft_size", "size", "size_y", "angle", "spot_size", "spot_blend", "exposure")
 
 
@@ -23,12 +24,16 @@ def repair_shaders() -> list[str]:
     """
     cut: list[str] = []
     numbers: list[str] = []
+    profiles: list[str] = []
     for holder, tree in node_trees():
         if tree.bl_idname != "ShaderNodeTree":
             continue
         owner = holder.name_full
         links = list(_closing_links(tree))
         cut += [f"{owner}: {link.from_node.name} to {link.to_node.name}" for link in links]
+        for node in [node for node in tree.nodes if node.type == "TEX_IES" and not _has_profile(node, holder)]:
+            profiles.append(f"{owner}: {node.name}")
+            links += [link for link in tree.links if link.from_node == node and link not in links]
         for link in links:
             tree.links.remove(link)
         for node, socket in list(_bad_sockets(tree)):
@@ -44,9 +49,17 @@ def repair_shaders() -> list[str]:
             numbers.append(f"{light.name_full}: color")
     found = {
         "shader link(s) run in a circle and are cut": cut,
-        "number(s) are not finite (NaN, infinite) and are replaced": numbers,
+        "IES texture(s) have no light profile and are cut off": profiles,
+        f"number(s) are not finite (NaN, infinite, beyond {LARGEST:g}) and are replaced": numbers,
     }
     return [f"{len(where)} {what}: {first_of(where, SHOWN, '; ')}" for what, where in found.items() if where]
+
+
+def _has_profile(node: Any, holder: Any) -> bool:
+    """Whether an IES texture has a text or a file: in a world, Cycles ends the process without one."""
+    if node.mode == "INTERNAL":
+        return node.ies is not None
+    return Path(bpy.path.abspath(node.filepath, library=holder.library)).is_file()
 
 
 def _usable(number: float) -> bool:

@@ -63,7 +63,11 @@ def diffuse_gain(f0: float, roughness: float) -> float:
 
 
 def normal_reflectance(ior: float, specular_level: float) -> float:
-    """Fresnel reflectance at normal incidence: ((ior - 1) / (ior + 1))^2 times twice the specular level."""
+    """Fresnel reflectance at normal incidence: ((ior - 1) / (ior + 1))^2 times twice the specular level.
+
+    An index below 1e-5 counts as that, as in Cycles.
+    """
+    ior = max(ior, 1e-5)
     return min(((ior - 1) / (ior + 1)) ** 2 * 2 * max(specular_level, 0.0), 0.99)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,6 +17,8 @@ from .sheets import AtlasSheets
 from .surface import CYCLES_DEFAULT_GREY, diffuse, twosided
 from .textures import ImageReader, Placement, Textured, TextureStore, Value, constant
 from .view_dependent import average
+
+DEEPEST = 50_000  # calls
 
 
 @dataclass
@@ -71,6 +74,8 @@ class MaterialConverter:
             bsdf = twosided(diffuse(CYCLES_DEFAULT_GREY))
             bsdf.set("id", identity)
             return Converted(identity, bsdf, None, None, False, None)
+        # A node takes up to five calls, and trees made by scripts are hundreds deep. They use no C stack.
+        sys.setrecursionlimit(max(sys.getrecursionlimit(), DEEPEST))
         walker = ShaderWalker(material, self.store, self.images, self.findings, self.bakes, self.sheets)
         surface = walker.material()
         bsdf = walker.finish(surface)

@@ -40,6 +40,8 @@ class MixShaders(ShaderBase, ABC):
                 return self._input(node, scope, 0)
             if equals(factor, 1.0):
                 return self._input(node, scope, 1)
+        if _same_twice(node, scope):
+            return self._input(node, scope, 0)
         first, second = self._input(node, scope, 0), self._input(node, scope, 1)
         other = complement(factor)
         opacity = self.sum(self.share(first.opacity, other), self.share(second.opacity, factor))
@@ -121,3 +123,10 @@ class MixShaders(ShaderBase, ABC):
             self._put(element, "opacity", surface.opacity)
             element.append(surface.sided())
         return element
+
+
+def _same_twice(node: Any, scope: Scope) -> bool:
+    """Whether both shader inputs receive the same shader: converted once, where many such nodes follow each other."""
+    sources = [resolve(socket, scope) for socket in node.inputs if socket.type == "SHADER"]
+    places = {(source.socket.as_pointer(), tuple(group.as_pointer() for group in source.scope)) for source in sources}
+    return len(places) == 1 and sources[0].linked

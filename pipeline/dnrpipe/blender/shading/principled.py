@@ -14,7 +14,7 @@ from .interfaces import MIN_ETA, InterfaceShaders
 from .lobes import LobeShaders
 from .sockets import Scope, find_input, resolve
 from .surface import Surface
-from .textures import Textured, Value, constant, scale
+from .textures import Constant, Textured, Value, constant, scale
 
 
 class PrincipledShader(LobeShaders, InterfaceShaders):
@@ -48,7 +48,9 @@ class PrincipledShader(LobeShaders, InterfaceShaders):
             element = self._native(base, roughness, metallic, transmission, f0)
             xmltree.number(element, "eta", max(ior, MIN_ETA))
             surface = self._bent(element, node, scope, both_sides=True)
-        surface.opacity = self._scalar(node, scope, "Alpha")
+        opacity = self._scalar(node, scope, "Alpha")
+        plain = isinstance(opacity, Constant)
+        surface.opacity = constant(min(max(opacity.scalar, 0.0), 1.0)) if plain else opacity
         strength = self._scalar(node, scope, "Emission Strength")
         emission = self._radiance(self._colour(node, scope, "Emission Color", "Emission"), strength)
         surface.emission = self.share(emission, surface.opacity)

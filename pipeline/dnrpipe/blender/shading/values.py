@@ -8,7 +8,7 @@ its average. Baking and averaging are findings.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import bpy
@@ -31,6 +31,10 @@ LIGHT_PATH_DEFAULTS = {"Is Camera Ray": 1.0}
 """Light Path outputs taken as constants: a directly seen surface; all other outputs are 0."""
 
 
+NUMBERS = {"VALUE", "INT", "BOOLEAN"}
+"""Types of sockets that take a number."""
+
+
 class Inexact(Exception):
     """A value that textures and constants cannot hold exactly: (feature, what is used where it is not baked)."""
 
@@ -48,6 +52,8 @@ class Evaluator:
     findings: Findings
     bakes: BakeCache | None = None
     exact: bool = False
+    _known: dict[tuple[int | str, ...], Value] = field(default_factory=dict)
+    """Values of nodes during one evaluation: a tree whose branches meet again and again has 2^n ways through it."""
 
     def colour(self, socket: Any, scope: Scope = ()) -> Value:
         """Value of a colour socket; textures have 3 channels."""
@@ -78,7 +84,7 @@ class Evaluator:
     def plain(self, socket: Any, scope: Scope = ()) -> Value | None:
         """Value of a socket that plain images and constants hold exactly; None for any other: nothing is baked."""
         try:
-            value = replace(self, exact=True)._value(socket, scope)
+            value = replace(self, exact=True, _known={})._value(socket, scope)
         except Inexact:
             return None
         return None if isinstance(value, Textured) and not value.placement.plain else value
@@ -93,17 +99,20 @@ class Evaluator:
     def _evaluated(self, socket: Any, scope: Scope, kind: ValueKind) -> Value:
         """The value: exactly where that is possible, else baked, else averaged."""
         if self.bakes is None or self.material is None:
-            return self._value(socket, scope)
-        trial = replace(self, findings=Findings(), exact=True)
+            return self._fresh(socket, scope)
+        trial = replace(self, findings=Findings(), exact=True, _known={})
         try:
             value = trial._value(socket, scope)
             if kind == "scalar" and isinstance(value, Textured) and value.placement.corners is not None:
                 raise Inexact("colour attribute as a number", "its mean over the mesh is used")
         except Inexact:
             baked = self.bakes.value(self.material, kind, resolve(socket, scope), socket.name, self.findings)
-            return self._value(socket, scope) if baked is None else baked
+            return self._fresh(socket, scope) if baked is None else baked
         self.findings.merge(trial.findings)
         return value
+
+    def _fresh(self, socket: Any, scope: Scope) -> Value:
+        return replace(self, _known={})._value(socket, scope)
 
     def _inexact(self, feature: str, text: str) -> None:
         """Say that ``text`` is done about ``feature``; or raise, for the value to be baked instead."""
@@ -118,9 +127,11 @@ class Evaluator:
     def _value(self, socket: Any, scope: Scope) -> Value:
         source = resolve(socket, scope)
         if not source.linked:
-            default = source.default
-            return constant(0.0 if default is None else default)
-        return self._node(source)
+            return constant(source.number if socket.type in NUMBERS else source.colour)
+        key = (source.socket.as_pointer(), *(group.as_pointer() for group in source.scope))
+        if key not in self._known:
+            self._known[key] = self._node(source)
+        return self._known[key]
 
     def _node(self, source: Source) -> Value:
         node, kind = source.node, source.node.type
