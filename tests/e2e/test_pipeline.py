@@ -30,17 +30,35 @@ def test_only_the_selected_views_are_traced(tiny: Path) -> None:
     expected = [f"{kind}train/{name}" for kind in ("", "base/") for name in selected]
     assert sorted(r.name for r in records if r.unit == "view") == sorted(expected)
     assert {path.stem for path in (tiny / "base" / "train").glob("*.exr")} == set(selected)
-    assert [r.name for r in records if r.unit != "view"] == ["path depth pilot", "light"]
+    assert [r.name for r in records if r.unit == "scene"] == ["path depth pilot", "light"]
 
 
 def test_evaluation_is_booked_apart(tiny: Path) -> None:
     records = Ledger(tiny / "costs.jsonl").read()
     assert {r.purpose for r in records if r.stage in ("select", "raytrace")} == {"training"}
-    shown = {(r.purpose, r.unit, r.name.partition(" ")[0]) for r in records if r.stage == "finetune"}
+    shown = {
+        (r.purpose, r.unit, r.name.partition(" ")[0]) for r in records if r.stage == "finetune" and r.unit != "overhead"
+    }
     looked_at = {("evaluation", "view", name) for name in ("base/test/0001", "preview/0001")}  # and not needed
     assert shown == {("training", "epoch", "epoch"), *looked_at}
     assert {r.purpose for r in records if r.stage == "evaluate"} == {"evaluation"}
     assert {r.purpose for r in records if r.name.startswith("test/")} == {"evaluation"}
+
+
+def test_the_ledger_explains_the_seconds_of_every_stage(tiny: Path) -> None:
+    """And most of them by name: what no step accounts for is a small part of a run."""
+    stages = json.loads((tiny / "manifest.json").read_text())["stages"]
+    records = Ledger(tiny / "costs.jsonl").read()
+    for name, stage in stages.items():
+        of_run = {r.run for r in records if r.stage == name}
+        assert len(of_run) == 1
+        booked = sum(r.wall_seconds for r in records if r.stage == name)
+        assert 0.95 * stage["seconds"] - 0.05 <= booked <= 1.05 * stage["seconds"] + 0.05, name
+    rest = sum(r.wall_seconds for r in records if r.name == "everything else")
+    assert rest < 0.35 * sum(stage["seconds"] for stage in stages.values())
+    # The engine of rasterised colour, which a timing chose, is told with every result.
+    engine = stages["prepare"]["detail"]["raster_engine"]
+    assert engine and json.loads((tiny / "evaluation" / "metrics.json").read_text())["raster_engine"] == engine
 
 
 def test_running_again_does_nothing(tiny: Path) -> None:

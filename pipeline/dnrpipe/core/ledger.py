@@ -26,7 +26,8 @@ from .errors import UserError
 
 StageName = Literal["prepare", "plan", "select", "raytrace", "finetune", "evaluate", "render"]
 Purpose = Literal["training", "evaluation", "inference"]
-Unit = Literal["scene", "view", "epoch"]
+Unit = Literal["scene", "view", "epoch", "overhead"]
+"""overhead: what a step of a stage took beside its work: starting processes, loading, waiting, writing files."""
 UpfrontPart = Literal["conversion", "passes", "pilot", "selection", "tracing", "light", "base images", "training"]
 
 
@@ -92,6 +93,8 @@ class Ledger:
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
+        self.booked = 0.0
+        """Wall seconds of all that was appended through this object."""
 
     def append(self, record: CostRecord) -> None:
         """Append one record, durably. After a truncated record it starts a new line first.
@@ -110,6 +113,7 @@ class Ledger:
             if written != len(line):
                 raise OSError(errno.ENOSPC, f"only {written} of {len(line)} bytes written", str(self.path))
             os.fsync(file.fileno())
+        self.booked += record.wall_seconds
 
     def read(self) -> list[CostRecord]:
         """All whole records in file order; [] when there is no ledger yet. Truncated records are left out.
@@ -214,7 +218,7 @@ def latest_epochs(records: Sequence[CostRecord], stage: str) -> list[CostRecord]
 
 def selection_cost(records: Sequence[CostRecord]) -> CostSum:
     """What the present selection cost: step 1's epochs, or the last choice that needed no training."""
-    chosen = [r for r in records if r.stage == "select" and not r.cache_hit]
+    chosen = [r for r in records if r.stage == "select" and r.unit != "overhead" and not r.cache_hit]
     if chosen and chosen[-1].unit != "epoch":
         return total(chosen[-1:])
     return total(latest_epochs(records, "select"))
@@ -246,7 +250,7 @@ def upfront_work(
 
 
 def _upfront_part(record: CostRecord) -> UpfrontPart:
-    if record.unit == "epoch":
+    if record.unit == "epoch" or record.stage == "finetune":
         return "training"
     if record.unit == "scene" and record.name == "light":  # whichever stage baked it
         return "light"

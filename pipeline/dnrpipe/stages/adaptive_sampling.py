@@ -71,7 +71,7 @@ def sample_adaptively(
     else:
         bar = run.console.bar(label, len(tasks), len(tasks) - len(due))
     began = schedule.clock()
-    with bar as shown:
+    with run.timed(f"{label}: processes"), bar as shown:
         for outcome in failures.noted(outcomes):
             written = outcome.result is not None and not outcome.task["add"]
             if written:

@@ -113,7 +113,8 @@ def base_views(
     if run.settings.model.base not in RENDERED or not views:
         return []
     renderer = base_renderer(run.workspace, run.settings, resolve_plan(run))
-    bake_light(run, renderer)
+    with run.timed("baking light: process"):
+        bake_light(run, renderer)
     paths = paths or [base_path(run.workspace, split, view.name) for view in views]
     tasks = []
     for view, path in zip(views, paths, strict=True):

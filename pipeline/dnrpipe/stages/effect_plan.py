@@ -28,7 +28,8 @@ def resolve_plan(run: Run) -> EffectPlan:
     workspace, settings = run.workspace, run.settings
     plan = plan_of(workspace, settings)
     if plan.max_depth is None:
-        pilot = _run_pilot(run, plan)
+        with run.timed("path depth pilot: process"):
+            pilot = _run_pilot(run, plan)
         keep_plan(workspace, plan.model_copy(update={"pilot": pilot}))
         plan = plan_of(workspace, settings)
         assert plan.max_depth is not None

@@ -89,6 +89,7 @@ def evaluate(run: Run) -> Outcome:
         perceptual=perceptual is not None,
         trained_with_perceptual=workspace.manifest.stages["finetune"].detail.get("perceptual", False),
         device=torch.cuda.get_device_name() if device.startswith("cuda") else "cpu",
+        raster_engine=workspace.manifest.prepared.raster_engine if workspace.manifest.prepared else "",
         reference_noise_target=settings.raytrace.evaluation_noise,
         neural_ms=1000 * float(np.median(neural_seconds)),
     )

@@ -211,7 +211,9 @@ def _make(stage: Stage, run: Run, inputs: str) -> Outcome:
     met: set[Path] = set()
     while True:
         try:
-            return stage.make(run.for_stage(stage.name, inputs))
+            own = run.for_stage(stage.name, inputs)
+            with own.timed("everything else"):
+                return stage.make(own)
         except DamagedFile as damage:
             owner = owner_of(damage.path, run.workspace)
             if owner is None or damage.path in met:

@@ -314,7 +314,8 @@ def _raster_engine(run: Run) -> RasterChoice:
     requested = run.settings.passes.raster
     chosen = read_raster_choice(run.workspace)
     if chosen is None or chosen.requested != requested:
-        engine, reason = choose_raster(requested)
+        with run.timed("raster trial"):
+            engine, reason = choose_raster(requested)
         run.console.say(f"raster colour by {engine}: {reason}")
         chosen = RasterChoice(requested=requested, engine=engine, reason=reason)
         write_json(run.workspace.root / "passes" / "raster.json", chosen.data())

@@ -55,6 +55,7 @@ class Metrics(Record, allow_inf_nan=False):
         perceptual: LPIPS was measured.
         trained_with_perceptual: the perceptual loss was among the losses; None: not known.
         device: that the network ran on.
+        raster_engine: that drew the rasterised colour.
         reference_noise_target: the relative noise that references were traced to; None: a number of samples was set.
         neural_ms: median of the network's milliseconds.
     """
@@ -64,6 +65,7 @@ class Metrics(Record, allow_inf_nan=False):
     perceptual: bool = True
     trained_with_perceptual: bool | None = None
     device: str = "cpu"
+    raster_engine: str = ""
     reference_noise_target: float | None = None
     neural_ms: float | None = None
 

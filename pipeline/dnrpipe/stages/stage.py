@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from ..core.console import Console
 from ..core.ledger import CostRecord, Purpose, StageName, Unit
@@ -18,6 +19,9 @@ from ..effects.plan import EffectPlan
 from ..effects.store import plan_of
 from ..workers.processes import run_tasks
 from ..workers.view_tasks import Book, Failures, is_made, task_name
+
+LEAST_OVERHEAD = 0.005
+"""Seconds below which overhead is not worth a record."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,16 @@ class Run:
                 **facts,
             )
         )
+
+    @contextmanager
+    def timed(self, name: str) -> Iterator[None]:
+        """Book as ``overhead`` what a block takes beyond what is booked within it."""
+        started, before = time.monotonic(), self.workspace.ledger.booked
+        yield
+        rest = time.monotonic() - started - (self.workspace.ledger.booked - before)
+        if rest > LEAST_OVERHEAD:
+            purpose = {"evaluate": "evaluation", "render": "inference"}.get(self.stage, "training")
+            self.book(cast(Purpose, purpose), "overhead", name, rest)
 
     def book_views(self, device: str, *, folder: str | None = None, purpose: Purpose | None = None) -> Book:
         """What `view_tasks` books each view by.
@@ -131,7 +145,7 @@ class Run:
         outcomes = run_tasks(
             module, common, due, workers=count, log=self.log, retried=failures.retried, environment=environment
         )
-        with self.console.bar(label, len(tasks), len(tasks) - len(due)) as bar:
+        with self.timed(f"{label}: processes"), self.console.bar(label, len(tasks), len(tasks) - len(due)) as bar:
             for outcome in failures.noted(outcomes):
                 if outcome.result is not None:
                     book(outcome.task, outcome.result, count)

@@ -184,3 +184,9 @@ def raster_file(workspace: Workspace, view: str) -> Path:
 def _trace(run: Run, views: list[View], split: str, spp: int | None = None) -> dict[str, str]:
     tasks = trace_views(run, views, split, spp=spp)
     return {view.name: task["fingerprint"] for view, task in zip(views, tasks, strict=True)}
+
+
+def raster_engine(root: Path) -> str:
+    """What drew the rasterised colour of a workspace's folder: a timing chose it, and it decides pictures."""
+    prepared = Workspace.open(root).manifest.prepared
+    return prepared.raster_engine if prepared else ""

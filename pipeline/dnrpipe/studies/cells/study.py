@@ -30,7 +30,7 @@ from ...workers.processes import run_tasks
 from ...workers.view_tasks import TasksFailed, warn_of_retries, worker_count
 from .cell import CELL_VERSION
 from .results import code_state, made_by
-from .scenes import Scene, traced_split
+from .scenes import Scene, raster_engine, traced_split
 from .tasks import CellTask, PoolTask, Step1Task, files_of
 
 CELL_WORKER = "dnrpipe.studies.cells.cell"
@@ -253,6 +253,9 @@ class Study(ABC, Generic[Place]):
             "seconds": self.seconds,
             "seeds": self.seeds,
             "scenes": [path.stem for path in self.sources],
+            "raster_engines": sorted(
+                {raster_engine(root) for root in {task.workspace for task in self.cells.values()}}
+            ),
             "spp": {"training": base.raytrace.spp, "test": base.raytrace.evaluation_spp},
             **self.compared(),
             "cells": [self.line(place, task) for place, task in self.cells.items() if task.output.exists()],
