@@ -18,6 +18,7 @@ from dnrpipe.core.ledger import (
     Ledger,
     break_even_frames,
     latest_epochs,
+    selection_cost,
     summarise,
     total,
     total_by,
@@ -262,12 +263,15 @@ def test_what_comes_before_the_first_frame_is_one_list_by_kind() -> None:
         record(stage="finetune", name="base/train/1", seconds=0.5, spp=None),
         record(stage="select", unit="epoch", name="epoch 1", seconds=2.0, spp=None),
         record(stage="finetune", unit="epoch", name="epoch 1", seconds=5.0, spp=None),
+        record(stage="finetune", unit="overhead", name="everything else", seconds=0.25, spp=None),
+        record(stage="select", unit="overhead", name="everything else", seconds=0.5, spp=None),
     ]
+    assert selection_cost(records).seconds == 2.0
     work = upfront_work(records)
     seconds = {part: total(units).seconds for part, units in work.items()}
     assert seconds == {
-        "conversion": 3.0, "passes": 1.0, "pilot": 8.0, "selection": 0.0, "tracing": 4.0, "light": 7.0,
-        "base images": 0.5, "training": 7.0,
+        "conversion": 3.0, "passes": 1.0, "pilot": 8.0, "selection": 0.5, "tracing": 4.0, "light": 7.0,
+        "base images": 0.5, "training": 7.25,
     }  # fmt: skip
     assert total(work["light"]).cpu_seconds == 14.0
     assert sum(seconds.values()) == upfront_seconds(records)

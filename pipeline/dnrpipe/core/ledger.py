@@ -250,7 +250,7 @@ def upfront_work(
 
 
 def _upfront_part(record: CostRecord) -> UpfrontPart:
-    if record.unit == "epoch" or record.stage == "finetune":
+    if record.unit == "epoch" or (record.unit, record.stage) == ("overhead", "finetune"):
         return "training"
     if record.unit == "scene" and record.name == "light":  # whichever stage baked it
         return "light"
