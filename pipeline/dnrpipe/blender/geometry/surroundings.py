@@ -86,7 +86,7 @@ def _about(camera: np.ndarray, clear: Clear, reach: float, rng: np.random.Genera
     """Standpoints that the camera's place is joined to by free air, within a few times the reach."""
     probes, places, found = _sphere(PROBES), [camera], list[Standpoint]()
     for _ in range(TRIES):
-        start = places[rng.integers(len(places))]  # from any place found: round corners, too
+        start = places[int(rng.integers(len(places)))]  # from any place found: round corners, too
         way = _direction(rng)
         ahead = min(clear(start, way), 2 * reach)
         place = start + way * ahead * FARTHEST * math.sqrt(rng.uniform())
@@ -118,7 +118,7 @@ def _along(
     """Standpoints beside the path, that look at what the camera sees from it."""
     probes, found = _sphere(PROBES), list[Standpoint]()
     for _ in range(TRIES):
-        number = rng.integers(len(poses))
+        number = int(rng.integers(len(poses)))
         pose, stop = poses[number], stops[number]
         # The frame is not known here: a square picture of the sensor's width.
         ray = np.array([*(rng.uniform(-0.5, 0.5, 2) * stop.sensor_width / stop.lens), -1.0])
