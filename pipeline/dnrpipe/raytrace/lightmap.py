@@ -259,7 +259,7 @@ class LightBaker:
         mi, light = self.mi, self.mi.Spectrum(0.0)
         # What glows is counted where emitters are; the integrator would look through it instead of stopping there.
         behind = self.scene.ray_intersect_preliminary(ray, active)
-        active &= ~(behind.is_valid() & behind.shape.is_emitter())
+        active = active & ~(behind.is_valid() & behind.shape.is_emitter())  # &= would change the caller's mask
         for medium, starts in self._around(ray, active):
             found, _, _ = self.integrator.sample(self.scene, sampler, mi.RayDifferential3f(ray), medium, starts)
             light = dr.select(starts, found, light)
