@@ -15,9 +15,11 @@ from dnrpipe.core import machine
 @pytest.fixture(autouse=True)
 def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setenv("DNRPIPE_CACHE", str(tmp_path / "cache"))
-    choice.try_engine.cache_clear()
+    for found in (choice.try_engine, machine.machine_fingerprint):
+        found.cache_clear()
     yield
-    choice.try_engine.cache_clear()
+    for found in (choice.try_engine, machine.machine_fingerprint):
+        found.cache_clear()
 
 
 def test_kept_until_the_driver_changes(monkeypatch: pytest.MonkeyPatch) -> None:

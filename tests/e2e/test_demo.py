@@ -22,21 +22,27 @@ def _dnrpipe(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return done
 
 
-@pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory, demo_blend: Path) -> Path:
-    folder = tmp_path_factory.mktemp("demo")
-    _dnrpipe("run", str(demo_blend), "--budget", "25", "--quiet", folder=folder)
+SHORT = ("finetune.step2.epochs=14", "cameras.test=4", "raytrace.evaluation_spp=256")
+"""A third of the draft preset's training and of its held-out views: what every run of the tests can wait for."""
+
+
+@pytest.fixture(scope="module", params=["short", pytest.param("whole", marks=pytest.mark.robustness)])
+def demo(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, demo_blend: Path) -> Path:
+    folder = tmp_path_factory.mktemp(request.param)
+    settings = [part for setting in SHORT for part in ("--set", setting)] if request.param == "short" else []
+    _dnrpipe("run", str(demo_blend), "--budget", "25", "--quiet", *settings, folder=folder)
     return folder / "demo.dnr"
 
 
 @pytest.mark.timeout(1200)
 def test_held_out_quality(demo: Path) -> None:
     metrics = json.loads((demo / "evaluation" / "metrics.json").read_text())
-    assert len(metrics["views"]) == 12
+    whole = demo.parent.name.startswith("whole")
+    assert len(metrics["views"]) == (12 if whole else 4)
     mean = metrics["mean"]
     print({key: round(value, 4) for key, value in mean.items() if value is not None})
-    assert mean["psnr"] >= 32.0
-    assert mean["ssim"] >= 0.965
+    assert mean["psnr"] >= (32.0 if whole else 30.5)
+    assert mean["ssim"] >= (0.965 if whole else 0.96)
     # A picture of the scene, not of a mean colour: it beats the best constant inside the mask by far.
     for view in metrics["views"]:
         truth = image(demo / "evaluation" / f"{view['name']}.truth.png")
