@@ -125,7 +125,9 @@ def _along(
         forward = pose[:3, :3] @ ray
         forward /= np.linalg.norm(forward)
         ahead = clear(pose[:3, 3], forward)
-        target = pose[:3, 3] + forward * (ahead if math.isfinite(ahead) else 2 * reach)
+        if not math.isfinite(ahead):  # sky
+            continue
+        target = pose[:3, 3] + forward * ahead
         way = _direction(rng)
         aside = min(clear(pose[:3, 3], way) * FARTHEST, STRAY * reach) * rng.uniform() ** (1 / 3)
         place = pose[:3, 3] + way * aside
