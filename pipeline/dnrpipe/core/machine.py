@@ -55,19 +55,20 @@ def forget_all() -> None:
 def machine_fingerprint() -> str:
     """Hash of the processor, the graphics and LLVM drivers, the packages, and the variables that choose among them."""
     variables = {name: value for name, value in os.environ.items() if name.startswith(VARIABLES)}
-    return digest([platform.node(), os.cpu_count(), _processor(), list(_versions()), list(_drivers()), variables])
+    return digest([platform.node(), os.cpu_count(), processor(), list(_versions()), list(_drivers()), variables])
+
+
+def processor() -> str:
+    """The processor's name; the architecture's where the system does not tell it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 def _path(name: str) -> Path:
     return cache_root() / "machine" / f"{name}.json"
-
-
-def _processor() -> str:
-    with suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line
-    return platform.processor()
 
 
 def _versions() -> Iterator[str]:

@@ -14,7 +14,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import os
 import shutil
 import subprocess
 import tarfile
@@ -37,6 +36,7 @@ from dnrtrain.records import read
 from .. import __version__
 from ..core.console import Console
 from ..core.errors import UserError
+from ..core.machine import cache_root
 from ..core.scene_files import read_frame, read_selection
 from ..core.workspace import Workspace
 from ..stages.records import METRICS, Metrics
@@ -150,8 +150,7 @@ def runtime() -> Path:
 
     Raises UserError: no npm, no network, or other bytes than expected.
     """
-    cache = Path(os.environ.get("DNRPIPE_CACHE") or Path.home() / ".cache" / "dnrpipe")
-    folder = cache / f"onnxruntime-web-{ORT_VERSION}"
+    folder = cache_root() / f"onnxruntime-web-{ORT_VERSION}"
     if all((folder / name).is_file() for name in (*ORT_FILES, "LICENSE")):
         return folder
     npm = shutil.which("npm")

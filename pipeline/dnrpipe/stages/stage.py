@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from ..core.console import Console
 from ..core.ledger import CostRecord, Purpose, StageName, Unit
@@ -61,6 +61,11 @@ class Run:
         """Where workers of the stage write what libraries print."""
         return self.workspace.log(self.stage)
 
+    @property
+    def purpose(self) -> Purpose:
+        """What the stage's own work is booked as."""
+        return "evaluation" if self.stage == "evaluate" else "inference" if self.stage == "render" else "training"
+
     def book(self, purpose: Purpose, unit: Unit, name: str, seconds: float, **facts: Any) -> None:
         """Append a record to the ledger. facts: further fields of `CostRecord`."""
         self.workspace.ledger.append(
@@ -83,8 +88,7 @@ class Run:
         yield
         rest = time.monotonic() - started - (self.workspace.ledger.booked - before)
         if rest > LEAST_OVERHEAD:
-            purpose = {"evaluate": "evaluation", "render": "inference"}.get(self.stage, "training")
-            self.book(cast(Purpose, purpose), "overhead", name, rest)
+            self.book(self.purpose, "overhead", name, rest)
 
     def book_views(self, device: str, *, folder: str | None = None, purpose: Purpose | None = None) -> Book:
         """What `view_tasks` books each view by.
@@ -112,10 +116,8 @@ class Run:
         return book
 
     def _purpose(self, task: dict[str, Any]) -> Purpose:
-        if self.stage == "render":
-            return "inference"
-        split = Path(task["output"]).parent.name
-        return "evaluation" if self.stage == "evaluate" or split.endswith("test") else "training"
+        held_out = Path(task["output"]).parent.name.endswith("test")
+        return "evaluation" if held_out and self.purpose == "training" else self.purpose
 
     def view_tasks(
         self,

@@ -7,6 +7,7 @@ Notation
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -84,13 +85,13 @@ def _clear(scene: bpy.types.Scene) -> Clear:
 
 def _about(camera: np.ndarray, clear: Clear, reach: float, rng: np.random.Generator) -> list[Standpoint]:
     """Standpoints that the camera's place is joined to by free air, within a few times the reach."""
-    probes, places, found = _sphere(PROBES), [camera], list[Standpoint]()
+    places, found = [camera], list[Standpoint]()
     for _ in range(TRIES):
         start = places[int(rng.integers(len(places)))]  # from any place found: round corners, too
         way = _direction(rng)
         ahead = min(clear(start, way), 2 * reach)
         place = start + way * ahead * FARTHEST * math.sqrt(rng.uniform())
-        if min(clear(place, probe) for probe in probes) < CLEARANCE * reach:
+        if _is_tight(place, clear, reach):
             continue
         target = _seen_from(place, clear, reach, rng)
         if target is None:
@@ -116,7 +117,7 @@ def _along(
     poses: Sequence[np.ndarray], stops: Sequence[SceneCamera], clear: Clear, reach: float, rng: np.random.Generator
 ) -> list[Standpoint]:
     """Standpoints beside the path, that look at what the camera sees from it."""
-    probes, found = _sphere(PROBES), list[Standpoint]()
+    found: list[Standpoint] = []
     for _ in range(TRIES):
         number = int(rng.integers(len(poses)))
         pose, stop = poses[number], stops[number]
@@ -135,12 +136,17 @@ def _along(
         distance = float(np.linalg.norm(gaze))
         if distance < CLEARANCE * reach or abs(gaze[2]) > 0.98 * distance:  # upright views need a horizon
             continue
-        if min(clear(place, probe) for probe in probes) < CLEARANCE * reach:
+        if _is_tight(place, clear, reach):
             continue
         found.append(_standpoint(place, target))
         if len(found) == STANDPOINTS:
             break
     return found
+
+
+def _is_tight(place: np.ndarray, clear: Clear, reach: float) -> bool:
+    """Whether a camera there would stand in a surface's way."""
+    return min(clear(place, probe) for probe in _sphere(PROBES)) < CLEARANCE * reach
 
 
 def _standpoint(place: np.ndarray, target: np.ndarray) -> Standpoint:
@@ -158,6 +164,7 @@ def _direction(rng: np.random.Generator) -> np.ndarray:
     return np.array([ring * math.cos(turn), ring * math.sin(turn), z])
 
 
+@functools.cache
 def _sphere(count: int) -> np.ndarray:
     """A Fibonacci lattice of unit vectors, float64 [count, 3]."""
     z = 1 - (2 * np.arange(count) + 1) / count
