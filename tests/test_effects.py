@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from tests.scene_records import CAMERA, MATT, scene_census, scene_summary
 
 from dnrpipe.core.cameras import view_lenses
-from dnrpipe.core.effect_names import FORCEABLE, LAMPS, NAMES, NEURAL
+from dnrpipe.core.effect_names import FORCEABLE, NAMES, NEURAL
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import CameraSettings, Settings, resolve
 from dnrpipe.effects.bundle import bundle_facts, write_without
@@ -109,8 +109,7 @@ def test_integrator_follows_the_plan() -> None:
     assert plan_effects(glass, {}, disable=["caustics"]).integrator == "path-without-caustics"
     # `direct` stops at null surfaces: cut-outs keep `path`.
     assert plan_effects(scene_census(), {"alpha": ["m"]}, max_depth=2).integrator == "path"
-    # Shadow rays of `path` stop at cut-outs: a lamp's light would not come through.
-    assert plan_effects(scene_census(), {"alpha": ["m"], "point-lights": ["m"]}).integrator == "volpath"
+    assert plan_effects(scene_census(), {"alpha": ["m"], "point-lights": ["m"]}).integrator == "path"
     assert plan_effects(scene_census(), {"null": ["m"]}, max_depth=2).integrator == "path"
     kept = plan_effects(glass, {"volumes": ["m"]}, disable=["caustics"])
     assert kept.on("caustics") and kept.integrator == "volpath"
@@ -158,9 +157,7 @@ def test_overrides_are_obeyed_or_have_nothing_to_act_on(
             assert not effect.present or (effect.name == "indirect" and depth in (1, 2))
             assert effect.name not in FORCEABLE - {"indirect"}
     assert set(plan.left_out) <= set(disable) and not set(plan.left_out) & NEURAL
-    behind_cutouts = plan.on("alpha") and any(plan.on(name) for name in LAMPS)
-    bare = behind_cutouts and plan.integrator != "path-without-caustics"
-    assert (plan.integrator == "volpath") == (plan.on("volumes") or bare)
+    assert (plan.integrator == "volpath") == plan.on("volumes")
     if plan.max_depth is None:
         assert depth == "auto" and piloted is None
     table(plan)

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from dnrtrain.settings import ModelSettings, Strict
 
-from ..core.effect_names import FORCEABLE, LAMPS, NAMES, NEURAL, REMOVABLE, EffectName
+from ..core.effect_names import FORCEABLE, NAMES, NEURAL, REMOVABLE, EffectName
 from ..core.scene_records import Census
 from ..raytrace.statistics import REFERENCE_DEPTH, DepthStep, Measured
 from .evidence import WORDS, Evidence, gather
@@ -176,9 +176,6 @@ def _integrator(plan: EffectPlan, bundle: Mapping[str, Sequence[str]]) -> Integr
     caustics = plan.effect("caustics")
     if caustics.present and not caustics.on and not shallow:
         return "path-without-caustics"
-    # Shadow rays of `path` stop at cut-outs, so lamps would not shine through; those of `volpath` go on.
-    if plan.on("alpha") and any(plan.on(lamp) for lamp in LAMPS):
-        return "volpath"
     # Mitsuba's `direct` stops at surfaces that let light straight through, where `path` goes on.
     passing = plan.on("alpha") or bool(bundle.get("null"))
     return "direct" if plan.max_depth == DIRECT_DEPTH and not passing else "path"

@@ -15,6 +15,7 @@ from dnrtrain.contract import View
 from . import paths, plugins
 from .auxiliary import auxiliary_integrator
 from .recorded import without_collection
+from .second_targets import second_targets
 from .sensors import scaled_lens, scaled_view, sensor_dict, unit_scale
 from .tasks import BundleCommon
 from .visibility import camera_integrator
@@ -50,6 +51,7 @@ class Engine:
         self.compiled = not variant.startswith("scalar")
         if self.compiled:
             paths.register(mi)
+            self._targets = second_targets(mi)
         else:
             _refuse_instances(bundles)
         self.mi = mi

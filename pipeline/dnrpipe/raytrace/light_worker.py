@@ -14,6 +14,7 @@ from dnrtrain.contract import NPZ_ERRORS
 
 from .engine import BundleWorker
 from .lightmap import LightBaker
+from .lobes import lets_through
 from .tasks import LightAnswer, LightTask, costs_since
 from .texels import grouped_meshes
 from .visibility import ROULETTE_DEPTH
@@ -51,6 +52,8 @@ class Worker(BundleWorker):
         settings: dict[str, Any] = {"type": kind}
         if kind == "path-without-caustics":
             settings = {"type": "dnr_path", "caustics": False, "after_diffuse": True}
+        elif kind == "path" and lets_through(self.engine.mi, self.engine.scenes[str(self.bundle)]):
+            settings = {"type": "dnr_path"}  # Mitsuba's is wrong there, see `paths`
         settings |= {"max_depth": depth, "rr_depth": ROULETTE_DEPTH, "hide_emitters": True}
         return self.engine.mi.load_dict(settings)
 

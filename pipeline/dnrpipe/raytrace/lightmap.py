@@ -34,6 +34,7 @@ from .lobes import (
     reflectance,
     specular_context,
 )
+from .paths import transmittance
 from .texels import AtlasSurface
 
 MAX_SAMPLES = 4_000_000
@@ -41,8 +42,6 @@ LIFT = 2e-4
 """Of the scene's size: how far above a surface the ray starts that finds it again."""
 LEAST_RHO = 1e-3
 """Texels that reflect less hold no light worth knowing."""
-MAX_LAYERS = 16
-"""Surfaces that a shadow ray passes at most."""
 
 
 class LightBaker:
@@ -224,7 +223,7 @@ class LightBaker:
         wo = si.to_local(toward.d)
         value = bsdf.eval(context, si, wo, lit)
         if self.passing:
-            arriving *= self._transmittance(si, toward, lit & (dr.max(value) > 0))
+            arriving *= transmittance(mi, scene, si, toward.p, lit & (dr.max(value) > 0))
         b = dr.select(lit, value * arriving, 0)
         if self.integrator is not None:
             b += self._bounced(sampler, si, bsdf, context, found)
@@ -279,21 +278,3 @@ class LightBaker:
         around = dr.select(leaves, hit.shape.interior_medium(), dr.zeros(mi.MediumPtr))
         members = [(medium, active & (around == mi.MediumPtr(medium))) for medium in self.media]
         return [(None, active & (around == dr.zeros(mi.MediumPtr))), *members]
-
-    def _transmittance(self, si: Any, toward: Any, active: Any) -> Any:
-        """Product of what the surfaces between ``si`` and the emitter's point let straight through."""
-        import drjit as dr
-
-        mi, scene = self.mi, self.scene
-        ray = si.spawn_ray_to(toward.p)
-
-        def step(ray: Any, total: Any, left: Any, active: Any) -> tuple[Any, ...]:
-            hit = scene.ray_intersect(ray, active)
-            met = active & hit.is_valid()
-            total = dr.select(met, total * hit.bsdf().eval_null_transmission(hit, met), total)
-            onwards = hit.spawn_ray_to(toward.p)
-            ray = dr.select(met, onwards, ray)
-            return ray, total, left - 1, met & (dr.max(total) > 0) & (left > 0)
-
-        state = (ray, mi.Spectrum(1.0), mi.UInt32(MAX_LAYERS), mi.Mask(active))
-        return dr.while_loop(state, lambda ray, total, left, active: active, step)[1]

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from .lobes import lets_through
+
 LAMP_PREFIX = "light-"
 TINTED = "dnr_transparent"
 UNSEEN_PREFIX = "unseen-"
@@ -30,14 +32,19 @@ def camera_integrator(mi: Any, scene: Any, max_depth: int, kind: str = "path") -
 
     kind: Mitsuba's ``direct``, ``path`` or ``volpath``, or one of ``OWN``. Roulette starts at a fixed depth: with
     the same seed, a path cut at one depth is then the beginning of the path cut at a larger one, which the depth
-    pilot relies on.
+    pilot relies on. Where surfaces let light straight through, ours takes the place of ``path``, which is wrong there
+    (see `paths`); under a scalar variant, ``volpath`` does.
     """
     settings: dict[str, Any] = dict(OWN.get(kind, {"type": kind}))
+    holes = lets_through(mi, scene)
+    if holes and kind == "path":
+        settings["type"] = "dnr_path" if mi.variant().startswith(("llvm", "cuda")) else "volpath"
     if kind == "direct":
         settings |= {"emitter_samples": 1, "bsdf_samples": 1}
     else:
         settings |= {"max_depth": max_depth, "rr_depth": ROULETTE_DEPTH}
-    hidden = mi.load_dict({**settings, "hide_emitters": True})
+    glow = {"shows_glow": True} if holes and settings["type"] == "dnr_path" else {}
+    hidden = mi.load_dict({**settings, **glow, "hide_emitters": True})
     first_visible, found, name = first_visible_of(mi, scene), hidden, kind
     unseen = any(shape.id().startswith(UNSEEN_PREFIX) for shape in scene.shapes())
     if glowing_shapes(scene) or unseen:

@@ -21,7 +21,7 @@ from .base_images import RENDERED, base_path, base_views
 from .effect_plan import resolve_plan
 from .stage import Outcome, Run
 
-TRACE_VERSION = 3
+TRACE_VERSION = 4
 SAMPLES_VERSION = 1
 
 

@@ -57,7 +57,10 @@ def export_bundle(
     shapes = export_shapes(meshes, used, converter, scene_dir, findings)
     root.extend(converter.sheets_elements())
     media = [converted.medium for converted in materials.values() if converted.medium is not None]
-    root.insert(0, _integrator("volpath" if media else "path"))
+    holes = any(
+        bsdf.get("type") in ("mask", "dnr_transparent") for m in materials.values() for bsdf in m.bsdf.iter("bsdf")
+    )
+    root.insert(0, _integrator("volpath" if media or holes else "path"))
     root.extend(converted.bsdf for converted in materials.values())
     root.extend([*media, *shapes])
     report_ray_visibility((mesh.object_name for mesh in meshes), findings)
@@ -84,7 +87,8 @@ def bounding_sphere(meshes: Sequence[FrozenMesh]) -> tuple[np.ndarray, float]:
 
 
 def _integrator(kind: str) -> ET.Element:
-    """``path``, or ``volpath`` where there are media.
+    """``path``, or ``volpath`` where there are media or holes, for Mitsuba by itself; the project's own is chosen by
+    the effects (`raytrace.visibility.camera_integrator`).
 
     Emitters and environment are invisible to the camera, as Blender's lamps over a clear film.
     """
