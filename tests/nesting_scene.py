@@ -59,10 +59,11 @@ def bsdf(parent: ET.Element, names: list[str], folder: Path) -> None:
         texture(element, name, folder, kind)
     if kind == "dnr_normal":
         ET.SubElement(element, "string", name="space", value="tangent")
-    if kind == "dnr_interface":
+    if kind in ("dnr_interface", "dnr_refraction"):
         ET.SubElement(element, "float", name="eta", value="1.4")
-    if kind == "dnr_refraction":
-        ET.SubElement(element, "bsdf", type="roughdielectric")
+        glass = ET.SubElement(element, "bsdf", type="roughdielectric")
+        ET.SubElement(glass, "float", name="int_ior", value="1.4")
+        ET.SubElement(glass, "float", name="ext_ior", value="1")
     if rest:
         bsdf(element, rest, folder)
     if kind in ("blendbsdf", "dnr_add"):

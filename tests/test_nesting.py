@@ -35,7 +35,7 @@ def rendered(variant: str, folder: Path, names: tuple[str, ...]) -> dict[str, An
     environment = {**os.environ, **choose_variant("llvm_ad_rgb").environment}
     done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=300, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
-    return json.loads(done.stdout)
+    return json.loads(done.stdout[done.stdout.index("{") :])  # Mitsuba warns on stdout
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import bpy
+import numpy as np
 
 from . import studio as s
 from .catalogue import scene
@@ -84,6 +86,49 @@ def hair() -> None:
     settings = system.settings
     settings.type, settings.count, settings.hair_length = "HAIR", 900, 0.35
     settings.material, settings.root_radius, settings.tip_radius, settings.radius_scale = 2, 1.0, 0.4, 0.02
+
+
+def _pelt(material: Any, strands: int, length: float) -> None:
+    """A ball with dense hair of ``material``, under the sky and an area lamp."""
+    _stage()
+    s.lamp("AREA", 120, (2.0, -1.5, 3.0), size=0.6)
+    body = s.ball(s.diffuse("Skin", (0.6, 0.4, 0.3)), (0, 0, 0.75), 0.45)
+    body.data.materials.append(material)
+    settings = body.modifiers.new("Hair", "PARTICLE_SYSTEM").particle_system.settings
+    settings.type, settings.count, settings.hair_length = "HAIR", strands, length
+    settings.child_type, settings.rendered_child_count, settings.child_radius = "SIMPLE", 10, 0.08
+    settings.material, settings.root_radius, settings.tip_radius, settings.radius_scale = 2, 1.0, 0.2, 0.01
+
+
+@scene("dense hair, Principled BSDF", GROUP, samples=2)
+def hair_principled() -> None:
+    _pelt(s.principled("Fur", (0.35, 0.2, 0.1)), 1500, 0.3)
+
+
+@scene("dense hair, Principled Hair BSDF", GROUP, samples=2)
+def hair_fibres() -> None:
+    _pelt(s.shader("Fur", "ShaderNodeBsdfHairPrincipled"), 1500, 0.3)
+
+
+@scene("dense hair, Diffuse BSDF", GROUP, samples=2)
+def hair_diffuse() -> None:
+    _pelt(s.diffuse("Fur", (0.6, 0.5, 0.4)), 1500, 0.3)
+
+
+@scene("smooth terrain of steep slopes, low sun", GROUP)
+def terrain() -> None:
+    s.constant_world((0.6, 0.75, 1.0), 0.3)
+    s.lamp("SUN", 3.0, (3.0, -1.0, 1.2), angle=0.01)
+    bpy.ops.mesh.primitive_grid_add(x_subdivisions=96, y_subdivisions=96, size=3.4)
+    body = s.smooth(bpy.context.object)
+    heights = np.empty(len(body.data.vertices) * 3, np.float32)
+    body.data.vertices.foreach_get("co", heights)
+    points = heights.reshape(-1, 3)
+    x, y = points[:, 0], points[:, 1]
+    waves = (((5, 3, 0), 0.22), ((-9, 13, 1), 0.12), ((23, 17, 2), 0.06), ((-41, 37, 3), 0.03))
+    points[:, 2] = 0.4 + sum(h * np.sin(a * x + c) * np.sin(b * y + 2 * c) for (a, b, c), h in waves)
+    body.data.vertices.foreach_set("co", heights)
+    body.data.materials.append(s.principled("Rock", (0.35, 0.3, 0.25), Roughness=0.8))
 
 
 @scene("Displace modifier", GROUP)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import bpy
+
 from . import studio as s
 from .catalogue import scene
 
@@ -112,6 +114,17 @@ def principled_emission() -> None:
 def subsurface() -> None:
     material = s.principled("Skin", (0.8, 0.5, 0.4), Roughness=0.5, Subsurface_Weight=1.0, Subsurface_Scale=0.1)
     s.lit(material)
+
+
+@scene("subsurface weight 1, radius 0.3, thin parts", GROUP)
+def subsurface_deep() -> None:
+    s.sky()
+    s.floor()
+    s.lamp("AREA", 100, (0.5, 2.5, 2.0), size=0.5)
+    bpy.ops.mesh.primitive_monkey_add(size=1.5, location=(0, 0, 0.75))
+    s.smooth(bpy.context.object).data.materials.append(
+        s.principled("Skin", (0.8, 0.5, 0.4), Roughness=0.5, Subsurface_Weight=1.0, Subsurface_Scale=0.3)
+    )
 
 
 @scene("anisotropic metal", GROUP)

@@ -78,6 +78,28 @@ def image_alpha() -> None:
     s.lit(material)
 
 
+@scene("dark leaves cut out by an image, under lamps", IMAGES)
+def leaves() -> None:
+    v, u = np.mgrid[0:64, 0:64] / 31.5 - 1
+    pixels = np.ones((64, 64, 4), np.float32)
+    pixels[..., :3] = np.stack([0.2 + 0.1 * u, 0.3 + 0.1 * v, 0.1 + 0 * u], -1)
+    pixels[..., 3] = np.clip((0.8 - np.hypot(u / (0.75 - 0.4 * v), v)) / 0.15, 0, 1)
+    material = s.principled("Leaf", Roughness=0.35)
+    picture = s.image("leaf", pixels)
+    s.image_node(material, picture)
+    s.image_node(material, picture, "Alpha", output="Alpha")
+    s.constant_world(strength=0.05)
+    s.floor()
+    s.lamp("SUN", 2.0, (1.5, -1.0, 3.0), angle=0.02)
+    s.lamp("AREA", 60, (-2.0, -1.0, 2.0), size=0.5)
+    place = np.random.default_rng(3)
+    for _ in range(70):
+        bpy.ops.mesh.primitive_plane_add(
+            size=0.5, location=place.uniform((-1, -0.7, 0.3), (1, 0.9, 1.3)), rotation=place.uniform(0, 6.3, 3)
+        )
+        bpy.context.object.data.materials.append(material)
+
+
 @scene("non-colour image as roughness", IMAGES)
 def image_roughness() -> None:
     material = s.principled("Patchy", (0.8, 0.8, 0.8), Metallic=1.0)

@@ -1,7 +1,11 @@
 """Hair and point clouds as triangles: particle hair, Curves objects, PointCloud objects -> `LocalMesh`.
 
-Every part of the pipeline then sees the same surface: strands are three-sided tubes with round normals, points are
-small spheres. Beyond a budget strands and points are thinned out evenly and thickened to keep their area.
+Every part of the pipeline then sees the same surface: strands are tubes, points are small spheres. Beyond a budget
+strands and points are thinned out evenly and thickened to keep their area.
+
+Few strands get many sides and round normals. Many get three flat sides, each strand turned by chance: about such
+prisms scatter, on average, what round strands do, while round normals on three sides lose a tenth (light that comes
+from below a side, and views at which the normal looks away).
 """
 
 from __future__ import annotations
@@ -18,9 +22,9 @@ from ..findings import Findings
 from .local_mesh import LocalMesh, slot_names
 
 BUDGET = 600_000  # triangles of one hair system or point cloud
-SIDES = 3
-MEAN_WIDTH = 2 * math.pi / (2 * SIDES * math.sin(math.pi / SIDES))
-"""Radius of a tube's corners over the strand's: a convex outline's mean width is its perimeter / pi."""
+FLAT_SIDES, ROUND_SIDES, MAX_SIDES = 3, 6, 8
+ROUND_BUDGET = 300_000
+"""Triangles of one hair system up to which strands get more than `FLAT_SIDES`."""
 MAX_SEGMENTS = 16
 DEFAULT_RADIUS = 0.005  # Cycles' radius of curves without one
 DEFAULT_POINT_RADIUS = 0.01
@@ -114,10 +118,10 @@ def _particle_strands(obj: bpy.types.Object, system: bpy.types.ParticleSystem, m
     first = parents if settings.child_type != "NONE" and children else 0
     numbers = np.arange(first, parents + children)
     steps = (1 << settings.render_step) + 1
-    if len(numbers) * SIDES * 2 * (steps - 1) > BUDGET:
-        numbers = numbers[_thinned(len(numbers), BUDGET // (SIDES * 2 * (min(steps, 5) - 1)))]
+    if len(numbers) * FLAT_SIDES * 2 * (steps - 1) > BUDGET:
+        numbers = numbers[_thinned(len(numbers), BUDGET // (FLAT_SIDES * 2 * (min(steps, 5) - 1)))]
     taken = np.unique(np.linspace(0, steps - 1, min(steps, MAX_SEGMENTS + 1)).round().astype(int))
-    if len(numbers) * SIDES * 2 * (len(taken) - 1) > BUDGET:
+    if len(numbers) * FLAT_SIDES * 2 * (len(taken) - 1) > BUDGET:
         taken = np.unique(np.linspace(0, steps - 1, 5).round().astype(int))
     points = np.array(
         [[system.co_hair(object=obj, particle_no=int(n), step=int(s)) for s in taken] for n in numbers], np.float64
@@ -156,9 +160,10 @@ def _tubes(strands: Strands, materials: list[str | None], slot: int, name: str, 
     total, steps = points.shape[:2]
     if total == 0 or steps < 2:
         return None
-    kept = _thinned(total, BUDGET // (SIDES * 2 * (steps - 1)))
+    kept = _thinned(total, BUDGET // (FLAT_SIDES * 2 * (steps - 1)))
     points, radii = points[kept], radii[kept] * (total / len(kept))
-    findings.add("approximated", "hair", _note("strands", total, len(kept), "three-sided tubes"), object=name)
+    sides = int(np.clip(ROUND_BUDGET // (len(kept) * 2 * (steps - 1)), FLAT_SIDES, MAX_SIDES))
+    findings.add("approximated", "hair", _note("strands", total, len(kept), f"tubes of {sides} sides"), object=name)
     tangent = np.gradient(points, axis=1)
     tangent /= np.maximum(np.linalg.norm(tangent, axis=2, keepdims=True), 1e-20)
     # One side direction per strand, made perpendicular at every point: no twist to speak of along a hair.
@@ -167,15 +172,22 @@ def _tubes(strands: Strands, materials: list[str | None], slot: int, name: str, 
     side = np.cross(tangent, np.broadcast_to(helper, tangent.shape))
     side /= np.maximum(np.linalg.norm(side, axis=2, keepdims=True), 1e-20)
     other = np.cross(tangent, side)
-    angles = 2 * np.pi * np.arange(SIDES) / SIDES
-    round_ = np.cos(angles)[:, None] * side[:, :, None] + np.sin(angles)[:, None] * other[:, :, None]
-    rings = points[:, :, None] + round_ * (radii * MEAN_WIDTH)[..., None, None]
-    k, s = np.arange(SIDES), np.arange(steps - 1)
-    lower = s[:, None] * SIDES + k
-    ahead = s[:, None] * SIDES + (k + 1) % SIDES
-    faces = np.stack([lower, ahead, ahead + SIDES, lower, ahead + SIDES, lower + SIDES], axis=-1).reshape(-1)
+    turn = np.random.default_rng(0).uniform(0, 2 * np.pi, (len(kept), 1, 1, 1))
+    angles = turn + (2 * np.pi * np.arange(sides) / sides)[:, None]
+    round_ = np.cos(angles) * side[:, :, None] + np.sin(angles) * other[:, :, None]
+    # A convex outline's mean width is its perimeter / pi: a tube's corners lie a little outside of the strand.
+    mean_width = math.pi / (sides * math.sin(math.pi / sides))
+    rings = points[:, :, None] + round_ * (radii * mean_width)[..., None, None]
+    k, s = np.arange(sides), np.arange(steps - 1)
+    lower = s[:, None] * sides + k
+    ahead = s[:, None] * sides + (k + 1) % sides
+    faces = np.stack([lower, ahead, ahead + sides, lower, ahead + sides, lower + sides], axis=-1).reshape(-1)
     positions = rings.reshape(len(kept), -1, 3)[:, faces]
-    normals = round_.reshape(len(kept), -1, 3)[:, faces]
+    if sides >= ROUND_SIDES:
+        normals = round_.reshape(len(kept), -1, 3)[:, faces]
+    else:
+        flat = (round_ + np.roll(round_, -1, axis=2))[:, :-1].reshape(len(kept), -1, 3)
+        normals = np.repeat(flat / np.linalg.norm(flat, axis=-1, keepdims=True), 6, axis=1)
     mesh = _local_mesh(positions, normals, materials, slot)
     mesh.strands = True
     if strands.uv is not None:
