@@ -15,6 +15,7 @@ from tests.nesting_scene import LEAVES, WRAPPERS
 SCRIPT = Path(__file__).with_name("nesting_scene.py")
 ONE_SIDED = ("dnr_principled", "roughconductor")
 """Leaves that stand in ``twosided``, as the conversion writes them."""
+GLASS = ("dnr_refraction", "dnr_interface")
 PRODUCTION = ("mask", "dnr_normal", "twosided", "dnr_principled")
 PAIRS = [
     (outer, inner, "twosided", "dnr_principled")
@@ -52,7 +53,7 @@ def test_nested_bsdfs_compile_and_agree(names: tuple[str, ...], tmp_path: Path, 
     )
     assert compiled["lost"] == scalar["lost"] == 0
     assert compiled["path"] == pytest.approx(scalar["path"], rel=0.05) and compiled["path"] > 0.01
-    # Nothing else is there to throw a caustic.
-    assert compiled["path-without-caustics"] == pytest.approx(compiled["path"], rel=0.02)
+    if names[-1] not in GLASS:  # nothing is there to throw a caustic
+        assert compiled["path-without-caustics"] == pytest.approx(compiled["path"], rel=0.02)
     # Dr.Jit writes a function twice that is called both through a table and without.
     assert compiled["kernels"] > 0 and compiled["direct"] == []

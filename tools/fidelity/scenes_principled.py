@@ -103,6 +103,14 @@ def alpha_constant() -> None:
     s.lit(s.principled("Half", s.CLAY, Roughness=1.0, Specular_IOR_Level=0.0, Alpha=0.5))
 
 
+@scene("alpha 0.5 under a sun and an area lamp", GROUP)
+def alpha_lamps() -> None:
+    s.floor()
+    s.subjects(s.principled("Half", s.CLAY, Roughness=0.4, Alpha=0.5))
+    s.lamp("SUN", 2.0, (1.5, -1.0, 3.0), angle=0.02)
+    s.lamp("AREA", 60, (-2.0, -1.0, 2.0), size=0.5)
+
+
 @scene("emission colour and strength", GROUP)
 def principled_emission() -> None:
     material = s.principled("Glow", (0.1, 0.1, 0.1), Roughness=1.0, Specular_IOR_Level=0.0, Emission_Strength=0.8)
