@@ -161,21 +161,6 @@ class PassesTask(Task):
     fingerprint: str
 
 
-class FrameCosts(TypedDict):
-    """What one frame took in its process. peak_mb: memory of the process so far."""
-
-    seconds: float
-    cpu_seconds: float
-    peak_mb: float
-
-
-class FrameFailure(TypedDict):
-    """Why a frame could not be rendered. input: the scene is at fault."""
-
-    error: str
-    input: bool
-
-
 class PassesHeader(TypedDict):
     """Header of a view's file. repaired: pixels that were not finite or had no normal, and are 0."""
 

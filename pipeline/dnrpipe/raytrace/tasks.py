@@ -10,6 +10,7 @@ Seconds are wall-clock, ``cpu_seconds`` of the process. A ``fingerprint`` is a h
 from __future__ import annotations
 
 import resource
+import sys
 import time
 from pathlib import Path
 from typing import Any, Literal, NotRequired, TypedDict
@@ -51,7 +52,8 @@ def costs_since(wall: float, cpu: float) -> Costs:
     return {
         "seconds": time.monotonic() - wall,
         "cpu_seconds": time.process_time() - cpu,
-        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        / (1 << 20 if sys.platform == "darwin" else 1 << 10),
     }
 
 

@@ -209,10 +209,10 @@ class LocalWorker:
 
     Linux kills it when the thread that asked first ends.
 
-    Args: as of `run_tasks`.
+    Args: as of `run_tasks`; without a log its output goes where this process's errors go.
     """
 
-    def __init__(self, module: str, common: dict[str, Any], log: Path, environment: dict[str, str]) -> None:
+    def __init__(self, module: str, common: dict[str, Any], log: Path | None, environment: dict[str, str]) -> None:
         self.module, self.common, self.log, self.environment = module, common, log, environment
         self._process: subprocess.Popen[str] | None = None
 
@@ -282,8 +282,9 @@ class LocalWorker:
             process.stdout.close()
 
     def _spawn(self) -> subprocess.Popen[str]:
-        self.log.parent.mkdir(parents=True, exist_ok=True)
-        with self.log.open("a") as sink:
+        if self.log is not None:
+            self.log.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.nullcontext() if self.log is None else self.log.open("a") as sink:
             process = subprocess.Popen(
                 [sys.executable, "-m", "dnrpipe.workers.processes", self.module, str(os.getpid())],
                 stdin=subprocess.PIPE,
