@@ -1,6 +1,6 @@
 """What the workers of this package are asked, and what they answer.
 
-Tasks travel as JSON: ``TraceTask(...).model_dump(mode="json")``; the worker reads them by ``model_validate``, so that a
+Tasks travel as JSON: ``TraceTask(...).data()``; the worker reads them by ``model_validate``, so that a
 malformed one fails with its name. What all tasks of a worker share (``common``) is sent once, when it starts.
 Answers are dicts as they come, since they go into the ledger and into file headers.
 
@@ -26,6 +26,10 @@ class Task(BaseModel):
     """Unknown keys are ignored."""
 
     model_config = ConfigDict(frozen=True)
+
+    def data(self) -> dict[str, Any]:
+        """The task as JSON-able values."""
+        return self.model_dump(mode="json")
 
 
 class BundleCommon(Task):

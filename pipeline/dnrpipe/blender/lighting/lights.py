@@ -158,7 +158,7 @@ def _point(light: Any, matrix: np.ndarray, power: np.ndarray, identity: str, sce
     position = matrix[:3, 3]
     if radius <= 1e-5:
         element = xmltree.plugin("emitter", "point", id=identity)
-        _position(element, "position", position)
+        xmltree.vector(element, "position", position, "point")
         xmltree.rgb(element, "intensity", power / (4 * math.pi))
         return element
     element = _sphere(position, radius, identity)
@@ -173,7 +173,7 @@ def _point(light: Any, matrix: np.ndarray, power: np.ndarray, identity: str, sce
 
 def _sphere(center: np.ndarray, radius: float, identity: str) -> ET.Element:
     element = xmltree.plugin("shape", "sphere", id=identity)
-    _position(element, "center", center)
+    xmltree.vector(element, "center", center, "point")
     xmltree.number(element, "radius", radius)
     return element
 
@@ -316,11 +316,6 @@ def _emit(shape: ET.Element, radiance: np.ndarray, kind: str = "area") -> ET.Ele
     xmltree.rgb(emitter, "radiance", radiance)
     shape.append(emitter)
     return emitter
-
-
-def _position(element: ET.Element, name: str, value: np.ndarray) -> None:
-    x, y, z = (f"{v:.9g}" for v in value)
-    ET.SubElement(element, "point", {"name": name, "x": x, "y": y, "z": z})
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:
