@@ -58,13 +58,7 @@ class StageRecord(BaseModel, extra="forbid"):
 
 
 class PrepareDetail(BaseModel, strict=True):
-    """What stage `prepare` tells of itself.
-
-    Args:
-        raster_engine, raster_reason: what draws rasterised colour, and why.
-        views: how many, by split.
-        triangles: of the scene.
-    """
+    """What stage `prepare` tells of itself."""
 
     raster_engine: str = ""
     raster_reason: str = ""

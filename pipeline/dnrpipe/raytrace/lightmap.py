@@ -50,7 +50,6 @@ class LightBaker:
 
     Args:
         mi: the mitsuba module, a jit variant set.
-        scene: the scene.
         integrator: continues paths from their first bounce on; emitters that it meets first must be hidden. None:
             direct light alone.
         groups: see `texels.AtlasSurface`.

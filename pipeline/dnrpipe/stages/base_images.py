@@ -102,8 +102,6 @@ def base_views(
     """Render the base images of the views that are missing or out of date -> all tasks, [] where none is rendered.
 
     Args:
-        run: of the stage that needs them.
-        views: all of them.
         split: that they are of; the ledger names them by it.
         paths: where they go instead of ``base/<split>``.
         purpose: they are booked under, instead of the stage's.

@@ -31,7 +31,6 @@ class Inspection:
     """What is in a scene file.
 
     Args:
-        warnings: lines for the user.
         census: with the findings of a conversion.
         effects: rows of the plan before its path depth pilot.
     """

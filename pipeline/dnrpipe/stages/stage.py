@@ -29,7 +29,6 @@ class Run:
     """One command's work on a workspace. Every stage gets one, as `for_stage` makes it.
 
     Args:
-        workspace, settings, console: of the command.
         stage: what the ledger books work under, and whose log workers write.
         id: names this run in the ledger.
         fingerprint: hash of all that the stage under way computes from; "" where none is.
@@ -94,7 +93,6 @@ class Run:
         """What `view_tasks` books each view by.
 
         Args:
-            device: as the ledger names it.
             folder: of the record's name; None: the one that the view's file lies in.
             purpose: None: by the stage, and by the split that the view's file lies in.
         """
@@ -133,9 +131,7 @@ class Run:
         """Run the tasks whose files are missing or out of date.
 
         Args:
-            label: what the progress bar and warnings call them.
             module, common, environment: of `processes.run_tasks`.
-            workers: processes at most.
 
         Raises TasksFailed after all other tasks are done when some failed twice. Raises OSError: the disk is full.
         """
@@ -168,13 +164,8 @@ class Stage:
     """One stage: a function of files in a workspace.
 
     Args:
-        name: in the manifest and the ledger.
-        command: of the command line.
-        does: in a few words.
-        needs: stages that must be done before.
         reads, writes: files and folders of the workspace.
         settings: those that decide what it makes, JSON-able.
-        make: does what is missing.
         progress: (units present, units wanted), by looking at files alone.
         version: raised when the same inputs give other files.
     """

@@ -88,7 +88,6 @@ class Study(ABC, Generic[Place]):
     """What to run, and the state of the run.
 
     Args:
-        sources: scene files.
         base: settings of all cells.
         seconds: of training, None: the preset's epochs.
         jobs: workers; 0: one per core, one on a GPU.
@@ -197,14 +196,11 @@ class Study(ABC, Generic[Place]):
         """Train on the views and measure.
 
         Args:
-            scene, settings, seed: of the cell.
             traced: fingerprints of the training views' pictures.
             coarse: the model that step 2 starts from.
             bases: fingerprints of base images by split and view; {} where none are read.
-            label: in messages, after the scene.
             network, full_step1: of `CellTask`.
             spp: of the training views' pictures, None: the settings'.
-            picture: whether a test view is kept.
         """
         views, seconds = (list(traced), self.seconds) if network else ([], None)
         model, step2 = settings.model.model_dump(mode="json"), settings.finetune.step2.model_dump(mode="json")
