@@ -195,9 +195,9 @@ def _is_ours(root: Path) -> bool:
     return not names or "manifest.json.damaged" in names
 
 
-def find_workspace(explicit: str | None, folder: Path | None = None) -> Path:
+def find_workspace(explicit: str | None) -> Path:
     """-w, else DNRPIPE_WORKSPACE, else the folder we stand in, else the only ``*.dnr`` here."""
-    folder = folder or Path.cwd()
+    folder = Path.cwd()
     named = explicit or os.environ.get("DNRPIPE_WORKSPACE")
     if named:
         return Path(named)

@@ -99,8 +99,9 @@ class Run:
         fields = {"seconds", "cpu_seconds", "peak_mb", "spp", "noise"}
 
         def book(task: dict[str, Any], result: dict[str, Any], workers: int) -> None:
+            held_out = self.purpose == "training" and Path(task["output"]).parent.name.endswith("test")
             self.book(
-                purpose or self._purpose(task),
+                purpose or ("evaluation" if held_out else self.purpose),
                 "view",
                 task_name(task) if folder is None else f"{folder}/{task['view']['name']}",
                 device=device,
@@ -112,10 +113,6 @@ class Run:
             )
 
         return book
-
-    def _purpose(self, task: dict[str, Any]) -> Purpose:
-        held_out = Path(task["output"]).parent.name.endswith("test")
-        return "evaluation" if held_out and self.purpose == "training" else self.purpose
 
     def view_tasks(
         self,
