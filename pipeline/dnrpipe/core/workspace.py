@@ -180,7 +180,6 @@ class Workspace:
             raise DamagedManifest(f"{path}: damaged ({reason}); run `dnrpipe prepare SCENE` again") from None
 
     def save(self) -> None:
-        """Write the manifest atomically."""
         write_json(self.root / "manifest.json", self.manifest.model_dump(mode="json", by_alias=True))
 
     def finish_stage(self, name: str, **facts: Any) -> None:

@@ -72,7 +72,6 @@ class EffectPlan(Strict):
         return self.effect(name).on
 
     def effect(self, name: EffectName) -> Effect:
-        """The row of an effect."""
         return next(effect for effect in self.effects if effect.name == name)
 
     @property

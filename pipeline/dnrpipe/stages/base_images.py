@@ -64,12 +64,10 @@ class BaseRenderer:
 
 
 def base_path(workspace: Workspace, split: str, name: str) -> Path:
-    """``base/<split>/<view>.exr``."""
     return workspace.root / "base" / split / f"{name}.exr"
 
 
 def light_path(workspace: Workspace) -> Path:
-    """The baked light of the scene."""
     return workspace.root / "base" / "light.npz"
 
 

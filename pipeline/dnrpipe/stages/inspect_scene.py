@@ -41,7 +41,6 @@ class Inspection:
     effects: tuple[Effect, ...]
 
     def findings(self, kind: FindingKind) -> list[Finding]:
-        """The findings of a kind."""
         return [finding for finding in self.census.findings if finding.kind == kind]
 
     def data(self) -> dict[str, Any]:

@@ -293,7 +293,6 @@ class StageStatus:
 
 
 def status(workspace: Workspace, settings: Settings) -> list[StageStatus]:
-    """One row per stage."""
     rows = []
     for stage in STAGES.values():
         present, wanted = stage.progress(workspace, settings)

@@ -92,7 +92,6 @@ class TaskTimeout:
         return usual * (1 if attempt == 1 else 2)
 
     def took(self, seconds: float) -> None:
-        """A task ended after so many seconds."""
         self.longest = max(seconds, self.longest)
 
     def reason(self) -> str:

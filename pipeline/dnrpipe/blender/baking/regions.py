@@ -190,7 +190,6 @@ class Atlas:
         return self._parts.get(material, [])
 
     def region(self, material: str) -> Region:
-        """The material's texels."""
         if material not in self._regions:
             stacked = [part.mesh.atlas[part.corners] for part in self.parts(material)]
             corners = np.concatenate(stacked) if stacked else np.zeros((0, 2), np.float32)

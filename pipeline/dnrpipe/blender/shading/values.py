@@ -122,7 +122,6 @@ class Evaluator:
         self.note("approximated", feature, text)
 
     def note(self, kind: Any, feature: str, text: str) -> None:
-        """Record a finding for this material."""
         self.findings.add(kind, feature, text, material=self.material)
 
     def _value(self, socket: Any, scope: Scope) -> Value:

@@ -149,7 +149,6 @@ class Study(ABC, Generic[Place]):
         """Prepare all scenes and trace their references."""
 
     def run_seed(self, seed: int) -> None:
-        """Make the seed's cells."""
         self.plan_cells(seed)
         tasks = [task for task in self.cells.values() if task.seed == seed]
         self.worker_pool.work(f"cells, seed {seed}", CELL_WORKER, tasks)

@@ -31,7 +31,6 @@ class Record(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     def data(self) -> dict[str, Any]:
-        """As it stands in a file."""
         return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
 
 

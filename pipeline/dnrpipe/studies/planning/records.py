@@ -247,7 +247,6 @@ class Plan(Record):
     actual: Actual | None = None
 
     def data(self) -> dict[str, Any]:
-        """As it stands in the file."""
         return self.model_dump(mode="json", by_alias=True, exclude=set(OPTIONAL - self.model_fields_set))
 
 
@@ -263,5 +262,4 @@ def read_plan(root: Path) -> Plan | None:
 
 
 def write_plan(root: Path, plan: Plan) -> None:
-    """Write ``plan/plan.json``, atomically."""
     write_json(root / FOLDER / "plan.json", plan.data())
