@@ -304,12 +304,16 @@ class LocalWorker:
 def _exit_reason(process: subprocess.Popen[str]) -> str:
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(timeout=5)
-    code = process.returncode
-    if code is not None and code < 0:
-        with contextlib.suppress(ValueError):
-            guess = " (out of memory?)" if -code == signal.SIGKILL else ""
-            return f"worker was killed by {signal.Signals(-code).name}{guess}"
-    return f"worker ended with exit code {code}"
+    guess = " (out of memory?)" if process.returncode == -signal.SIGKILL else ""
+    return f"worker {how_ended(process.returncode)}{guess}"
+
+
+def how_ended(code: int | None) -> str:
+    """``was killed by SIGKILL``, ``ended with exit code 3``."""
+    if code is None or code >= 0:
+        return f"ended with exit code {code}"
+    names = {int(one): one.name for one in signal.Signals}
+    return f"was killed by {names.get(-code, f'signal {-code}')}"
 
 
 def die_with_parent(parent: int) -> None:
