@@ -89,6 +89,7 @@ def build() -> None:
 def prepare(folder: Path) -> None:
     import bpy
 
+    from dnrpipe.blender.baking.pending import convert_materials
     from dnrpipe.blender.bundle.export import export_bundle
     from dnrpipe.blender.geometry.atlas import build_atlas
     from dnrpipe.blender.geometry.freeze import freeze_scene
@@ -98,7 +99,7 @@ def prepare(folder: Path) -> None:
     build()
     frozen = freeze_scene(bpy.context.scene)
     atlas = build_atlas(frozen.meshes)
-    materials = export_bundle(frozen.meshes, folder, frozen.findings)
+    materials = export_bundle(frozen.meshes, convert_materials(frozen.meshes, folder, frozen.findings, None))
     add_gbuffer_scene(frozen.meshes, {name: converted.opacity for name, converted in materials.items()})
     save_blend(folder / "source.blend")
     meshes = {mesh.name: [mesh.triangles, len(mesh.copies), mesh.object_id] for mesh in frozen.meshes}

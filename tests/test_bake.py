@@ -16,6 +16,7 @@ from mathutils import Euler, Matrix  # noqa: E402
 from dnrpipe.blender.baking import bake as baking  # noqa: E402
 from dnrpipe.blender.baking.cache import BakeCache  # noqa: E402
 from dnrpipe.blender.baking.mesh import object_positions, object_random  # noqa: E402
+from dnrpipe.blender.baking.regions import Atlas  # noqa: E402
 from dnrpipe.blender.findings import Findings  # noqa: E402
 from dnrpipe.blender.geometry.atlas import build_atlas  # noqa: E402
 from dnrpipe.blender.geometry.freeze import freeze_scene  # noqa: E402
@@ -86,7 +87,7 @@ class Bench:
     def __init__(self, meshes: list[FrozenMesh], folder: Path) -> None:
         self.meshes, self.folder = meshes, folder
         folder.mkdir(exist_ok=True)
-        self.book = BakeCache.open(meshes, folder, SIZE)
+        self.book = BakeCache(Atlas(meshes, SIZE), folder)
 
     def evaluator(self, material: Any) -> tuple[Evaluator, Findings]:
         findings = Findings()
@@ -107,7 +108,7 @@ class Bench:
         worker = baking.Worker(common)
         for layer in self.book.layers():
             worker(BakeTask(layer=tuple(layer), output=self.folder).data())
-        self.book = BakeCache.open(self.meshes, self.folder, SIZE)
+        self.book = BakeCache(Atlas(self.meshes, SIZE), self.folder)
 
     def baked(self, name: str, socket: str, kind: str) -> np.ndarray:
         """The baked value [N, C] of a Principled socket; bakes first where it is missing."""
@@ -227,12 +228,12 @@ def test_cached_by_content(tmp_path: Path) -> None:
     edited.node_tree.nodes["Noise Texture"].inputs["Scale"].default_value = 3.0
     edited.node_tree.nodes["Noise Texture"].location.x += 50
     kept.node_tree.nodes["Noise Texture"].location.x += 50
-    again = BakeCache.open(bench.meshes, bench.folder, SIZE)
+    again = BakeCache(Atlas(bench.meshes, SIZE), bench.folder)
     again.value("kept", "colour", source_of(kept), "Base Color", Findings())
     assert not again.missing
     again.value("edited", "colour", source_of(edited), "Base Color", Findings())
     assert [material for material, _ in again.missing.values()] == ["edited"]
-    refused = BakeCache.open(bench.meshes, bench.folder, SIZE, list(again.missing))
+    refused = BakeCache(Atlas(bench.meshes, SIZE), bench.folder, frozenset(again.missing))
     findings = Findings()
     value = Evaluator("edited", ImageReader(findings), findings, refused).colour(
         source_of(edited).socket.links[0].to_socket
@@ -350,7 +351,7 @@ def test_bake_processes_fill_the_cache_and_name_what_failed(tmp_path: Path) -> N
     meshes = scene_of(material_of("m", lambda tree: add_node(tree, "TexNoise").outputs["Fac"]))
     source, geometry = tmp_path / "scene.blend", tmp_path / "geometry.npz"
     workspace = Workspace.create(tmp_path / "w.dnr", Source(path=str(source), sha256="0"))
-    book = BakeCache.open(meshes, workspace.root / BAKES, SIZE)
+    book = BakeCache(Atlas(meshes, SIZE), workspace.root / BAKES)
     book.value("m", "colour", source_of(bpy.data.materials["m"]), "Base Color", Findings())
     bpy.ops.wm.save_as_mainfile(filepath=str(source))
     save_geometry(geometry, meshes)

@@ -136,7 +136,7 @@ def test_samples_that_are_not_finite_are_counted(
     assert (baker.lost > 0, renderer.repaired > 0, renderer.masked > 0) == (lost, repaired, masked)
     assert renderer.repaired + renderer.masked < SIZE * SIZE
     assert np.isfinite(BaseRenderer(mi, scene, light, 1).frame(camera())["base.R"]).all()
-    mapper = SurfaceMapper(mi, scene)
+    mapper = SurfaceMapper(mi, scene, None)
     assert all(np.isfinite(values).all() for values in mapper.maps(16, 4, 0).values())
     assert (mapper.lost > 0) == (name == "floor.bsdf.reflectance.value")
 

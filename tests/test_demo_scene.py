@@ -11,6 +11,7 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
+from dnrpipe.blender.baking.pending import convert_materials  # noqa: E402
 from dnrpipe.blender.bundle.display import export_display  # noqa: E402
 from dnrpipe.blender.bundle.export import bounding_sphere, export_bundle  # noqa: E402
 from dnrpipe.blender.census import take_census  # noqa: E402
@@ -43,7 +44,7 @@ def test_has_what_a_demo_needs(tmp_path: Path) -> None:
     assert export_display(scene, tmp_path)["display_lut"] is None
     center, radius = bounding_sphere(meshes)
     assert radius < 2.1 and np.hypot(center[0], center[1]) < 0.1
-    export_bundle(meshes, tmp_path, findings)
+    export_bundle(meshes, convert_materials(meshes, tmp_path, findings, None))
     # Nothing in it is beyond the converter: rough metal's energy is made up for, no more.
     assert {(f.kind, f.feature) for f in findings} <= {("approximated", "rough metal")}
 

@@ -15,6 +15,7 @@ import pytest
 
 bpy = pytest.importorskip("bpy")
 
+from dnrpipe.blender.baking.pending import convert_materials  # noqa: E402
 from dnrpipe.blender.bundle.display import (  # noqa: E402
     LUT_K,
     LUT_MAX,
@@ -165,7 +166,8 @@ def hdri(rotation: Rgb = (0, 0, 0), kind: str = "POINT", strength: float = 1.0) 
 
 def export(folder: Path) -> Findings:
     findings = Findings()
-    export_bundle(freeze_scene(bpy.context.scene).meshes, folder, findings)
+    meshes = freeze_scene(bpy.context.scene).meshes
+    export_bundle(meshes, convert_materials(meshes, folder, findings, None))
     return findings
 
 

@@ -97,8 +97,6 @@ class ModelRecord(Record):
         run: fingerprint of the run, settings included.
         selected, policy, budget, details, gains, why: step 1's choice, see `Selection`.
         choosing: wall and process seconds of that choice: ``seconds``, ``cpu_seconds``.
-        views: the views of step 2.
-        perceptual: whether step 2 had the perceptual loss.
     """
 
     model: dict[str, Any]

@@ -211,7 +211,6 @@ class EpochBook:
         return {name: total / self.counts[name] for name, total in self.sums.items()}
 
     def entry(self, epoch: int, rate: float, val: dict[str, float]) -> Epoch:
-        """The epoch's line of the history."""
         return Epoch(
             epoch=epoch,
             losses=self.means(),

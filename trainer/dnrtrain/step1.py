@@ -57,10 +57,8 @@ def run_step1(
         policy: a name of ``selector.names``.
         budget: M, the number of views to select, 1 <= M <= N.
         seed: of weights, of the order of steps, of the agent's dice.
-        device: torch's.
         checkpoints: this step's own folder. A run that was interrupted there with the same fingerprint
             and settings is continued after its last whole epoch, a finished one answers at once.
-        fingerprint: of the caller's inputs.
         choice: what a policy without training has chosen. None: it is asked here, and knows the cameras only.
 
     Raises:

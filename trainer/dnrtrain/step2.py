@@ -44,11 +44,8 @@ def run_step2(
         views: the M selected views, targets = ray-traced images.
         val: views with held-out targets, or None.
         coarse: folder of the finished step 1; with ``start = fresh`` it is not read.
-        model: of the renderer.
         seed: of new weights, of the order of steps, of patches and flips.
-        device: torch's.
         checkpoints: this step's own folder; see `run_step1` on resuming.
-        fingerprint: of the caller's inputs.
         weights: from ``weights.load_weights``; None drops L_p with a note, and the record says
             ``"perceptual": false``.
         preview: a view to show now and then while training goes on. It changes nothing of what is trained.

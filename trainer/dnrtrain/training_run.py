@@ -34,7 +34,6 @@ class TrainingRun(ABC, Generic[Settings]):
         val: validation views with targets, or None.
         run: fingerprint of the run; only a checkpoint of the same run is continued.
         folder: where checkpoints and the model go.
-        device: torch's.
         average: of the weights, where that becomes the model.
         preview: decides after which epochs to show a view.
         notes: what the caller should be told before training.

@@ -28,7 +28,6 @@ class Walker:
 
     Args:
         run: the training of the renderer on all candidates, which it is part of.
-        candidates: their cameras.
         budget: views of an episode.
     """
 
@@ -60,7 +59,6 @@ class Walker:
             episode: zero-based, of the epoch.
             train_view: one DNR step on a view -> (its loss before the step, T of the view).
             rate: learning rate of the last step.
-            book: takes the agent's terms.
         """
         s, agent = self.settings, self.agent
         random = step_random(self.seed, STEP1, epoch, episode)

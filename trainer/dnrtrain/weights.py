@@ -49,7 +49,6 @@ class WeightsMissing(RuntimeError):
 
 
 def cache_folder(cache_dir: Path | None = None) -> Path:
-    """Where weights are cached."""
     base = cache_dir or os.environ.get("DNRPIPE_CACHE") or Path.home() / ".cache" / "dnrpipe"
     return Path(base) / "weights"
 

@@ -19,7 +19,7 @@ from .geometry.frozen import FrozenMesh
 from .lighting.lights import visible_lights
 from .reading.missing import SHAPELESS_IMAGES
 from .reading.names import find_material
-from .settings_left_out import moving_objects, note_settings
+from .settings_left_out import moving_objects, settings_left_out
 from .shading.sockets import find_input, resolve, surface_source, walk
 
 NAMES_PER_MATERIAL = 8  # objects listed as examples for each material
@@ -37,7 +37,8 @@ def take_census(scene: bpy.types.Scene, findings: Findings, meshes: Sequence[Fro
     users = _users(meshes)
     found = {name: find_material(name) for name in sorted(filter(None, users))}
     described = {name: describe_material(material, users[name]) for name, material in found.items() if material}
-    note_settings(scene, findings)
+    for finding in settings_left_out(scene):
+        findings.add(*finding)
     volumes = sorted(obj.name for obj in scene.objects if obj.type == "VOLUME" and not obj.hide_render)
     return Census(
         scene=scene.name,

@@ -43,6 +43,6 @@ def inspect(task: InspectTask) -> InspectAnswer:
     census = take_census(loaded.scene, findings, meshes)
     # What would be baked is in the findings; placeholders stand for it in the bundle.
     bakes = BakeOptions(folder=task.folder / "bakes", size=task.bake_size)
-    export_bundle(meshes, task.folder, findings, convert_materials(meshes, task.folder, findings, bakes))
+    export_bundle(meshes, convert_materials(meshes, task.folder, findings, bakes))
     census = census.model_copy(update={"findings": list(findings)})
     return InspectAnswer(census=census, warnings=loaded.warnings)

@@ -57,7 +57,7 @@ def prepare(
     pending = missing_bakes(converter, frozen.meshes, atlas, scene_dir, scene.frame_current)
     if pending is not None:
         return pending
-    materials = export_bundle(frozen.meshes, scene_dir, findings, converter)
+    materials = export_bundle(frozen.meshes, converter)
     census = census.model_copy(update={"findings": list(findings)})
     radius = loaded.bounds.radius
     # near and far are placeholders for a camera at four radii; camera placement replaces them.

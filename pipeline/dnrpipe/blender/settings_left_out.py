@@ -7,7 +7,6 @@ from typing import Any
 
 import bpy
 
-from .findings import Findings
 from .geometry.freeze import render_layer
 from .lighting.lights import is_portal
 
@@ -22,13 +21,8 @@ LAYER_SWITCHES = {
 }
 
 
-def note_settings(scene: bpy.types.Scene, findings: Findings) -> None:
-    """Record what the conversion leaves out of the scene's render settings."""
-    for kind, feature, note in _settings(scene):
-        findings.add(kind, feature, note)
-
-
-def _settings(scene: bpy.types.Scene) -> Iterator[tuple[Any, str, str]]:
+def settings_left_out(scene: bpy.types.Scene) -> Iterator[tuple[Any, str, str]]:
+    """(kind, feature, note) of findings on what the conversion leaves out of the scene's render settings."""
     render: Any = scene.render
     layer = render_layer(scene)
     if render.pixel_aspect_x != render.pixel_aspect_y:

@@ -9,23 +9,11 @@ Seconds are wall-clock, ``cpu_seconds`` of the process. A ``fingerprint`` is a h
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal, TypedDict
-
-from pydantic import BaseModel, ConfigDict
+from typing import Literal, TypedDict
 
 from dnrpipe.core.scene_records import Census, SceneRecord
+from dnrpipe.raytrace.tasks import Task
 from dnrtrain.contract import View
-
-
-class Task(BaseModel):
-    """Unknown keys are ignored."""
-
-    model_config = ConfigDict(frozen=True)
-
-    def data(self) -> dict[str, Any]:
-        """The task as JSON-able values."""
-        return self.model_dump(mode="json")
-
 
 # -- prepare, inspection: a scene file -> scene/, or what is in it ----------------------------------------------
 
@@ -159,21 +147,6 @@ class PassesTask(Task):
     output: Path
     raster: bool
     fingerprint: str
-
-
-class FrameCosts(TypedDict):
-    """What one frame took in its process. peak_mb: memory of the process so far."""
-
-    seconds: float
-    cpu_seconds: float
-    peak_mb: float
-
-
-class FrameFailure(TypedDict):
-    """Why a frame could not be rendered. input: the scene is at fault."""
-
-    error: str
-    input: bool
 
 
 class PassesHeader(TypedDict):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,11 @@ def flip_error(truth: np.ndarray, prediction: np.ndarray) -> tuple[float, np.nda
         np.ascontiguousarray(truth, np.float32), np.ascontiguousarray(prediction, np.float32), "LDR"
     )
     return float(mean), np.asarray(heat)
+
+
+def picture_of(tensor: Any) -> np.ndarray:
+    """Display-space RGB, torch [3, H, W], as float32 [H, W, 3] in [0, 1]."""
+    return tensor.float().clamp(0, 1).permute(1, 2, 0).cpu().numpy()
 
 
 def write_png(path: Path, image: np.ndarray) -> None:

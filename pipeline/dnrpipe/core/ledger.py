@@ -36,14 +36,11 @@ class CostRecord(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
 
     Args:
         time: unix seconds when it ended.
-        run: id of the command that did it.
         name: what it was, e.g. ``train/0007`` or ``epoch 3``.
         seconds: wall clock.
         cpu_seconds: of the process.
         workers: how many such units ran side by side.
         width, height: pixels.
-        spp: samples per pixel.
-        steps: optimiser steps.
         peak_mb: peak memory, MiB.
         noise: estimated relative error of the ray-traced view.
         cache_hit: the result was found, not computed; ``seconds`` is then what the look-up took.
@@ -327,11 +324,9 @@ class RaytracedSum(Strict):
     """The ray-traced views of one purpose.
 
     Args:
-        views: how many.
         spp: all numbers of samples per pixel that they have.
         seconds_per_view: mean, on one worker.
         slowest_view_seconds: on one worker.
-        wall_seconds: of all of them.
         noise: mean estimated relative error; None where it is unknown.
     """
 
@@ -351,7 +346,6 @@ class CostSummary(Strict):
         raytraced: by purpose.
         tracing_all: None without ray-traced training views, or where the candidates are not known.
         runs: how many commands have booked something.
-        devices: all that they ran on.
         torn_lines: truncated records, whose seconds are not counted.
     """
 
@@ -376,10 +370,8 @@ def summarise(
     """Sum up a ledger.
 
     Args:
-        records: of the ledger.
         n_candidates: number of candidate views; without it ``tracing_all`` is None.
         only: names of the training views that count as chosen (``train/0007``); None = all in the ledger.
-        truncated_records: of the ledger.
     """
     stages = total_by("stage", records)
     traced = {p: traced_views(records, p, only if p == "training" else None) for p in get_args(Purpose)}

@@ -48,7 +48,6 @@ class SceneCamera(SceneRecord):
         sensor_fit: "AUTO", "HORIZONTAL" or "VERTICAL".
         shift_x, shift_y: of the longer side of the image, or of the side that ``sensor_fit`` names.
         clip_start, clip_end, ortho_scale: scene units.
-        dof: its lens where it has depth of field.
     """
 
     frame: int | None = None
@@ -80,7 +79,6 @@ class Surroundings(SceneRecord):
 
     Args:
         enclosed: share of all directions in which it meets a surface; of an animated camera the mean over its path.
-        moves: whether the camera is animated.
         standpoints: in free air around its place or beside its path, in random order.
     """
 
@@ -94,7 +92,6 @@ class AtlasFacts(SceneRecord):
 
     Args:
         method: "smart" (Blender's Smart UV Project) or "charts" (planar ones).
-        seconds: that it took.
         occupancy: covered texels, of all.
         overlap: texels whose centre lies in more than one triangle, of the covered ones.
         triangles_without_texel: triangles that hold no texel's centre, of all.
@@ -123,7 +120,6 @@ class SceneSummary(SceneRecord):
         has_light: whether the file brought light of its own.
         bake_size: texels of a baked texture's side; None where nothing is baked.
         external: SHA-256 of each file that the scene refers to, or "missing", by path.
-        warnings: lines for the user.
     """
 
     bounds: Bounds
@@ -201,7 +197,6 @@ class LightFacts(SceneRecord):
         type: "POINT", "SPOT", "SUN" or "AREA".
         power: watts (a sun: W/m²), exposure included.
         color: linear Rec.709.
-        shape: of an area lamp.
         size: of an area lamp width and height, of a sun its angle in radians, of others the radius; scene units.
     """
 
@@ -242,7 +237,6 @@ class Census(SceneRecord):
         blender, file_version: of the program that converted it; of the one that saved the file.
         objects: how many of each Blender type.
         triangles: that rays can hit, instances included; ``triangles_by_object``: of one instance.
-        default_material: objects with no material.
         procedural_textures, transparency, …, view_dependent_nodes: names of the materials that have them.
         volumes: names of volume objects and of materials with a volume.
         hair, depth_of_field, motion: names of objects with hair, of cameras with depth of field, of objects that

@@ -58,13 +58,7 @@ class StageRecord(BaseModel, extra="forbid"):
 
 
 class PrepareDetail(BaseModel, strict=True):
-    """What stage `prepare` tells of itself.
-
-    Args:
-        raster_engine, raster_reason: what draws rasterised colour, and why.
-        views: how many, by split.
-        triangles: of the scene.
-    """
+    """What stage `prepare` tells of itself."""
 
     raster_engine: str = ""
     raster_reason: str = ""
@@ -186,7 +180,6 @@ class Workspace:
             raise DamagedManifest(f"{path}: damaged ({reason}); run `dnrpipe prepare SCENE` again") from None
 
     def save(self) -> None:
-        """Write the manifest atomically."""
         write_json(self.root / "manifest.json", self.manifest.model_dump(mode="json", by_alias=True))
 
     def finish_stage(self, name: str, **facts: Any) -> None:
@@ -201,9 +194,9 @@ def _is_ours(root: Path) -> bool:
     return not names or "manifest.json.damaged" in names
 
 
-def find_workspace(explicit: str | None, folder: Path | None = None) -> Path:
+def find_workspace(explicit: str | None) -> Path:
     """-w, else DNRPIPE_WORKSPACE, else the folder we stand in, else the only ``*.dnr`` here."""
-    folder = folder or Path.cwd()
+    folder = Path.cwd()
     named = explicit or os.environ.get("DNRPIPE_WORKSPACE")
     if named:
         return Path(named)

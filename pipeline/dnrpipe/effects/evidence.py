@@ -49,9 +49,14 @@ def gather(census: Census, bundle: Mapping[str, Sequence[str]], lenses: Sequence
     materials = census.materials
     frozen = f"asked for, but the scene is frozen: {_list([repr(name) for name in census.motion])}"
     motion = (frozen,) if census.motion else ()
+    refracting = _where(materials, lambda m: m.refractive, lambda m: f"index {m.ior:.3g}" if m.ior else "")
     result: dict[EffectName, Evidence] = {
         "indirect": _indirect(census),
-        "refraction": _held(bundle, "refraction", _where(materials, lambda m: m.refractive, _with_ior)),
+        "refraction": _held(
+            bundle,
+            "refraction",
+            refracting,
+        ),
         "caustics": _caustics(materials, bundle),
         "volumes": _held(bundle, "volumes", _volumes(census)),
         "subsurface": _held(bundle, "subsurface", _where(materials, lambda m: m.subsurface)),
@@ -62,7 +67,7 @@ def gather(census: Census, bundle: Mapping[str, Sequence[str]], lenses: Sequence
         "glow": _held(bundle, "glow", _where(materials, lambda m: m.emissive)),
         "hair": _held(bundle, "hair", tuple(f"'{name}'" for name in census.hair)),
         "depth-of-field": _lenses(census, lenses),
-        "spectral": _spectral(materials),
+        "spectral": _held({}, "spectral", _where(materials, lambda m: m.thin_film)),
         "motion": Evidence(False, False, motion),
     }
     shiny = [f"'{n}'" for n, m in materials.items() if m.glossy or m.transmissive or m.view_dependent]
@@ -103,10 +108,6 @@ def _where(
 def _list(names: Sequence[str]) -> str:
     more = len(names) - LISTED
     return ", ".join(names[:LISTED]) + (f" and {more} more" if more > 0 else "")
-
-
-def _with_ior(entry: MaterialFacts) -> str:
-    return f"index {entry.ior:.3g}" if entry.ior else ""
 
 
 def _with_roughness(entry: MaterialFacts) -> str:
@@ -172,8 +173,3 @@ def _lenses(census: Census, lenses: Sequence[str]) -> Evidence:
         return Evidence(False, False)
     named = _list([repr(name) for name in census.depth_of_field])
     return Evidence(False, False, (f"camera {named} has it, but the views in use are not its own",))
-
-
-def _spectral(materials: Mapping[str, MaterialFacts]) -> Evidence:
-    films = _where(materials, lambda m: m.thin_film)
-    return Evidence(False, False, ("not in the converted scene, see `dnrpipe inspect`", *films) if films else ())

@@ -72,7 +72,6 @@ class EffectPlan(Strict):
         return self.effect(name).on
 
     def effect(self, name: EffectName) -> Effect:
-        """The row of an effect."""
         return next(effect for effect in self.effects if effect.name == name)
 
     @property
@@ -105,7 +104,6 @@ def plan_effects(
         enable, disable: the user's overrides; ``disable`` wins.
         max_depth: the user's path depth, or "auto": the pilot's.
         lenses: names of the cameras in use that have depth of field.
-        pilot: outcome of the depth pilot, where it has run.
     """
     evidence = gather(census, bundle, lenses)
     depth, depth_by = _depth(evidence, enable, disable, max_depth, pilot)

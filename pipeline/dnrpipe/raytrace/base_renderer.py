@@ -46,7 +46,6 @@ class BaseRenderer:
 
     Args:
         mi: the mitsuba module, a jit variant set.
-        scene: the scene.
         light: E and S of the front and of the back, float32 [2, 2, size, size, 3], row 0 at V = 0.
         samples: K, rays per pixel.
 
@@ -107,13 +106,10 @@ class BaseRenderer:
         A pixel's samples lie side by side; the first goes through the pixel's centre.
 
         Args:
-            scene: the scene.
             light: E and S, a texture of six channels for the front and one for the back.
             tables: places within a tile, steps of the random numbers.
             axes: the camera's axes and its place, columns of c2w.
             film: fl_x, fl_y, cx, cy in pixels.
-            start: the first row.
-            width, height: the size of the band.
         """
         import drjit as dr
 

@@ -69,6 +69,13 @@ def filled(light: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.where(valid[..., None], light, _pull_push(light * weight, weight)).astype(np.float32)
 
 
+def filled_map(values: np.ndarray, texels: np.ndarray, size: int) -> np.ndarray:
+    """[size, size, C] of the texels' values [T, C], the rest made up by `filled`. texels: their numbers [T]."""
+    valid, image = np.zeros(size * size, bool), np.zeros((size * size, values.shape[1]), np.float32)
+    valid[texels], image[texels] = True, values
+    return filled(image.reshape(size, size, -1), valid.reshape(size, size))
+
+
 def _pull_push(total: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """Means of the valid texels, where there are none those of the next coarser level. ``total`` is weighted."""
     known = weight > 0

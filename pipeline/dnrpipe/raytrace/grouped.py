@@ -25,7 +25,6 @@ class GroupedSensor:
     """A view as Mitsuba sensor that renders several groups at once.
 
     Args:
-        engine, bundle: the scene.
         view: in scene units.
         lens: see `sensors.sensor_dict`.
     """
@@ -53,7 +52,6 @@ class GroupedSensor:
         """(means of the groups, float64 [G, H, W, 4], linear Rec.709, premultiplied; number of kernel launches).
 
         Args:
-            integrator: a Mitsuba integrator.
             samples: per pixel, in each group.
             seed: of the view, 18 bits.
             first: number of launches of this view so far.

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from .denoise import denoise, filled
+from .denoise import denoise, filled_map
 from .lobes import (
     bsdfs_of,
     diffuse_context,
@@ -49,7 +49,6 @@ class LightBaker:
 
     Args:
         mi: the mitsuba module, a jit variant set.
-        scene: the scene.
         integrator: continues paths from their first bounce on; emitters that it meets first must be hidden. None:
             direct light alone.
         groups: see `texels.AtlasSurface`.
@@ -119,13 +118,7 @@ class LightBaker:
         if not found.any():
             return np.zeros((size, size, 3), np.float32)
         mean = np.divide(total[found], weight[found], out=np.zeros_like(total[found]), where=weight[found] > least)
-        valid = np.zeros(size * size, bool)
-        valid[texels[found]] = True
-        images = []
-        for values in (mean, *(guide[found] for guide in guides)):
-            image = np.zeros((size * size, 3), np.float32)
-            image[texels[found]] = values
-            images.append(filled(image.reshape(size, size, 3), valid.reshape(size, size)))
+        images = [filled_map(values, texels[found], size) for values in (mean, *(guide[found] for guide in guides))]
         return denoise(images[0], images[1], images[2], threads=1)
 
     def _traced(self, sample: Any, texels: np.ndarray, size: int, spp: int, seed: int, side: int) -> np.ndarray:

@@ -75,10 +75,8 @@ class SpecularPaths:
         """One sample along each ray -> the values that `base_renderer` names by LOST, MEANS and CENTRES, in that order.
 
         Args:
-            scene: the scene.
             light: E and S of the front and of the back, two textures of six channels.
             steps: of the random numbers, ``self.steps``.
-            ray: camera rays.
             forward: where the camera looks, in world space.
             number: the samples' places in the sequence.
         """
@@ -250,9 +248,7 @@ class SpecularPaths:
         """Where the paths go on -> (BSDF sample, its weight, which paths go on, which were split by glass).
 
         Args:
-            bsdf, si: the surfaces.
             number: the samples' places in the sequence.
-            u: random numbers.
             met: paths that are at a surface.
             active: those of them whose BSDF splits into lobes.
             unforked: paths that have met no glass yet.

@@ -12,10 +12,10 @@ import numpy as np
 
 from dnrtrain.atomic import atomic_path
 
-from .denoise import filled
+from .denoise import filled_map
 from .engine import BundleWorker
 from .lightmap import LightBaker
-from .lobes import diffuse_context, lets_through, reflectance
+from .lobes import diffuse_context, reflectance
 from .tasks import SurfaceAnswer, SurfaceTask
 from .texels import grouped_meshes
 
@@ -33,7 +33,7 @@ class Worker(BundleWorker):
 
     def __call__(self, task: dict[str, Any]) -> SurfaceAnswer:
         asked = SurfaceTask.model_validate(task)
-        mapper = SurfaceMapper(self.engine.mi, self.engine.scenes[str(self.bundle)], grouped_meshes(self.bundle))
+        mapper = SurfaceMapper(self.engine.mi, self.engine.scenes[str(self.bundle)], None, grouped_meshes(self.bundle))
         maps = mapper.maps(asked.size, asked.samples, asked.seed)
         with atomic_path(asked.output) as temporary, temporary.open("wb") as file:
             np.savez(file, **maps)  # pyright: ignore[reportArgumentType]
@@ -42,10 +42,6 @@ class Worker(BundleWorker):
 
 class SurfaceMapper(LightBaker):
     """Maps of one scene's surfaces; finds its points as the light's baker does."""
-
-    def __init__(self, mi: Any, scene: Any, groups: Any = ()) -> None:
-        super().__init__(mi, scene, None, groups)
-        self.holes = lets_through(mi, scene)
 
     def maps(self, size: int, samples: int, seed: int) -> dict[str, np.ndarray]:
         """The maps that `Worker` writes. samples: points per texel."""
@@ -60,11 +56,7 @@ class SurfaceMapper(LightBaker):
         if not self.surface.count:
             return found
         texels, _, normal, thin = self.occupied(size)
-        everywhere = np.zeros(size * size, bool)
-        everywhere[texels] = True
-        image = np.zeros((size * size, 3), np.float32)
-        image[texels] = normal
-        found["normal"] = filled(image.reshape(size, size, 3), everywhere.reshape(size, size))
+        found["normal"] = filled_map(normal, texels, size)
         found["thin"] = np.array(bool(thin.any()))
         for number, side in enumerate((1, -1)):
             chosen = texels if side > 0 else texels[thin]
@@ -75,16 +67,12 @@ class SurfaceMapper(LightBaker):
             self.lost += round(float(sums[:, 8].sum(dtype=np.float64)))
             mean = np.divide(sums[:, :7], count, out=np.zeros_like(sums[:, :7]), where=count > 0)
             met = count[:, 0] > 0
-            valid = np.zeros(size * size, bool)
-            valid[chosen[met]] = True
-            for name, columns in (("albedo", slice(0, 3)), ("emission", slice(3, 6)), ("opacity", slice(6, 7))):
-                values = np.zeros((size * size, 3), np.float32)
-                values[chosen[met]] = mean[met, columns]
-                whole = filled(values.reshape(size, size, 3), valid.reshape(size, size)) if met.any() else None
-                if name != "opacity" and whole is not None:
-                    found[name][number] = whole
-                elif side > 0 and whole is not None:
-                    found[name] = whole[..., 0]
+            if not met.any():
+                continue
+            whole = filled_map(mean[met], chosen[met], size)
+            found["albedo"][number], found["emission"][number] = whole[..., :3], whole[..., 3:6]
+            if side > 0:
+                found["opacity"] = whole[..., 6]
         return found
 
     def _properties(self, sampler: Any, uv: Any, side: int) -> list[Any]:
@@ -98,7 +86,7 @@ class SurfaceMapper(LightBaker):
         emitter = si.emitter(self.scene)
         emission = dr.select(found, emitter.eval(si, found), 0)
         opacity = mi.Float(1.0)
-        if self.holes:
+        if self.passing:
             opacity = 1 - dr.mean(bsdf.eval_null_transmission(si, found))
         fine = found & dr.all(dr.isfinite(rho)) & dr.all(dr.isfinite(emission)) & dr.isfinite(opacity)
         one = mi.Float(1.0)

@@ -1,6 +1,6 @@
 """What the workers of this package are asked, and what they answer.
 
-Tasks travel as JSON: ``TraceTask(...).model_dump(mode="json")``; the worker reads them by ``model_validate``, so that a
+Tasks travel as JSON: ``TraceTask(...).data()``; the worker reads them by ``model_validate``, so that a
 malformed one fails with its name. What all tasks of a worker share (``common``) is sent once, when it starts.
 Answers are dicts as they come, since they go into the ledger and into file headers.
 
@@ -10,6 +10,7 @@ Seconds are wall-clock, ``cpu_seconds`` of the process. A ``fingerprint`` is a h
 from __future__ import annotations
 
 import resource
+import sys
 import time
 from pathlib import Path
 from typing import Any, Literal, NotRequired, TypedDict
@@ -25,6 +26,10 @@ class Task(BaseModel):
     """Unknown keys are ignored."""
 
     model_config = ConfigDict(frozen=True)
+
+    def data(self) -> dict[str, Any]:
+        """The task as JSON-able values."""
+        return self.model_dump(mode="json")
 
 
 class BundleCommon(Task):
@@ -51,7 +56,8 @@ def costs_since(wall: float, cpu: float) -> Costs:
     return {
         "seconds": time.monotonic() - wall,
         "cpu_seconds": time.process_time() - cpu,
-        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        / (1 << 20 if sys.platform == "darwin" else 1 << 10),
     }
 
 

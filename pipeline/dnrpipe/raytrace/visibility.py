@@ -22,11 +22,6 @@ OWN: dict[str, dict[str, Any]] = {
 """Integrators of `paths`."""
 
 
-def glowing_shapes(scene: Any) -> list[Any]:
-    """Shapes of the scene that emit and are not lamps."""
-    return [shape for shape in scene.shapes() if shape.is_emitter() and not shape.id().startswith(LAMP_PREFIX)]
-
-
 def camera_integrator(mi: Any, scene: Any, max_depth: int, kind: str = "path") -> tuple[Any, str]:
     """(integrator, its name for the file's metadata): ``kind``, or ``kind+glow`` where surfaces glow.
 
@@ -46,11 +41,12 @@ def camera_integrator(mi: Any, scene: Any, max_depth: int, kind: str = "path") -
     glow = {"shows_glow": True} if holes and settings["type"] == "dnr_path" else {}
     hidden = mi.load_dict({**settings, **glow, "hide_emitters": True})
     first_visible, found, name = first_visible_of(mi, scene), hidden, kind
-    unseen = any(shape.id().startswith(UNSEEN_PREFIX) for shape in scene.shapes())
-    if glowing_shapes(scene) or unseen:
+    shapes = scene.shapes()
+    glowing = any(shape.is_emitter() and not shape.id().startswith(LAMP_PREFIX) for shape in shapes)
+    if glowing or any(shape.id().startswith(UNSEEN_PREFIX) for shape in shapes):
         shown = mi.load_dict({**settings, "hide_emitters": False})
         found, name = _camera_view(mi, scene, hidden, shown, first_visible), f"{kind}+glow"
-    if has_tinted(scene):
+    if any(str(shape.bsdf()).startswith(TINTED) for shape in shapes):  # light passes straight on, and is coloured
         found = with_tinted_alpha(mi, found, first_visible)
     return found, name
 
@@ -145,11 +141,6 @@ def _camera_view(mi: Any, scene: Any, hidden: Any, shown: Any, first_visible: An
             return total, (front & bounced) | (rest & found), []
 
     return CameraView(mi.Properties("camera_view"))
-
-
-def has_tinted(scene: Any) -> bool:
-    """Whether a surface of the scene passes light straight on and colours it."""
-    return any(str(shape.bsdf()).startswith(TINTED) for shape in scene.shapes() if shape.bsdf() is not None)
 
 
 def with_tinted_alpha(mi: Any, inner: Any, first_visible: Any) -> Any:

@@ -57,7 +57,6 @@ def bench(workspace: str, server: str | None, *, size: int, seconds: float, cons
 
 
 def lines(result: dict[str, Any]) -> list[str]:
-    """The result as lines of text."""
     stages = ", ".join(f"{name} {value:.0f}" for name, value in result["stages_ms"].items())
     seen = ", ".join(f"{key}: {share:.0%}" for key, share in result["frames_at"].items())
     return [

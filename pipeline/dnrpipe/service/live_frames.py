@@ -23,7 +23,7 @@ import torch
 from PIL import Image
 
 from dnrpipe.core.errors import UserError
-from dnrpipe.core.images import flip_error
+from dnrpipe.core.images import flip_error, picture_of
 from dnrpipe.core.settings import Settings
 from dnrpipe.raytrace.base_renderer import BaseRenderer
 from dnrpipe.raytrace.base_worker import Worker as BaseWorker
@@ -130,8 +130,7 @@ class Worker:
         """Display RGB over white, float32 [H, W, 3] in [0, 1]."""
         data = view_in_memory(channels, self.frame, view, display=self.display, base=self.kind)
         with torch.inference_mode():
-            output = self.model(data.tensors.to(self.device))
-            return output.rgb[0].float().clamp(0, 1).permute(1, 2, 0).cpu().numpy()
+            return picture_of(self.model(data.tensors.to(self.device)).rgb[0])
 
     def _shown(self, mode: str, channels: dict[str, np.ndarray]) -> np.ndarray:
         """A channel as a picture over white, float32 [H, W, 3] in [0, 1]."""

@@ -139,7 +139,6 @@ class Queue:
         return [_job(row) for row in self._db().execute(query, (*values, limit))]
 
     def counts(self) -> dict[State, int]:
-        """How many jobs are in each state."""
         found = dict(self._db().execute("SELECT state, count(*) FROM jobs GROUP BY state").fetchall())
         return {state: found.get(state, 0) for state in STATES}
 
@@ -267,11 +266,9 @@ class Queue:
         return [due[start : start + BATCH] for start in range(0, len(due), BATCH)]
 
     def last_event(self) -> int:
-        """Id of the newest event of any job."""
         return int(self._db().execute("SELECT coalesce(max(id), 0) FROM events").fetchone()[0])
 
     def close(self) -> None:
-        """Close this thread's connection."""
         db = getattr(self._local, "db", None)
         if db is not None:
             db.close()

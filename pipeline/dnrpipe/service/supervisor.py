@@ -38,7 +38,6 @@ class Supervisor:
         self._thread.start()
 
     def alive(self) -> dict[str, bool]:
-        """Whether each device's worker lives."""
         found = dict(self.processes)
         return {d: (p := found.get(d)) is not None and p.poll() is None for d in self.config.devices}
 

@@ -23,7 +23,7 @@ from filelock import FileLock, Timeout
 from ..core.errors import UserError
 from ..core.event_stream import VARIABLE
 from ..core.workspace import LOCK_FILES
-from ..workers.processes import TIMEOUT_VARIABLE, die_with_parent
+from ..workers.processes import TIMEOUT_VARIABLE, die_with_parent, how_ended
 from .config import ServerConfig, tightest
 from .models import Job, Limits
 from .queue import MAX_STARTS, Queue
@@ -131,7 +131,7 @@ class Worker:
         elif ended is not None:
             queue.finish(job.id, "failed", exit_code=code, error=f"{ended}; raise it and retry to go on")
         elif code < 0 and job.crashes < job.request.retries and job.starts < MAX_STARTS:
-            queue.requeue(job.id, crashed=True, why=f"its process was killed by {_signal_name(-code)}")
+            queue.requeue(job.id, crashed=True, why=f"its process {how_ended(code)}")
         else:
             queue.finish(job.id, "failed", exit_code=code, error=_reason(self.root.log(job.id), code))
 
@@ -234,15 +234,7 @@ def _reason(log: Path, code: int) -> str:
         return errors[-1].removeprefix("dnrpipe: error: ")
     if code == INTERRUPTED:
         return "interrupted from outside; retry to go on where it stopped"
-    how = f"was killed by {_signal_name(-code)}" if code < 0 else f"ended with exit code {code}"
-    return f"the command {how}; see its log"
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
+    return f"the command {how_ended(code)}; see its log"
 
 
 def main() -> int:

@@ -64,12 +64,10 @@ class BaseRenderer:
 
 
 def base_path(workspace: Workspace, split: str, name: str) -> Path:
-    """``base/<split>/<view>.exr``."""
     return workspace.root / "base" / split / f"{name}.exr"
 
 
 def light_path(workspace: Workspace) -> Path:
-    """The baked light of the scene."""
     return workspace.root / "base" / "light.npz"
 
 
@@ -102,8 +100,6 @@ def base_views(
     """Render the base images of the views that are missing or out of date -> all tasks, [] where none is rendered.
 
     Args:
-        run: of the stage that needs them.
-        views: all of them.
         split: that they are of; the ledger names them by it.
         paths: where they go instead of ``base/<split>``.
         purpose: they are booked under, instead of the stage's.

@@ -13,7 +13,7 @@ from dnrtrain.exr import read_metadata
 from dnrtrain.records import write
 
 from ..core.errors import UserError
-from ..core.images import flip_error, write_png
+from ..core.images import flip_error, picture_of, write_png
 from ..core.scene_files import split_views
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest
@@ -54,8 +54,7 @@ def evaluate(run: Run) -> Outcome:
             seconds, prediction = _timed_render(lambda data=data: render_views(model, data), device)
             assert data.tensors.target is not None  # loaded with raytraced=True
             measured = image_metrics(prediction, data.tensors.target.cpu(), data.tensors.mask.cpu(), lpips)
-            truth = _image(data.tensors.target)
-            predicted = _image(prediction)
+            truth, predicted = picture_of(data.tensors.target[0]), picture_of(prediction[0])
             flip, heat = flip_error(truth, predicted)
             traced = read_metadata(workspace.raytraced("test", view.name)) or {}
             base = read_metadata(base_path(workspace, "test", view.name)) or {} if rendered else {}
@@ -135,10 +134,6 @@ def _timed_render(render: Any, device: str) -> tuple[float, Any]:
             torch.cuda.synchronize()
         seconds.append(time.perf_counter() - started)
     return float(np.median(seconds)), picture
-
-
-def _image(tensor: Any) -> np.ndarray:
-    return tensor[0].float().clamp(0, 1).permute(1, 2, 0).cpu().numpy()
 
 
 def _mean(rows: list[ViewMetrics]) -> dict[str, float | None]:

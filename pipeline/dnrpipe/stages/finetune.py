@@ -15,7 +15,7 @@ import importlib.util
 import time
 from typing import TYPE_CHECKING, Any, Literal
 
-from dnrtrain.contract import ContractError, View
+from dnrtrain.contract import ContractError
 from dnrtrain.events import Previewed
 from dnrtrain.records import write
 
@@ -76,12 +76,6 @@ def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
     return epochs_done(workspace.checkpoints("step2"), settings.finetune.step2.epochs, True)
 
 
-def shown_view(workspace: Workspace, settings: Settings) -> View | None:
-    """The middle one of the test views; None: previews are off, or there are no test views."""
-    views = split_views(workspace).get("test")
-    return views[len(views) // 2] if views and settings.finetune.preview_seconds > 0 else None
-
-
 class LivePicture:
     """The pictures of one fine-tuning. ``preview``: what the trainer is given; None: there are none, which was said.
 
@@ -107,12 +101,12 @@ class LivePicture:
         self.preview = Preview(views, settings.finetune.preview_seconds)
 
     def _held_out(self) -> ViewSet | None:
-        """The view's inputs; None, with the reason said, where a training view must do."""
-        settings = self.run.settings
-        view = shown_view(self.workspace, settings)
-        if view is None:
+        """Inputs of the middle test view; None, with the reason said, where a training view must do."""
+        settings, tests = self.run.settings, split_views(self.workspace).get("test")
+        if not tests:
             self.console.say("no test views: the pictures while it trains are of a training view")
             return None
+        view = tests[len(tests) // 2]
         base = self.workspace.preview / "base" / "test" / f"{view.name}.exr"
         try:
             base_views(self.run, [view], "test", paths=[base], purpose="evaluation")

@@ -31,7 +31,6 @@ class Inspection:
     """What is in a scene file.
 
     Args:
-        warnings: lines for the user.
         census: with the findings of a conversion.
         effects: rows of the plan before its path depth pilot.
     """
@@ -42,7 +41,6 @@ class Inspection:
     effects: tuple[Effect, ...]
 
     def findings(self, kind: FindingKind) -> list[Finding]:
-        """The findings of a kind."""
         return [finding for finding in self.census.findings if finding.kind == kind]
 
     def data(self) -> dict[str, Any]:

@@ -279,14 +279,7 @@ def weights_cached() -> bool:
 
 @dataclass(frozen=True)
 class StageStatus:
-    """A row of ``dnrpipe status``.
-
-    Args:
-        stage, command, does, reads, writes: of the `Stage`.
-        state: see `state`.
-        present, wanted: units, e.g. views or epochs.
-        seconds: wall time of its last run; None before it has finished one.
-    """
+    """A row of ``dnrpipe status``. seconds: wall time of its last run; None before it has finished one."""
 
     stage: StageName
     command: str
@@ -300,7 +293,6 @@ class StageStatus:
 
 
 def status(workspace: Workspace, settings: Settings) -> list[StageStatus]:
-    """One row per stage."""
     rows = []
     for stage in STAGES.values():
         present, wanted = stage.progress(workspace, settings)

@@ -119,9 +119,6 @@ def draw_passes(
     """G-buffers of the views, those that are missing or out of date, by Blender. Returns all tasks.
 
     Args:
-        label: of the progress bar.
-        paths: a file for each view.
-        engine: for rasterised colour.
         raster: for each view, whether it gets rasterised colour.
     """
     passes = run.settings.passes
@@ -226,7 +223,6 @@ def bake(run: Run, source: Path, geometry: Path, pending: PendingBakes) -> list[
 
     Args:
         geometry: ``geometry.npz`` of the conversion that asked for the bakes.
-        pending: what it asked for.
     """
     passes, console = run.settings.passes, run.console
     count = min(worker_count(passes.workers), len(pending.layers))

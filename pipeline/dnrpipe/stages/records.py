@@ -26,7 +26,6 @@ class ViewMetrics(Record, allow_inf_nan=False):
         reference_noise, reference_noise_error: relative noise of the reference, and its standard error.
         seconds_traced, seconds_base: of the reference and the base image, on one worker.
         seconds_neural: of the network alone.
-        spp: samples per pixel of the reference.
     """
 
     name: str = Field(pattern=r"^[A-Za-z0-9_.-]+$")
@@ -50,12 +49,9 @@ class Metrics(Record, allow_inf_nan=False):
     """The evaluation.
 
     Args:
-        views: the held-out views.
         mean: of each figure, over the views that have it; None where none has.
         perceptual: LPIPS was measured.
         trained_with_perceptual: the perceptual loss was among the losses; None: not known.
-        device: that the network ran on.
-        raster_engine: that drew the rasterised colour.
         reference_noise_target: the relative noise that references were traced to; None: a number of samples was set.
         neural_ms: median of the network's milliseconds.
     """

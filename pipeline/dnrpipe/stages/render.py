@@ -15,7 +15,7 @@ from dnrtrain.atomic import atomic_path, write_json
 from dnrtrain.contract import View, write_cameras
 
 from ..core.errors import UserError
-from ..core.images import write_png
+from ..core.images import picture_of, write_png
 from ..core.scene_files import read_frame
 from ..core.workspace import digest
 from .base_images import RENDERED, base_views
@@ -76,7 +76,7 @@ def render_novel(run: Run, views: Sequence[View], *, name: str, frames: str, mov
                 base_files=[path] if kind in RENDERED else None,
             ).to(device)
             started = time.perf_counter()
-            picture = render_views(model, data)[0].float().clamp(0, 1).permute(1, 2, 0).cpu().numpy()
+            picture = picture_of(render_views(model, data)[0])
             seconds.append(time.perf_counter() - started)
             if movie != "none":
                 pictures.append((picture * 255 + 0.5).astype(np.uint8))

@@ -29,7 +29,6 @@ class Run:
     """One command's work on a workspace. Every stage gets one, as `for_stage` makes it.
 
     Args:
-        workspace, settings, console: of the command.
         stage: what the ledger books work under, and whose log workers write.
         id: names this run in the ledger.
         fingerprint: hash of all that the stage under way computes from; "" where none is.
@@ -94,15 +93,15 @@ class Run:
         """What `view_tasks` books each view by.
 
         Args:
-            device: as the ledger names it.
             folder: of the record's name; None: the one that the view's file lies in.
             purpose: None: by the stage, and by the split that the view's file lies in.
         """
         fields = {"seconds", "cpu_seconds", "peak_mb", "spp", "noise"}
 
         def book(task: dict[str, Any], result: dict[str, Any], workers: int) -> None:
+            held_out = self.purpose == "training" and Path(task["output"]).parent.name.endswith("test")
             self.book(
-                purpose or self._purpose(task),
+                purpose or ("evaluation" if held_out else self.purpose),
                 "view",
                 task_name(task) if folder is None else f"{folder}/{task['view']['name']}",
                 device=device,
@@ -114,10 +113,6 @@ class Run:
             )
 
         return book
-
-    def _purpose(self, task: dict[str, Any]) -> Purpose:
-        held_out = Path(task["output"]).parent.name.endswith("test")
-        return "evaluation" if held_out and self.purpose == "training" else self.purpose
 
     def view_tasks(
         self,
@@ -133,9 +128,7 @@ class Run:
         """Run the tasks whose files are missing or out of date.
 
         Args:
-            label: what the progress bar and warnings call them.
             module, common, environment: of `processes.run_tasks`.
-            workers: processes at most.
 
         Raises TasksFailed after all other tasks are done when some failed twice. Raises OSError: the disk is full.
         """
@@ -168,13 +161,8 @@ class Stage:
     """One stage: a function of files in a workspace.
 
     Args:
-        name: in the manifest and the ledger.
-        command: of the command line.
-        does: in a few words.
-        needs: stages that must be done before.
         reads, writes: files and folders of the workspace.
         settings: those that decide what it makes, JSON-able.
-        make: does what is missing.
         progress: (units present, units wanted), by looking at files alone.
         version: raised when the same inputs give other files.
     """

@@ -34,7 +34,6 @@ def load(
     """G-buffers of the views, with rasterised (train, val) or ray-traced targets, or none (test).
 
     Args:
-        base: the kind of base image to load beside them.
         base_files: where rendered ones lie, instead of ``base/<split>``.
     """
     from dnrtrain.dataset import load_views

@@ -92,7 +92,6 @@ class TaskTimeout:
         return usual * (1 if attempt == 1 else 2)
 
     def took(self, seconds: float) -> None:
-        """A task ended after so many seconds."""
         self.longest = max(seconds, self.longest)
 
     def reason(self) -> str:
@@ -209,10 +208,10 @@ class LocalWorker:
 
     Linux kills it when the thread that asked first ends.
 
-    Args: as of `run_tasks`.
+    Args: as of `run_tasks`; without a log its output goes where this process's errors go.
     """
 
-    def __init__(self, module: str, common: dict[str, Any], log: Path, environment: dict[str, str]) -> None:
+    def __init__(self, module: str, common: dict[str, Any], log: Path | None, environment: dict[str, str]) -> None:
         self.module, self.common, self.log, self.environment = module, common, log, environment
         self._process: subprocess.Popen[str] | None = None
 
@@ -282,8 +281,9 @@ class LocalWorker:
             process.stdout.close()
 
     def _spawn(self) -> subprocess.Popen[str]:
-        self.log.parent.mkdir(parents=True, exist_ok=True)
-        with self.log.open("a") as sink:
+        if self.log is not None:
+            self.log.parent.mkdir(parents=True, exist_ok=True)
+        with contextlib.nullcontext() if self.log is None else self.log.open("a") as sink:
             process = subprocess.Popen(
                 [sys.executable, "-m", "dnrpipe.workers.processes", self.module, str(os.getpid())],
                 stdin=subprocess.PIPE,
@@ -304,12 +304,16 @@ class LocalWorker:
 def _exit_reason(process: subprocess.Popen[str]) -> str:
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(timeout=5)
-    code = process.returncode
-    if code is not None and code < 0:
-        with contextlib.suppress(ValueError):
-            guess = " (out of memory?)" if -code == signal.SIGKILL else ""
-            return f"worker was killed by {signal.Signals(-code).name}{guess}"
-    return f"worker ended with exit code {code}"
+    guess = " (out of memory?)" if process.returncode == -signal.SIGKILL else ""
+    return f"worker {how_ended(process.returncode)}{guess}"
+
+
+def how_ended(code: int | None) -> str:
+    """``was killed by SIGKILL``, ``ended with exit code 3``."""
+    if code is None or code >= 0:
+        return f"ended with exit code {code}"
+    names = {int(one): one.name for one in signal.Signals}
+    return f"was killed by {names.get(-code, f'signal {-code}')}"
 
 
 def die_with_parent(parent: int) -> None:

@@ -22,11 +22,8 @@ def lazy_greedy(
     The lowest index wins ties.
 
     Args:
-        count: number of elements.
-        budget: how many are chosen.
         gain: what an element would add now.
         take: called once per element chosen.
-        tick: told of every element weighed.
     """
 
     def weigh(element: int) -> float:

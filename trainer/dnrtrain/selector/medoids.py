@@ -53,9 +53,7 @@ def build(
 
     Args:
         problem: what is covered by what, at which distance.
-        budget: how many views are chosen.
         among: the views to choose from; None: all.
-        tick: told of every view weighed.
     """
     views = np.arange(problem.count) if among is None else np.asarray(among)
     near = problem.nothing.copy()

@@ -29,9 +29,7 @@ def complete_useful(
     """The views that complete ``kept`` to ``budget``, chosen as in `choose_useful`; duplicates of kept views come last.
 
     Args:
-        candidates: all views.
         kept: views that are chosen already.
-        budget: views wanted in all.
         choose: ``choose(some, kept, count)`` answers with ``count`` further views of ``some``.
     """
     check_budget(budget, len(candidates))

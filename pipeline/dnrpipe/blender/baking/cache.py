@@ -9,7 +9,6 @@ does not count: `bake` bakes what is missing, and the scene is converted again.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -47,11 +46,6 @@ class BakeCache:
     used_atlas: bool = False
     _graphs: GraphHasher = field(default_factory=GraphHasher)
     _meshes: dict[int, str] = field(default_factory=dict)
-
-    @classmethod
-    def open(cls, meshes: Sequence[FrozenMesh], folder: Path, size: int, refused: Iterable[str] = ()) -> BakeCache:
-        """The cache of a frozen scene whose bakes have ``size``² texels."""
-        return cls(Atlas(meshes, size), folder, frozenset(refused))
 
     def value(self, material: str, kind: ValueKind, source: Source, socket: str, findings: Findings) -> Textured | None:
         """The value at ``source`` over the material's surface; None when it could not be baked.

@@ -20,6 +20,7 @@ from ..shading.materials import MaterialConverter
 from ..shading.textures import ImageReader, TextureStore
 from ..tasks import BakeOptions, PendingBakes
 from .cache import BakeCache
+from .regions import Atlas
 
 PENDING = "pending.json"
 
@@ -39,7 +40,9 @@ def convert_materials(
     meshes: Sequence[FrozenMesh], scene_dir: Path, findings: Findings, options: BakeOptions | None
 ) -> MaterialConverter:
     """A converter that has converted every material in use; `missing_bakes` says what it lacks."""
-    bakes = None if options is None else BakeCache.open(meshes, options.folder, options.size, options.refused)
+    bakes = (
+        None if options is None else BakeCache(Atlas(meshes, options.size), options.folder, frozenset(options.refused))
+    )
     converter = MaterialConverter(TextureStore(scene_dir), ImageReader(findings), findings, bakes)
     for mesh in meshes:
         for slot in np.unique(mesh.material_index):

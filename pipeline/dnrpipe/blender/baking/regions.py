@@ -8,7 +8,7 @@ from the bottom left, row by row, as in `shading.textures`.
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -72,34 +72,41 @@ def rasterise(triangles: np.ndarray, size: int) -> Region:
     """
     corners = triangles.astype(np.float64) * size
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    sign = np.sign(doubled_areas(corners))
     owner = np.full(size * size, -1, np.int32)
-    low = np.clip(np.ceil(corners.min(1) - 0.5 - 1e-4), 0, size).astype(np.int32)
-    high = np.clip(np.floor(corners.max(1) - 0.5 + 1e-4) + 1, 0, size).astype(np.int32)
-    sign = np.sign(_cross(b - a, c - a))
-    extent = np.maximum(high - low, 0)
-    boxes = extent[:, 0].astype(np.int64) * extent[:, 1]
-    boxes[sign == 0] = 0
     edges = [_distance(p, q, sign) for p, q in ((a, b), (b, c), (c, a))]
-    todo = np.flatnonzero(boxes)
-    starts = np.cumsum(boxes[todo]) - boxes[todo]
-    for group in np.unique(starts // CHUNK):
-        part = todo[starts // CHUNK == group]
-        counts = boxes[part]
-        which = np.repeat(part, counts)
-        local = (np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)).astype(np.int32)
-        row = local // extent[which, 0]
-        x = low[which, 0] + local - row * extent[which, 0]
-        y = low[which, 1] + row
+    for which, x, y in texels_near(np.where((sign == 0)[:, None, None], -1.0, corners), size, 1e-4, CHUNK):
         inside = np.ones(len(which), bool)
         for along, across, offset in edges:
             inside &= along[which] * (x + 0.5) + across[which] * (y + 0.5) + offset[which] >= -EDGE
-        owner[y[inside].astype(np.int64) * size + x[inside]] = which[inside]
+        owner[y[inside] * size + x[inside]] = which[inside]
     centre = np.clip(((a + b + c) / 3).astype(np.int64), 0, size - 1)
     flat = centre[:, 1] * size + centre[:, 0]
     lost = np.flatnonzero(owner[flat] < 0)
     owner[flat[lost]] = lost
     texels = np.flatnonzero(owner >= 0)
     return Region(texels, owner[texels], corners, size)
+
+
+def texels_near(
+    corners: np.ndarray, size: int, slack: float, chunk: int
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """(triangle, column, row), int64 [K] each, of the texels whose centres lie in the triangles' boxes.
+
+    corners: [T, 3, 2], texel units. slack: added around the boxes. chunk: texels at a time, about.
+    """
+    low = np.clip(np.ceil(corners.min(1) - 0.5 - slack), 0, size).astype(np.int64)
+    high = np.clip(np.floor(corners.max(1) - 0.5 + slack) + 1, 0, size).astype(np.int64)
+    extent = np.maximum(high - low, 0)
+    boxes = extent.prod(1)
+    todo = np.flatnonzero(boxes)
+    starts = np.cumsum(boxes[todo]) - boxes[todo]
+    for group in np.unique(starts // chunk):
+        part = todo[starts // chunk == group]
+        counts = boxes[part]
+        which = np.repeat(part, counts)
+        row, column = np.divmod(np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts), extent[which, 0])
+        yield which, low[which, 0] + column, low[which, 1] + row
 
 
 def _distance(p: np.ndarray, q: np.ndarray, sign: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -112,7 +119,7 @@ def _distance(p: np.ndarray, q: np.ndarray, sign: np.ndarray) -> tuple[np.ndarra
 
 def _barycentric(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Weights clipped to the triangle, summing to 1; the centroid's for a triangle without area."""
-    area = _cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = doubled_areas(corners)
     usable = np.abs(area) > 1e-12
     weights = np.empty((len(corners), 3))
     for k in range(3):
@@ -124,6 +131,11 @@ def _barycentric(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def doubled_areas(triangles: np.ndarray) -> np.ndarray:
+    """[T] of triangles [T, 3, 2]; positive where they run counter-clockwise."""
+    return _cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
 
 
 def spread(covered: np.ndarray, size: int, margin: int = MARGIN) -> tuple[np.ndarray, np.ndarray]:
@@ -178,7 +190,6 @@ class Atlas:
         return self._parts.get(material, [])
 
     def region(self, material: str) -> Region:
-        """The material's texels."""
         if material not in self._regions:
             stacked = [part.mesh.atlas[part.corners] for part in self.parts(material)]
             corners = np.concatenate(stacked) if stacked else np.zeros((0, 2), np.float32)
@@ -194,8 +205,7 @@ class Atlas:
             triangles = uv[part.corners].reshape(-1, 3, 2)
             if triangles.min(initial=0) < -UNIT_EDGE or triangles.max(initial=1) > 1 + UNIT_EDGE:
                 return False
-            a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-            area = float(np.abs(_cross(a.astype(np.float64), b)).sum()) / 2
+            area = float(np.abs(doubled_areas(triangles.astype(np.float64))).sum()) / 2
             covered = len(rasterise(triangles, UNFOLD_SIZE).texels) / UNFOLD_SIZE**2
             if area > UNFOLD_SLACK * covered:
                 return False

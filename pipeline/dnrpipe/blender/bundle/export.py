@@ -9,21 +9,18 @@ from __future__ import annotations
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
-from pathlib import Path
 
 import bpy
 import numpy as np
 
 from dnrtrain.atomic import write_text
 
-from ..findings import Findings
 from ..geometry.frozen import FrozenMesh
 from ..lighting.lights import export_lights, report_ray_visibility
 from ..lighting.world import export_world
 from ..reading.framing import framing_pose
 from ..reading.names import find_material
 from ..shading.materials import Converted, MaterialConverter
-from ..shading.textures import ImageReader, TextureStore
 from . import xmltree
 from .shapes import export_shapes
 from .units import rescale, unit_scale
@@ -33,18 +30,13 @@ MAX_DEPTH = 12
 DEFAULT_FOV = 40.0
 
 
-def export_bundle(
-    meshes: Sequence[FrozenMesh], scene_dir: Path, findings: Findings, converter: MaterialConverter | None = None
-) -> dict[str | None, Converted]:
-    """Write the open scene (``bpy.context.scene``) as a bundle into ``scene_dir``; return its materials by name.
+def export_bundle(meshes: Sequence[FrozenMesh], converter: MaterialConverter) -> dict[str | None, Converted]:
+    """Write the open scene (``bpy.context.scene``) as a bundle into the converter's folder; its materials by name.
 
-    meshes: the frozen geometry, world space. converter: brings the baked textures (see `baking.cache`); without
-    one, averages stand for them. Every deviation from Blender goes into ``findings``.
+    meshes: the frozen geometry, world space. Every deviation from Blender goes into the converter's findings.
     """
     scene = bpy.context.scene
     assert scene is not None
-    converter = converter or MaterialConverter(TextureStore(scene_dir), ImageReader(findings), findings)
-    store, images = converter.store, converter.images
     center, radius = bounding_sphere(meshes)
 
     root = ET.Element("scene", {"version": FORMAT_VERSION})
@@ -54,7 +46,7 @@ def export_bundle(
         for mesh in meshes
     ]
     materials = {converted.id: converted for slots in used for _, converted in slots}
-    shapes = export_shapes(meshes, used, converter, scene_dir, findings)
+    shapes = export_shapes(meshes, used, converter)
     root.extend(converter.sheets_elements())
     media = [converted.medium for converted in materials.values() if converted.medium is not None]
     holes = any(
@@ -63,13 +55,13 @@ def export_bundle(
     root.insert(0, _integrator("volpath" if media or holes else "path"))
     root.extend(converted.bsdf for converted in materials.values())
     root.extend([*media, *shapes])
-    report_ray_visibility((mesh.object_name for mesh in meshes), findings)
-    export_lights(scene, root, store, findings, center, radius)
-    export_world(scene, root, store, images, findings, center, radius)
+    report_ray_visibility((mesh.object_name for mesh in meshes), converter.findings)
+    export_lights(scene, root, converter, center, radius)
+    export_world(scene.world, root, converter, center, radius)
     if unit_scale(radius) != 1.0:
         rescale(root, unit_scale(radius))
     ET.indent(root)
-    write_text(scene_dir / "scene.xml", ET.tostring(root, encoding="unicode") + "\n")
+    write_text(converter.store.scene_dir / "scene.xml", ET.tostring(root, encoding="unicode") + "\n")
     return {converted.name: converted for converted in materials.values()}
 
 

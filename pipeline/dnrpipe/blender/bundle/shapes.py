@@ -11,7 +11,6 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -52,13 +51,7 @@ class Piece:
 
 
 def export_shapes(
-    meshes: Sequence[FrozenMesh],
-    used: Sequence[Sequence[tuple[int, Converted]]],
-    converter: MaterialConverter,
-    scene_dir: Path,
-    findings: Findings,
-    *,
-    written_triangles: int = WRITTEN_TRIANGLES,
+    meshes: Sequence[FrozenMesh], used: Sequence[Sequence[tuple[int, Converted]]], converter: MaterialConverter
 ) -> list[ET.Element]:
     """Write ``meshes/*.ply`` and return the shape elements. used: per mesh the (slot, material) pairs in use."""
     ids = xmltree.Ids()
@@ -66,19 +59,19 @@ def export_shapes(
     elements: list[ET.Element] = []
     many = sum(map(len, used)) > JOIN_ABOVE
     extra = {id(mesh): mesh.triangles * len(mesh.copies) for mesh in meshes if len(mesh.copies)}
-    instanced = _too_many(meshes, extra, written_triangles)
+    instanced = _too_many(meshes, extra, WRITTEN_TRIANGLES)
     for number, (mesh, slots) in enumerate(zip(meshes, used, strict=True)):
         glowing = any(converter.emitter(converted) is not None for _, converted in slots)
         as_instances = id(mesh) in instanced and not glowing
         copies = mesh.copies[:0] if as_instances else mesh.copies
-        pieces = [_piece(mesh, slot, converted, converter, copies, findings) for slot, converted in slots]
+        pieces = [_piece(mesh, slot, converted, converter, copies) for slot, converted in slots]
         if as_instances:
-            elements += _instances(mesh, pieces, converter, scene_dir, ids)
+            elements += _instances(mesh, pieces, converter, ids)
             continue
         for piece in pieces:
             joined.setdefault(piece.layout if many else (number, *piece.layout), []).append(piece)
     for pieces in joined.values():
-        elements.append(_shape(pieces, converter, scene_dir, ids))
+        elements.append(_shape(pieces, converter, ids))
     return elements
 
 
@@ -95,12 +88,7 @@ def _too_many(meshes: Sequence[FrozenMesh], extra: dict[int, int], budget: int) 
 
 
 def _piece(
-    mesh: FrozenMesh,
-    slot: int,
-    converted: Converted,
-    converter: MaterialConverter,
-    copies: np.ndarray,
-    findings: Findings,
+    mesh: FrozenMesh, slot: int, converted: Converted, converter: MaterialConverter, copies: np.ndarray
 ) -> Piece:
     corners = np.repeat(mesh.material_index == slot, 3)
     order = np.flatnonzero(corners)
@@ -112,8 +100,8 @@ def _piece(
         if not two_sided and volume < 0:  # area emitters shine, and media begin, on the normal's sides
             order = order.reshape(-1, 3)[:, ::-1].ravel()
             positions, normals = mesh.positions[order], -mesh.normals[order]
-    uv = _texture_coordinates(mesh, converted, findings)
-    attributes = [(name, values[order]) for name, values in _attributes(mesh, converted, findings)]
+    uv = _texture_coordinates(mesh, converted, converter.findings)
+    attributes = [(name, values[order]) for name, values in _attributes(mesh, converted, converter.findings)]
     if not mesh.camera_visible:
         attributes.append((UNSEEN_ATTRIBUTE, np.ones((len(order), 1), np.float32)))
     place = np.concatenate([mesh.atlas[order], np.zeros((len(order), 1), np.float32)], axis=1)
@@ -122,7 +110,7 @@ def _piece(
     return Piece(mesh, converted, welded, two_sided)
 
 
-def _shape(pieces: Sequence[Piece], converter: MaterialConverter, scene_dir: Path, ids: xmltree.Ids) -> ET.Element:
+def _shape(pieces: Sequence[Piece], converter: MaterialConverter, ids: xmltree.Ids) -> ET.Element:
     """``ply`` shape of one material: one mesh's faces, or those of all its meshes."""
     mesh, converted = pieces[0].mesh, pieces[0].converted
     material = xmltree.safe_name(converted.name or "default")
@@ -133,7 +121,7 @@ def _shape(pieces: Sequence[Piece], converter: MaterialConverter, scene_dir: Pat
     prefix = UNSEEN_PREFIX if not mesh.camera_visible else STRANDS_PREFIX if mesh.strands else "mesh-"
     identity = ids.take(prefix.removesuffix("-"), name)
     relative = f"meshes/{identity.removeprefix('mesh-')}.ply"
-    write_ply(scene_dir / relative, [piece.welded for piece in pieces])
+    write_ply(converter.store.scene_dir / relative, [piece.welded for piece in pieces])
     element = xmltree.plugin("shape", "ply", id=identity)
     xmltree.text(element, "filename", relative)
     xmltree.reference(element, converted.id)
@@ -148,12 +136,12 @@ def _shape(pieces: Sequence[Piece], converter: MaterialConverter, scene_dir: Pat
 
 
 def _instances(
-    mesh: FrozenMesh, pieces: Sequence[Piece], converter: MaterialConverter, scene_dir: Path, ids: xmltree.Ids
+    mesh: FrozenMesh, pieces: Sequence[Piece], converter: MaterialConverter, ids: xmltree.Ids
 ) -> Iterator[ET.Element]:
     """One ``shapegroup`` and an ``instance`` per placement."""
     group = xmltree.plugin("shape", "shapegroup", id=ids.take("group", mesh.name))
     for piece in pieces:
-        group.append(_shape([piece], converter, scene_dir, ids))
+        group.append(_shape([piece], converter, ids))
     yield group
     prefix = "" if mesh.camera_visible else UNSEEN_PREFIX
     for number, matrix in enumerate((np.eye(4), *mesh.copies)):

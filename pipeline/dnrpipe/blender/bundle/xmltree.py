@@ -74,10 +74,10 @@ def matrix(parent: ET.Element, name: str, value: np.ndarray) -> None:
     ET.SubElement(holder, "matrix", {"value": " ".join(_text(v) for v in np.asarray(value).ravel())})
 
 
-def vector(parent: ET.Element, name: str, value: Iterable[float]) -> None:
-    """``<vector>``."""
+def vector(parent: ET.Element, name: str, value: Iterable[float], tag: str = "vector") -> None:
+    """``<vector>``, or ``<point>``."""
     x, y, z = (_text(v) for v in value)
-    ET.SubElement(parent, "vector", {"name": name, "x": x, "y": y, "z": z})
+    ET.SubElement(parent, tag, {"name": name, "x": x, "y": y, "z": z})
 
 
 def reference(parent: ET.Element, id: str, name: str | None = None) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from dnrpipe.core.scene_records import AtlasFacts
 
+from ..baking.regions import doubled_areas, texels_near
 from .charts import chart_atlas, count_pieces
 from .frozen import ATLAS_LAYER, FrozenMesh
 from .local_mesh import new_mesh
@@ -194,33 +195,17 @@ def _span(meshes: Sequence[FrozenMesh]) -> tuple[np.ndarray, np.ndarray]:
 
 def _area(uv: np.ndarray) -> float:
     """Area of all triangles with these corners [3T, 2]."""
-    return np.abs(_doubled_area(uv.astype(np.float64).reshape(-1, 3, 2))).sum() / 2
+    return np.abs(doubled_areas(uv.astype(np.float64).reshape(-1, 3, 2))).sum() / 2
 
 
-def _doubled_area(triangles: np.ndarray) -> np.ndarray:
-    a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-
-
-def _texel_counts(triangles: np.ndarray, size: int, chunk: int = 1 << 20) -> tuple[np.ndarray, np.ndarray]:
+def _texel_counts(triangles: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
     """How many triangles [T, 3, 2] (texel units) hold each texel centre, int32 [size²]; and hits per triangle."""
     counts = np.zeros(size * size, np.int32)
     hits = np.zeros(len(triangles), np.int64)
-    low = np.clip(np.ceil(triangles.min(1) - 0.5), 0, size).astype(np.int64)
-    high = np.clip(np.floor(triangles.max(1) - 0.5) + 1, 0, size).astype(np.int64)
-    extent = np.maximum(high - low, 0)
-    boxes = extent.prod(1)
-    todo = np.flatnonzero(boxes)
-    starts = np.cumsum(boxes[todo]) - boxes[todo]
-    for group in np.unique(starts // chunk):
-        part = todo[starts // chunk == group]
-        owner = np.repeat(part, boxes[part])
-        local = np.arange(len(owner)) - np.repeat(np.cumsum(boxes[part]) - boxes[part], boxes[part])
-        x = low[owner, 0] + local % extent[owner, 0]
-        y = low[owner, 1] + local // extent[owner, 0]
+    for owner, x, y in texels_near(triangles, size, 0.0, 1 << 20):
         point = np.stack([x, y], axis=1) + 0.5
         corners = triangles[owner]
-        sign = np.sign(_doubled_area(corners))
+        sign = np.sign(doubled_areas(corners))
         inside = np.ones(len(owner), bool)
         for k in range(3):
             a, b = corners[:, k], corners[:, (k + 1) % 3]

@@ -21,11 +21,6 @@ def colour_corners(bakes: BakeCache, material: str, name: str) -> np.ndarray | N
     return bakes.atlas.stacked(material, found, 4) if found else None
 
 
-def is_uv_layer(bakes: BakeCache, material: str, name: str) -> bool:
-    """Whether ``name`` is a UV layer of a mesh with this material."""
-    return any(name in part.mesh.uv_layers for part in bakes.atlas.parts(material))
-
-
 def as_attribute(atlas: Atlas, material: str, value: Textured) -> str:
     """Name of the attribute in ``FrozenMesh.colors`` that holds a corner value; a new one where arithmetic changed it.
 

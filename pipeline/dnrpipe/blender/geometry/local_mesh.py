@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import bpy
@@ -80,17 +81,18 @@ def read_local(obj: bpy.types.Object) -> LocalMesh | None:
             if layer.active_render:
                 active = layer.name
         materials = slot_names(obj)
-        colors = _colors(mesh, corner_vertex, loops)
+        places = {"POINT": corner_vertex[loops], "CORNER": loops, "FACE": np.repeat(polygons, 3)}
+        colors = _colors(mesh, places)
         known = set(uv_layers) | set(colors)
         return LocalMesh(
-            positions=vertices[corner_vertex[loops]],
+            positions=vertices[places["POINT"]],
             normals=normals[loops],
             # Renderers use the last slot for indices beyond it.
             material_index=np.clip(slot[polygons], 0, len(materials) - 1),
             materials=materials,
             uv_layers=uv_layers,
             active_uv=active,
-            colors=colors | _named_attributes(obj, mesh, known, corner_vertex, loops, polygons),
+            colors=colors | _named_attributes(obj, mesh, known, places),
             active_color=mesh.attributes.default_color_name or None,
             texture_space=(_triple(mesh.texspace_location), _triple(mesh.texspace_size)),
         )
@@ -116,7 +118,7 @@ def slot_names(obj: bpy.types.Object) -> list[str | None]:
     return [slot.material.name_full if slot.material else None for slot in obj.material_slots] or [None]
 
 
-def _colors(mesh: bpy.types.Mesh, corner_vertex: np.ndarray, loops: np.ndarray) -> dict[str, np.ndarray]:
+def _colors(mesh: bpy.types.Mesh, places: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Colour attributes per triangle corner, float32 [3T, 4], linear: Blender decodes byte colours itself."""
     result = {}
     for attribute in mesh.color_attributes:
@@ -124,32 +126,22 @@ def _colors(mesh: bpy.types.Mesh, corner_vertex: np.ndarray, loops: np.ndarray) 
             continue  # Blender itself shows no others as colours
         values = np.empty((len(attribute.data), 4), np.float32)
         attribute.data.foreach_get("color", values.ravel())
-        result[attribute.name] = values[corner_vertex[loops] if attribute.domain == "POINT" else loops]
+        result[attribute.name] = values[places[attribute.domain]]
     return result
 
 
 def _named_attributes(
-    obj: bpy.types.Object,
-    mesh: bpy.types.Mesh,
-    known: set[str],
-    corner_vertex: np.ndarray,
-    loops: np.ndarray,
-    polygons: np.ndarray,
+    obj: bpy.types.Object, mesh: bpy.types.Mesh, known: set[str], places: Mapping[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
     """Attributes other than UV layers and colours that the object's materials name, float32 [3T, 4].
 
     A number fills all three channels, as Cycles shows it as a colour; alpha is 1 unless the attribute has one.
-
-    Args:
-        known: names that are read elsewhere.
-        corner_vertex: vertex of every corner of the mesh. loops, polygons: corner [3T] and polygon [T] of the
-            triangles.
+    known: names that are read elsewhere. places: by domain, the element at each corner of the triangles, int [3T].
     """
     wanted = set[str]()
     for slot in obj.material_slots:
         if slot.material is not None:
             wanted |= attribute_names(slot.material)
-    places = {"POINT": corner_vertex[loops], "CORNER": loops, "FACE": np.repeat(polygons, 3)}
     result = {}
     for name in sorted(wanted - known):
         attribute = mesh.attributes.get(name)

@@ -16,8 +16,9 @@ import numpy as np
 
 from ..bundle import xmltree
 from ..findings import Findings
+from ..shading.materials import MaterialConverter
 from ..shading.sockets import Scope, resolve, surface_source
-from ..shading.textures import ImageReader, Textured, TextureStore
+from ..shading.textures import ImageReader, Textured
 from ..shading.values import Evaluator
 
 FAR_DISC = 100.0
@@ -44,15 +45,10 @@ KINDS = {
 
 
 def export_lights(
-    scene: bpy.types.Scene,
-    root: ET.Element,
-    store: TextureStore,
-    findings: Findings,
-    center: np.ndarray,
-    radius: float,
+    scene: bpy.types.Scene, root: ET.Element, converter: MaterialConverter, center: np.ndarray, radius: float
 ) -> None:
     """Append all lamps to ``root``. center, radius: bounds of the geometry."""
-    ids = xmltree.Ids()
+    ids, findings = xmltree.Ids(), converter.findings
     for obj, matrix in visible_lights(scene):
         light = obj.data
         strength = _strength(light, obj.name, findings)
@@ -68,7 +64,7 @@ def export_lights(
         elif light.type == "SUN":
             element = _sun(light, matrix, strength, identity, center, radius)
         elif light.type == "SPOT":
-            element = _spot(light, matrix, strength, identity, obj.name, store, findings, radius)
+            element = _spot(obj, matrix, strength, identity, converter, radius)
         else:
             element = _area(light, matrix, strength, identity)
         root.append(element)
@@ -158,7 +154,7 @@ def _point(light: Any, matrix: np.ndarray, power: np.ndarray, identity: str, sce
     position = matrix[:3, 3]
     if radius <= 1e-5:
         element = xmltree.plugin("emitter", "point", id=identity)
-        _position(element, "position", position)
+        xmltree.vector(element, "position", position, "point")
         xmltree.rgb(element, "intensity", power / (4 * math.pi))
         return element
     element = _sphere(position, radius, identity)
@@ -173,7 +169,7 @@ def _point(light: Any, matrix: np.ndarray, power: np.ndarray, identity: str, sce
 
 def _sphere(center: np.ndarray, radius: float, identity: str) -> ET.Element:
     element = xmltree.plugin("shape", "sphere", id=identity)
-    _position(element, "center", center)
+    xmltree.vector(element, "center", center, "point")
     xmltree.number(element, "radius", radius)
     return element
 
@@ -219,14 +215,7 @@ def far_disc(
 
 
 def _spot(
-    light: Any,
-    matrix: np.ndarray,
-    power: np.ndarray,
-    identity: str,
-    name: str,
-    store: TextureStore,
-    findings: Findings,
-    scene_radius: float,
+    obj: Any, matrix: np.ndarray, power: np.ndarray, identity: str, converter: MaterialConverter, scene_radius: float
 ) -> ET.Element:
     """Spot without radius -> ``spot`` whose cross-section image carries Cycles' falloff (Mitsuba's own is 0.117 off).
 
@@ -234,11 +223,12 @@ def _spot(
     With a radius r, or too wide for an image (then r is tiny): a ``sphere`` of L = P / (4 pi^2 r^2) whose emitter
     ``dnr_lamp`` has that falloff.
     """
+    light, findings = obj.data, converter.findings
     if light.use_square:
-        findings.add("ignored", "square spot", "its cone is round, as in Cycles", object=name)
+        findings.add("ignored", "square spot", "its cone is round, as in Cycles", object=obj.name)
     scales = np.linalg.norm(matrix[:3, :3], axis=0)
     if np.ptp(scales) > 1e-3 * scales.max():
-        findings.add("approximated", "stretched spot", "its cone is round", object=name)
+        findings.add("approximated", "stretched spot", "its cone is round", object=obj.name)
     half = 0.5 * float(light.spot_size)
     direction = -_unit(matrix[:3, 2])
     radius = float(light.shadow_soft_size)
@@ -265,7 +255,7 @@ def _spot(
     xmltree.number(element, "beam_width", math.degrees(half) * 0.9999)
     texture = xmltree.plugin("texture", "bitmap", name="texture")
     section = spot_section(half, float(light.spot_blend))
-    xmltree.text(texture, "filename", store.save(section, False, f"{name}-spot"))
+    xmltree.text(texture, "filename", converter.store.save(section, False, f"{obj.name}-spot"))
     xmltree.flag(texture, "raw", True)
     xmltree.text(texture, "wrap_mode", "clamp")
     element.append(texture)
@@ -316,11 +306,6 @@ def _emit(shape: ET.Element, radiance: np.ndarray, kind: str = "area") -> ET.Ele
     xmltree.rgb(emitter, "radiance", radiance)
     shape.append(emitter)
     return emitter
-
-
-def _position(element: ET.Element, name: str, value: np.ndarray) -> None:
-    x, y, z = (f"{v:.9g}" for v in value)
-    ET.SubElement(element, "point", {"name": name, "x": x, "y": y, "z": z})
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

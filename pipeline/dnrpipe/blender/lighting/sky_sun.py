@@ -37,7 +37,8 @@ class SkySun:
 
 def find_sun(world: Any) -> SkySun | None:
     """The world's only sun disc; None where there is none, several, or one that the environment image resolves."""
-    found = [node for node in walk(world.node_tree) if node.type == "TEX_SKY" and _has_disc(node)]
+    skies = [node for node in walk(world.node_tree) if node.type == "TEX_SKY" and node.sky_type in WITH_DISC]
+    found = [node for node in skies if node.sun_disc and node.sun_size > 0 and node.sun_intensity > 0]
     if len(found) != 1 or found[0].sun_size > RESOLVED:
         return None
     node = found[0]
@@ -48,10 +49,6 @@ def find_sun(world: Any) -> SkySun | None:
     flat = math.cos(elevation)
     local = np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)])
     return SkySun(node, turn.T @ local, float(node.sun_size))
-
-
-def _has_disc(node: Any) -> bool:
-    return node.sky_type in WITH_DISC and bool(node.sun_disc) and node.sun_size > 0 and node.sun_intensity > 0
 
 
 @contextmanager

@@ -9,9 +9,9 @@ import bpy
 import numpy as np
 
 from ..bundle import xmltree
-from ..findings import Findings
-from ..shading.sockets import find_input, resolve, surface_source, walk
-from ..shading.textures import ImageReader, TextureStore, finite_texels, srgb_to_linear
+from ..shading.materials import MaterialConverter
+from ..shading.sockets import Source, find_input, resolve, surface_source, walk
+from ..shading.textures import TextureStore, finite_texels, srgb_to_linear
 from .lights import far_disc
 from .sky_sun import find_sun, measure, plain_colour, plain_number, rotation, without_disc
 from .world_images import SIZE, render_equirect
@@ -22,24 +22,16 @@ MAX_EXACT_ROWS = 1024
 """Environment images up to this height are resampled without loss."""
 
 
-def export_world(
-    scene: bpy.types.Scene,
-    root: ET.Element,
-    store: TextureStore,
-    images: ImageReader,
-    findings: Findings,
-    center: np.ndarray,
-    radius: float,
-) -> None:
+def export_world(world: Any, root: ET.Element, converter: MaterialConverter, center: np.ndarray, radius: float) -> None:
     """Append the world's emitter to ``root``, if there is a world and it is not black.
 
     Constant Background -> ``constant``; Environment Texture with constant strength -> ``envmap``, rotated by its
     Mapping node; any other node tree is rendered once with Cycles as an equirectangular image, the sun disc of a Sky
     Texture apart. center, radius: bounds of the geometry.
     """
-    world = scene.world
     if world is None:
         return
+    findings = converter.findings
     rays = ("diffuse", "glossy", "transmission")
     hidden = [ray for ray in rays if not getattr(world.cycles_visibility, ray)]
     if hidden:
@@ -64,11 +56,9 @@ def export_world(
                 return
             if abs(amount) < 1e-8:
                 return
-            if colour.node.type == "TEX_ENVIRONMENT" and _hdri(
-                root, colour.node, colour.scope, amount, store, images, findings, world.name
-            ):
+            if colour.node.type == "TEX_ENVIRONMENT" and _hdri(root, colour, amount, converter, world.name):
                 return
-    _rendered(world, root, store, findings, center, radius)
+    _rendered(world, root, converter, center, radius)
 
 
 def _constant(root: ET.Element, radiance: np.ndarray) -> None:
@@ -78,30 +68,22 @@ def _constant(root: ET.Element, radiance: np.ndarray) -> None:
         root.append(element)
 
 
-def _hdri(
-    root: ET.Element,
-    node: Any,
-    scope: Any,
-    strength: float,
-    store: TextureStore,
-    images: ImageReader,
-    findings: Findings,
-    world: str,
-) -> bool:
+def _hdri(root: ET.Element, source: Source, strength: float, converter: MaterialConverter, world: str) -> bool:
     """Environment Texture -> ``envmap`` with to_world = R^-1 B; False when its coordinates are not a rotation."""
-    turn = rotation(find_input(node, "Vector"), scope)
+    node = source.node
+    turn = rotation(find_input(node, "Vector"), source.scope)
     if node.projection != "EQUIRECTANGULAR" or turn is None:
         return False
     if node.image is None:
-        findings.add("missing", f"world '{world}' image", "no image chosen; magenta light stands for it")
+        converter.findings.add("missing", f"world '{world}' image", "no image chosen; magenta light stands for it")
         _constant(root, np.array([1.0, 0.0, 1.0]) * strength)
         return strength > 0
-    texels, srgb = images.read(node.image, None)
+    texels, srgb = converter.images.read(node.image, None)
     colour = texels[..., :3]
     if colour.dtype == np.uint8:
         codes = colour.astype(np.float32) / 255
         colour = srgb_to_linear(codes) if srgb else codes
-    _envmap(root, colour, strength, turn.T @ ENVMAP_TO_BLENDER, store, f"{world}-{node.image.name}")
+    _envmap(root, colour, strength, turn.T @ ENVMAP_TO_BLENDER, converter.store, f"{world}-{node.image.name}")
     return True
 
 
@@ -138,10 +120,9 @@ def rows_to_nodes(image: np.ndarray) -> np.ndarray:
     return image[low] * (1 - share) + image[high] * share
 
 
-def _rendered(
-    world: Any, root: ET.Element, store: TextureStore, findings: Findings, center: np.ndarray, radius: float
-) -> None:
+def _rendered(world: Any, root: ET.Element, converter: MaterialConverter, center: np.ndarray, radius: float) -> None:
     """Any other world -> rendered once by Cycles as an equirectangular image (sky textures, gradients, mixes)."""
+    findings = converter.findings
     paths = [node for node in walk(world.node_tree) if node.type == "LIGHT_PATH"]
     copy = world.copy()
     if paths:
@@ -168,7 +149,7 @@ def _rendered(
     if np.any(pixels > 0):
         note = f"its nodes are rendered into a {SIZE[0]} x {SIZE[1]} environment image"
         findings.add("baked", f"world '{world.name}'", note)
-        _envmap(root, pixels, 1.0, ENVMAP_TO_BLENDER, store, f"{world.name}-world")
+        _envmap(root, pixels, 1.0, ENVMAP_TO_BLENDER, converter.store, f"{world.name}-world")
 
 
 def _unlink_camera_rays(tree: bpy.types.NodeTree) -> None:

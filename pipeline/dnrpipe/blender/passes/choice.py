@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import functools
 import json
-import signal
 import subprocess
 import sys
 from typing import NamedTuple
 
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.machine import remember, remembered
+from dnrpipe.workers.processes import how_ended
 
 from ..tasks import RasterTrial
 
@@ -71,12 +71,12 @@ def _try(engine: str) -> Trial:
         done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT, stdin=subprocess.DEVNULL)
     except subprocess.TimeoutExpired:
         return Trial(None, f"{NO_ANSWER} {TIMEOUT:.0f} s")
+    reason = f"its trial {how_ended(done.returncode)}"
     if done.returncode < 0:
-        return Trial(None, f"its trial was killed by {signal.Signals(-done.returncode).name}")
+        return Trial(None, reason)
     lines = [line for line in done.stdout.splitlines() if line.startswith('{"ok"')]
     if done.returncode == 0 and lines:
         answer: RasterTrial = json.loads(lines[-1])
         return Trial(answer["seconds_next"]) if answer["ok"] else Trial(None, "its trial frame is empty")
     errors = [line.strip() for line in done.stderr.splitlines() if line.strip()]
-    reason = f"its trial ended with exit code {done.returncode}"
     return Trial(None, f"{reason} ({errors[-1][:200]})" if errors else reason)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import threading
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dnrtrain.contract import GBUFFER_CHANNELS, RASTER_CHANNELS
+from dnrpipe.core.errors import UserError
+from dnrpipe.raytrace.tasks import Costs
+from dnrpipe.workers.processes import LocalWorker, WorkerDied
+from dnrtrain.contract import GBUFFER_CHANNELS, RASTER_CHANNELS, View
 from dnrtrain.exr import write_exr
 
 from ..tasks import PassesAnswer, PassesCommon, PassesHeader, PassesTask
-from .render_process import RenderProcess
 from .scratch import read_channels, scratch_folder
 
 FAR_AWAY = 9e9  # Cycles writes depth 1e10 where a ray hits nothing
@@ -23,9 +27,9 @@ class Worker:
 
     def __init__(self, common: dict[str, Any]) -> None:
         self.common = PassesCommon.model_validate(common)
-        self.gbuffer = RenderProcess("gbuffer", self.common)
-        self.coverage = RenderProcess("coverage", self.common)
-        self.raster = RenderProcess("raster", self.common)
+        data, module = self.common.data(), "dnrpipe.blender.passes.render_worker"
+        kinds = ("gbuffer", "coverage", "raster")
+        self.renderers = {kind: LocalWorker(module, {**data, "kind": kind}, None, {}) for kind in kinds}
 
     def __call__(self, task: dict[str, Any]) -> PassesAnswer:
         """Write the view's EXR. One frame at a time: processes side by side would spoil each other's seconds."""
@@ -33,14 +37,14 @@ class Worker:
         wanted = PassesTask.model_validate(task)
         view = wanted.view
         with scratch_folder(view.width * view.height) as folder:
-            frames = [self.gbuffer(view, folder / "gbuffer.exr")]
+            frames = [self._render("gbuffer", view, folder)]
             channels, repaired = read_gbuffer(read_channels(folder / "gbuffer.exr", LAYER_PREFIX))
             gbuffer_seconds = time.perf_counter() - started
-            frames.append(self.coverage(view, folder / "coverage.exr"))
+            frames.append(self._render("coverage", view, folder))
             channels["coverage"] = np.clip(read_channels(folder / "coverage.exr")["A"], 0, 1)
             geometry_seconds = time.perf_counter() - started
             if wanted.raster:
-                frames.append(self.raster(view, folder / "raster.exr"))
+                frames.append(self._render("raster", view, folder))
                 picture = read_channels(folder / "raster.exr")
                 colour, bad = finite({name: picture[name] for name in RASTER_CHANNELS})
                 channels |= colour
@@ -64,6 +68,20 @@ class Worker:
             "cpu_seconds": time.process_time() - cpu + sum(frame["cpu_seconds"] for frame in frames),
             "peak_mb": sum(frame["peak_mb"] for frame in frames),
         }
+
+    def _render(self, kind: str, view: View, folder: Path) -> Costs:
+        """Write ``KIND.exr`` into the folder. A renderer that died is replaced by the next call.
+
+        Raises UserError for unusable input, RuntimeError when rendering fails or the renderer dies.
+        """
+        task = {"view": view.model_dump(mode="json"), "path": str(folder / f"{kind}.exr")}
+        try:
+            answer = self.renderers[kind].answer(task, threading.TIMEOUT_MAX)
+        except WorkerDied as death:
+            raise RuntimeError(f"the {kind} renderer {str(death).removeprefix('worker ')}") from None
+        if "error" in answer:
+            raise (RuntimeError if answer["retry"] or answer["errno"] else UserError)(answer["error"])
+        return answer["result"]
 
 
 def read_gbuffer(passes: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], int]:

@@ -57,16 +57,13 @@ class ShaderBase:
         self.sheets = sheets
         self.bakes = bakes
         self.values = Evaluator(material.name_full, images, findings, bakes)
+        self.note = self.values.note
         self.colors: list[str] = []
         self._lookups: list[_Lookup] = []
 
     @property
     def textured(self) -> bool:
         return bool(self._lookups)
-
-    def note(self, kind: Any, feature: str, text: str) -> None:
-        """Record a finding for this material."""
-        self.values.note(kind, feature, text)
 
     def share(self, value: Value | None, factor: Value) -> Value | None:
         """``value`` times ``factor``; see `algebra.product`."""

@@ -32,11 +32,6 @@ def _grey(x: np.ndarray) -> np.ndarray:
     return np.broadcast_to((x @ LUMINANCE)[..., None], x.shape)
 
 
-def _invert(node: Any, socket: Any, a: Arrays) -> np.ndarray:
-    """Invert Color: mix of c and 1 - c by the factor."""
-    return a[1] + (1 - 2 * a[1]) * _grey(a[0])
-
-
 def _gamma(node: Any, socket: Any, a: Arrays) -> np.ndarray:
     """Gamma: c ** gamma where c > 0."""
     return np.where(a[0] > 0, np.power(np.maximum(a[0], 1e-20), _grey(a[1])), a[0])
@@ -197,7 +192,8 @@ def _sockets(*names: str | tuple[str, ...]) -> Callable[[Any], list[tuple[str, .
 _SEPARATE = Operation(_sockets(("Color", "Image", "Vector")), _separate)
 _COMBINE = Operation(_sockets(("Red", "R", "X"), ("Green", "G", "Y"), ("Blue", "B", "Z")), _combine)
 OPERATIONS: dict[str, Operation] = {
-    "INVERT": Operation(_sockets("Fac", "Color"), _invert, fallback=1),
+    # Mix of c and 1 - c by the factor.
+    "INVERT": Operation(_sockets("Fac", "Color"), lambda node, socket, a: a[1] + (1 - 2 * a[1]) * _grey(a[0]), 1),
     "GAMMA": Operation(_sockets("Color", "Gamma"), _gamma),
     "BRIGHTCONTRAST": Operation(_sockets("Color", ("Bright", "Brightness"), "Contrast"), _bright_contrast),
     "RGBTOBW": Operation(_sockets("Color"), lambda node, socket, a: _grey(a[0])),

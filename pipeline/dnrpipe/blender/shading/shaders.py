@@ -21,7 +21,6 @@ class ShaderWalker(PrincipledShader, MixShaders, VolumeShaders):
     """Walks the shader tree of one material."""
 
     def material(self) -> Surface:
-        """The material's surface."""
         tree = self.blender.node_tree
         if tree is None:
             return self._viewport_material()

@@ -15,9 +15,10 @@ import bpy
 import numpy as np
 
 from ..baking.cache import BakeCache
+from ..baking.regions import Part
 from ..baking.trees import ACTIVE_COLOUR
 from ..findings import Findings
-from ..geometry.corner_colours import colour_corners, is_uv_layer
+from ..geometry.corner_colours import colour_corners
 from ..tasks import ValueKind
 from .color_nodes import OPERATIONS
 from .filtering import finer
@@ -121,7 +122,6 @@ class Evaluator:
         self.note("approximated", feature, text)
 
     def note(self, kind: Any, feature: str, text: str) -> None:
-        """Record a finding for this material."""
         self.findings.add(kind, feature, text, material=self.material)
 
     def _value(self, socket: Any, scope: Scope) -> Value:
@@ -256,16 +256,19 @@ class Evaluator:
         self._inexact("image extension Clip", "edge texels are repeated")
         return placement
 
+    @property
+    def _parts(self) -> list[Part]:
+        """The triangles that carry the material; none where nothing is baked."""
+        return [] if self.bakes is None or self.material is None else self.bakes.atlas.parts(self.material)
+
     def _is_active(self, layer: str) -> bool:
         """Whether a named UV layer is the active one on all of the material's surface."""
-        parts = [] if self.bakes is None or self.material is None else self.bakes.atlas.parts(self.material)
-        return bool(parts) and all(part.mesh.active_uv == layer for part in parts)
+        return bool(self._parts) and all(part.mesh.active_uv == layer for part in self._parts)
 
     def _is_other_attribute(self, name: str) -> bool:
         """Whether ``name`` is a mesh attribute, but no UV layer."""
-        parts = [] if self.bakes is None or self.material is None else self.bakes.atlas.parts(self.material)
-        layers = any(name in part.mesh.uv_layers for part in parts)
-        return not layers and any(name in part.mesh.colors for part in parts)
+        layers = any(name in part.mesh.uv_layers for part in self._parts)
+        return not layers and any(name in part.mesh.colors for part in self._parts)
 
     def _affine(self, socket: Any, scope: Scope) -> np.ndarray:
         """Mean of a vector socket of a Mapping node."""
@@ -279,7 +282,7 @@ class Evaluator:
         if self.bakes is None or self.material is None:
             return False
         affine = np.asarray(placement.to_uv)
-        for part in self.bakes.atlas.parts(self.material):
+        for part in self._parts:
             layer = part.mesh.uv_layers.get(placement.uv or part.mesh.active_uv or "")
             if layer is not None:
                 uv = layer[part.corners] @ affine[:2, :2].T + affine[:2, 2]
@@ -299,7 +302,7 @@ class Evaluator:
             return constant(0.0)
         values = colour_corners(self.bakes, self.material, name) if self.bakes and self.material else None
         if values is None:
-            if self.exact and self.bakes is not None and is_uv_layer(self.bakes, self.material or "", name):
+            if self.exact and any(name in part.mesh.uv_layers for part in self._parts):
                 raise Inexact(f"UV layer '{name}' as a colour", "black is used")
             self.note("missing", f"attribute '{name}'", "not found on the mesh: black, as Cycles renders it")
             return constant(0.0)

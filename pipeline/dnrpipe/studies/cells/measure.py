@@ -12,7 +12,7 @@ import numpy as np
 from dnrtrain.exr import read_metadata
 
 from ...core.errors import UserError
-from ...core.images import flip_error, write_png
+from ...core.images import flip_error, picture_of, write_png
 from ...core.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -94,8 +94,8 @@ def measure(
         rows.append({"name": name, **row})
     if keep is not None:
         middle = views.index(pictured(rows)["name"])
-        write_png(keep, _image(pictures[middle]))
-        write_png(keep.parent / "truth.png", _image(target[middle]))
+        write_png(keep, picture_of(pictures[middle]))
+        write_png(keep.parent / "truth.png", picture_of(target[middle]))
     return rows
 
 
@@ -104,16 +104,12 @@ def view_metrics(picture: Tensor, target: Tensor, mask: Tensor, lpips: Any) -> d
     from dnrtrain.metrics import image_metrics
 
     metrics = image_metrics(picture, target, mask, lpips)
-    return {**metrics, "flip": flip_error(_image(target[0]), _image(picture[0]))[0]}
+    return {**metrics, "flip": flip_error(picture_of(target[0]), picture_of(picture[0]))[0]}
 
 
 def pictured(tests: list[dict[str, Any]]) -> dict[str, Any]:
     """The test view whose picture is kept: the middle one, the same for every row."""
     return tests[len(tests) // 2]
-
-
-def _image(tensor: Tensor) -> np.ndarray:
-    return tensor.float().clamp(0, 1).permute(1, 2, 0).cpu().numpy()
 
 
 METRICS = ("psnr", "psnr_mask", "ssim", "ssim_mask", "lpips_vgg", "lpips_alex", "flip", "ceiling")

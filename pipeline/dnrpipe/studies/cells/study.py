@@ -88,7 +88,6 @@ class Study(ABC, Generic[Place]):
     """What to run, and the state of the run.
 
     Args:
-        sources: scene files.
         base: settings of all cells.
         seconds: of training, None: the preset's epochs.
         jobs: workers; 0: one per core, one on a GPU.
@@ -150,7 +149,6 @@ class Study(ABC, Generic[Place]):
         """Prepare all scenes and trace their references."""
 
     def run_seed(self, seed: int) -> None:
-        """Make the seed's cells."""
         self.plan_cells(seed)
         tasks = [task for task in self.cells.values() if task.seed == seed]
         self.worker_pool.work(f"cells, seed {seed}", CELL_WORKER, tasks)
@@ -197,14 +195,11 @@ class Study(ABC, Generic[Place]):
         """Train on the views and measure.
 
         Args:
-            scene, settings, seed: of the cell.
             traced: fingerprints of the training views' pictures.
             coarse: the model that step 2 starts from.
             bases: fingerprints of base images by split and view; {} where none are read.
-            label: in messages, after the scene.
             network, full_step1: of `CellTask`.
             spp: of the training views' pictures, None: the settings'.
-            picture: whether a test view is kept.
         """
         views, seconds = (list(traced), self.seconds) if network else ([], None)
         model, step2 = settings.model.model_dump(mode="json"), settings.finetune.step2.model_dump(mode="json")

@@ -8,7 +8,6 @@ from .records import FrontierResults
 
 
 def markdown(results: FrontierResults) -> str:
-    """All of it."""
     code = f", commit {results.commit[:7]}" if results.commit else ""
     lines = [
         f"# What accuracy costs in time: {results.scene}",

@@ -31,7 +31,6 @@ class Record(BaseModel):
     model_config = ConfigDict(frozen=True)
 
     def data(self) -> dict[str, Any]:
-        """As it stands in a file."""
         return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
 
 
@@ -53,7 +52,6 @@ class Point(Measured):
 
     Args:
         kind: ours; random and all: other views; paper: the paper's model; base: no network.
-        views, spp, steps: of its training.
         parts: seconds before the first frame, by kind of work; ``upfront`` is their sum.
         network_ms, base_ms: parts of a frame as they were measured in the point's own cell.
         frame_ms: a frame, once points of one model share the network's least milliseconds.

@@ -65,7 +65,6 @@ Answers = list[tuple[dict[str, Any], dict[str, Any]]]
 
 
 def pilot_path(workspace: Workspace) -> Path:
-    """``plan/pilot.json``."""
     return workspace.root / FOLDER / "pilot.json"
 
 
@@ -194,7 +193,6 @@ class Piloting:
         return LightPart(bake=bake, startup=max(0.0, took - bake.seconds), kept=kept)
 
     def base(self) -> BasePart:
-        """Base images of all views of the pilot."""
         common, light = self.renderer.common, self._light()
         if light is not None:
             common = common | {"light": str(light)}
@@ -215,7 +213,6 @@ class Piloting:
         )
 
     def training(self) -> TrainingPart:
-        """Short step 2s."""
         view, per_epoch = self.train[0], math.ceil(len(self.train) / self.settings.finetune.step2.batch)
         task = TrainTask(
             views=self.train,
@@ -230,7 +227,6 @@ class Piloting:
         return TrainingPart(views=len(self.train), spp=SPP, pixels=pixels, **result)
 
     def frames(self) -> FramePart:
-        """The held-out views, by all renderers."""
         task = FramesTask(
             views=self.held_out,
             folders=self._models(),

@@ -10,7 +10,6 @@ BUSY = 1.5
 
 
 def lines(plan: Plan, cores: int) -> list[str]:
-    """What the command prints."""
     load = plan.pilot.load
     found = [f"pilot: {duration(plan.pilot.seconds)}; base image alone {plan.base_psnr:.1f} dB"]
     if load is not None and load > BUSY * cores:
@@ -28,7 +27,6 @@ def lines(plan: Plan, cores: int) -> list[str]:
 
 
 def table(rows: list[Prediction]) -> list[str]:
-    """What each budget buys."""
     found = [f"{'expected time':>14}  {'PSNR, dB (9 in 10)':>22}  {'views':>5}  {'spp':>4}  {'steps':>5}  CPU"]
     for row in rows:
         choice, psnr = row.choice, row.psnr
@@ -39,7 +37,6 @@ def table(rows: list[Prediction]) -> list[str]:
 
 
 def choice(plan: Plan, chosen: Prediction) -> list[str]:
-    """The choice, its seconds, and why."""
     what, seconds, psnr = chosen.choice, chosen.seconds, chosen.psnr
     span = seconds.total
     stages = ", ".join(f"{name} {duration(getattr(seconds, name))}" for name in RENDERER_STAGES)
@@ -106,7 +103,6 @@ def route_lines(plan: Plan) -> list[str]:
 
 
 def actual_lines(plan: Plan) -> list[str]:
-    """Predicted against actual."""
     actual, chosen = plan.actual, plan.chosen
     assert actual is not None and chosen is not None  # it was carried out
     found = [f"{'':<10}{'predicted':>14}{'actual':>14}"]

@@ -92,7 +92,6 @@ class Gain:
 
 
 def load_prior() -> Prior:
-    """The prior that comes with the package."""
     text = (resources.files("dnrpipe.studies.planning") / "prior.json").read_text(encoding="utf-8")
     return Prior.model_validate_json(text)
 

@@ -220,12 +220,10 @@ class Plan(Record):
         base_psnr: of the base image alone, as a report would measure it.
         gain: dB that the network adds with many views and steps.
         chosen: None where a table was asked for, or where nothing reaches the target.
-        table: what each of a row of budgets buys.
         routes: to the wanted frames at ``routes_psnr``, the cheapest first.
         break_even: frames from which on training is cheaper than path tracing; None where it never is.
         train: whether the neural renderer is the cheapest route.
         carried_out: the choice once its steps fit the time that ray tracing left.
-        actual: what that took and gave.
     """
 
     model_config = ConfigDict(populate_by_name=True)
@@ -249,7 +247,6 @@ class Plan(Record):
     actual: Actual | None = None
 
     def data(self) -> dict[str, Any]:
-        """As it stands in the file."""
         return self.model_dump(mode="json", by_alias=True, exclude=set(OPTIONAL - self.model_fields_set))
 
 
@@ -265,5 +262,4 @@ def read_plan(root: Path) -> Plan | None:
 
 
 def write_plan(root: Path, plan: Plan) -> None:
-    """Write ``plan/plan.json``, atomically."""
     write_json(root / FOLDER / "plan.json", plan.data())

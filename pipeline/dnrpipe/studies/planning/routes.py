@@ -63,9 +63,7 @@ def routes(
     """All routes to ``frames`` frames at ``psnr`` dB, the cheapest that reaches it first.
 
     Args:
-        part: frames of the pilot.
         neural: the cheapest choice that reaches ``psnr``, None where none does.
-        light_seconds: of baking the light.
         scale: pixels of a frame over the pilot's.
     """
 

@@ -107,7 +107,6 @@ class Costs:
         return self._traced(views, spp) + self.light() + self._base(views)
 
     def finetune(self, steps: int, epochs: int) -> float:
-        """Step 2."""
         part = self.pilot.training
         assert part is not None
         step = getattr(part, self.clock) * self.work.trained / part.pixels

@@ -170,7 +170,6 @@ class Bench(Study[Place]):
             self._plan_pool(pool, places, starts)
 
     def _choice_task(self, pool: Pool, contender: Contender, settings: Settings, seed: int) -> ChoiceTask:
-        """A selection by the contender's policy."""
         policy, budget, inputs = contender.policy, settings.select.budget, pool.data.inputs
         if contender.kind == "step1":  # the preset's epochs: what step 1 takes is part of what its policy costs
             return self.step1_task(pool.data, settings, policy, seed)

@@ -46,7 +46,6 @@ class Pool:
 
     @property
     def folder(self) -> str:
-        """Name of the pool's folders."""
         return f"{self.scene}-{self.name}"
 
 

@@ -83,7 +83,6 @@ class Observed(ABC):
         return pieces.pixels / self.usual[pieces.keys]
 
     def take(self, pieces: Pieces) -> None:
-        """Count a view."""
         self.observed[pieces.keys] += self.observations(pieces)
 
     @abstractmethod
