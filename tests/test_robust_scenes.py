@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -49,13 +50,27 @@ class Made:
         self.error, self.image, self.numbers, self.warnings = error, image, numbers or {}, list(warnings)
 
 
+QUICK = {
+    *("again", "times 1e6", "1e5 away", "negative scale", "NaN corners", "zero normals", "NaN UVs"),
+    *("black", "sun of 1e6", "tiny emitter", "camera inside a mesh", "camera that looks at nothing"),
+}
+"""What the quick tests take; the slow half takes all."""
+
+
+def cases(names: Iterable[str]) -> list[Any]:
+    return [pytest.param(name, marks=() if name in QUICK else pytest.mark.robustness) for name in names]
+
+
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Made]:
-    """Every scene through the real workers, many in one process."""
+def made(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> dict[str, Made]:
+    """Every scene that a chosen test asks for through the real workers, many in one process."""
     root = tmp_path_factory.mktemp("robust")
+    items = [item for item in request.session.items if item.path == Path(__file__)]
+    asked = {"as it is", *(item.callspec.params["name"] for item in items)}
     log = root / "log.txt"
     (root / "many_tracer.py").write_text(WORKER)
     builders = {**robust_scenes.SAME, **{name: entry[0] for name, entry in robust_scenes.OWN.items()}}
+    builders = {name: build for name, build in builders.items() if name in asked}
     folders = {name: root / str(number) for number, name in enumerate(builders)}
     tasks = []
     for name, builder in builders.items():
@@ -103,7 +118,7 @@ def _outcomes(module: str, tasks: list[dict[str, Any]], log: Path, **options: An
     return {o.task["name"]: o for o in done if isinstance(o, TaskResult)}
 
 
-@pytest.mark.parametrize("name", list(robust_scenes.SAME)[1:])
+@pytest.mark.parametrize("name", cases(list(robust_scenes.SAME)[1:]))
 def test_what_must_not_matter_does_not(name: str, made: dict[str, Made]) -> None:
     """The picture is the plain still life's: mean within 1.5 %, pixels within noise but for single edge pixels.
 
@@ -123,7 +138,7 @@ def test_what_must_not_matter_does_not(name: str, made: dict[str, Made]) -> None
     assert np.quantile(difference, 0.9) < 0.1, np.quantile(difference, 0.9)
 
 
-@pytest.mark.parametrize("name", robust_scenes.OWN)
+@pytest.mark.parametrize("name", cases(robust_scenes.OWN))
 def test_extremes_of_light_and_camera(name: str, made: dict[str, Made]) -> None:
     ours = made[name]
     assert ours.error is None, ours.error

@@ -20,7 +20,10 @@ REPO = Path(__file__).resolve().parents[1]
 ROW = re.compile(r"^\| (?P<case>.+?) \| (?P<happens>.+) \| (?P<test>.*?) \|$")
 TEST = re.compile(r"^`(?P<file>tests/[\w/]+\.py)::(?P<function>\w+)(?:\[(?P<case>.+)\])?`$")
 COUNTS = re.compile(r"(<!-- counts -->\n).*?(<!-- end -->)", re.DOTALL)
-SCENES = ("tests/robust_scenes.py", "tests/nasty_scenes.py")
+SCENES = tuple(
+    f"tests/{name}.py"
+    for name in ("robust_scenes", *(f"nasty_{kind}" for kind in ("scenes", "materials", "images", "objects")))
+)
 
 
 @dataclass(frozen=True)
