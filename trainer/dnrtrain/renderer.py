@@ -105,6 +105,7 @@ class HalfUNet(nn.Module):
         with torch.autocast(first.device.type, dtype=torch.bfloat16, enabled=bfloat16):
             detail = self.point[0](first)
             for layer, maps in zip(self.point[1:], groups[1:], strict=True):
+                assert isinstance(layer, nn.Conv2d)
                 detail = add_pointwise(detail, layer, maps)
             detail = pad_to_multiple(F.leaky_relu(detail, SLOPE), 2 << self.depth)
             context = self.unet.head(self.unet.features(F.leaky_relu(self.gather(detail), SLOPE)))

@@ -30,7 +30,7 @@ class Recorded:
     def __init__(self, function: Callable[..., Any]) -> None:
         import drjit as dr
 
-        self.frozen = dr.freeze(function)
+        self.frozen: Any = dr.freeze(function)
 
     @property
     def n_recordings(self) -> int:

@@ -170,4 +170,4 @@ def _small(image: np.ndarray) -> Any:
         return image
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     channels = [Image.fromarray(channel) for channel in np.moveaxis(image, -1, 0).astype(np.float32, order="C")]
-    return np.stack([channel.resize(size, Image.Resampling.BOX) for channel in channels], axis=-1)
+    return np.stack([np.asarray(channel.resize(size, Image.Resampling.BOX)) for channel in channels], axis=-1)

@@ -152,7 +152,8 @@ def register(mi: Any) -> None:
                 coat = below * weight * coat_boost
                 inside = dr.safe_sqrt(1 - (1 - m * m) / self.coat_eta**2)
                 colour = dr.clip(self.textures["coat_tint"].eval(si, active), 1e-4, 1)
-                passed = 1 + (dr.power(colour, 1 / dr.maximum(inside, 1e-3)) - 1) * weight
+                through: Any = dr.power(colour, 1 / dr.maximum(inside, 1e-3))
+                passed = 1 + (through - 1) * weight
                 below = below * (1 - dr.clip(albedo, 0, 1)) * passed
                 coat_odds = albedo
             else:
