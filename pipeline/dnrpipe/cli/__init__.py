@@ -18,7 +18,7 @@ from ..core.errors import UserError
 from . import information, stages
 from .export import export_gltf, export_nerf, export_onnx, export_web
 from .plan import frontier, plan
-from .service import bench_live, cancel, jobs, logs, retry, serve, submit
+from .service import cancel, jobs, logs, retry, serve, submit
 from .studies import ablate, bench_select
 
 _EXTRAS = {
@@ -75,7 +75,7 @@ for _command in (
     frontier,
     ablate,
     bench_select,
-    *(serve, submit, jobs, logs, cancel, retry, bench_live),
+    *(serve, submit, jobs, logs, cancel, retry),
     information.status,
     information.verify,
     information.costs,

@@ -1,4 +1,4 @@
-"""Commands of the service: serve; submit, jobs, logs, cancel, retry, which talk to a server; bench-live."""
+"""Commands of the service: serve; submit, jobs, logs, cancel, retry, which talk to a server."""
 
 from __future__ import annotations
 
@@ -110,31 +110,6 @@ def serve(
     console = Console()
     console.say(f"serving {root.resolve()}, workers: {', '.join(chosen)}; Ctrl-C stops, jobs go on at the next start")
     run_server(config, token, ready=lambda address: console.say(f"dashboard: {address}"))
-
-
-@click.command("bench-live")
-@click.argument("workspace")
-@click.option("--server", metavar="URL", help="A running server (default: one is started for the measurement).")
-@click.option("--size", type=click.IntRange(64, 1024), default=256, show_default=True, metavar="PIXELS")
-@click.option("--seconds", type=click.FloatRange(1, 600), default=15.0, show_default=True)
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def bench_live(workspace: str, server: str | None, size: int, seconds: float, as_json: bool) -> None:
-    """Measure the live viewer: frames per second of an orbiting camera, over the WebSocket.
-
-    WORKSPACE is a folder, or a workspace's name with --server. Says how busy the machine was meanwhile.
-
-    \b
-    Examples:
-      dnrpipe bench-live scene.dnr
-      dnrpipe bench-live scene --server http://127.0.0.1:8420 --size 512
-    """
-    from ..service.live_bench import bench, lines
-
-    console = Console(json_mode=as_json)
-    result = bench(workspace, server, size=size, seconds=seconds, console=console)
-    for line in lines(result):
-        console.say(line)
-    console.result(result)
 
 
 @click.command()

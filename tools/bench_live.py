@@ -1,7 +1,14 @@
-"""`dnrpipe bench-live`: frames per second of an orbiting camera, end to end over the WebSocket."""
+"""Frames per second of the live viewer for an orbiting camera, end to end over the WebSocket; how busy the machine was.
+
+    python -m tools.bench_live scene.dnr [--size 256] [--seconds 15] [--json]
+    python -m tools.bench_live scene --server http://127.0.0.1:8420
+
+The workspace is a folder, or a workspace's name with --server; without, a server is started for the measurement. Linux.
+"""
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import json
 import os
@@ -18,12 +25,12 @@ from typing import Any
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
-from ..core.console import Console
-from ..core.errors import UserError
-from ..core.workspace import SUFFIX
-from .guard import SUBPROTOCOL
-from .models import NAME_PATTERN
-from .routes_live import unpack
+from dnrpipe.core.console import Console
+from dnrpipe.core.errors import UserError
+from dnrpipe.core.workspace import SUFFIX
+from dnrpipe.service.guard import SUBPROTOCOL
+from dnrpipe.service.models import NAME_PATTERN
+from dnrpipe.service.routes_live import unpack
 
 WARM_FRAMES = 40
 """Frames before the measurement: they compile kernels and let the pace settle."""
@@ -126,7 +133,7 @@ def _cpu_times() -> tuple[float, float]:
     for entry in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError, ValueError, IndexError):
             words = (entry / "cmdline").read_bytes().split(b"\0")
-            if b"dnrpipe.service.live_frames" in words or b"bench-live" in words or b"serve" in words:
+            if b"dnrpipe.service.live_frames" in words or b"tools.bench_live" in words or b"serve" in words:
                 fields = (entry / "stat").read_text().rpartition(")")[2].split()
                 ours += (int(fields[11]) + int(fields[12])) / tick
     return user + nice + system + irq + soft + steal, ours
@@ -152,3 +159,27 @@ def _server(root: Path) -> Iterator[str]:
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tools.bench_live", description=__doc__)
+    parser.add_argument("workspace")
+    parser.add_argument("--server", metavar="URL", help="a running server (default: one is started)")
+    parser.add_argument("--size", type=int, default=256, metavar="PIXELS", help="side of the picture (default: 256)")
+    parser.add_argument("--seconds", type=float, default=15.0, help="how long to orbit (default: 15)")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    options = parser.parse_args()
+    console = Console(json_mode=options.json)
+    try:
+        result = bench(options.workspace, options.server, size=options.size, seconds=options.seconds, console=console)
+    except UserError as error:
+        print(error, file=sys.stderr)
+        return 2
+    for line in lines(result):
+        console.say(line)
+    console.result(result)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
