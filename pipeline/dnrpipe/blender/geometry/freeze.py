@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import bpy
@@ -19,6 +20,8 @@ from .simplify import fit_instances
 from .strands import hair_systems, read_curves, read_points
 from .world import REPAIRS, to_world
 
+COARSE = math.radians(15)
+"""Mean angle between shading normals and triangles, from which on what Cycles does at terminators shows."""
 SURFACELESS = {"VOLUME", "GREASEPENCIL"}
 
 LONGEST_STEM = 80  # characters of a name in file names: systems allow 255 bytes, and several names may be joined
@@ -122,6 +125,7 @@ def freeze(depsgraph: bpy.types.Depsgraph) -> Frozen:
     unique: dict[bytes, LocalMesh] = {}  # one mesh for all that evaluate to the same content
     placed: list[Placed] = []
     findings = Findings()
+    coarse: list[str] = []
     lit_by: set[str] = set()
     for instance in depsgraph.object_instances:
         obj = instance.object
@@ -139,10 +143,14 @@ def freeze(depsgraph: bpy.types.Depsgraph) -> Frozen:
                 local = read()
                 cache[key] = None
                 if local is not None and len(local.material_index):
+                    offset = getattr(obj, "shadow_terminator_geometry_offset", 0) > 0
+                    if offset and not local.strands and local.tilt() > COARSE:
+                        coarse.append(obj.name_full)
                     digest = local.digest()
                     cache[key] = unique.setdefault(digest, local), digest
             if (found := cache[key]) is not None:
                 placed.append(Placed(obj.name_full, persistent, matrix, *found, seen))
+    _note_terminator(coarse, findings)
     repairs: dict[str, int] = dict.fromkeys(REPAIRS, 0)
     ids: dict[str, int] = {}
     taken: set[str] = set()
@@ -228,6 +236,14 @@ def _surfaces(
     if show_particles and isinstance(data, bpy.types.Mesh):
         for name, read in hair_systems(obj, findings):
             yield (obj.name, data.as_pointer(), "hair", name), read
+
+
+def _note_terminator(coarse: Sequence[str], findings: Findings) -> None:
+    """Cycles starts shadow rays of smooth triangles a little off the surface (Shadow Terminator: Geometry Offset)."""
+    if coarse:
+        names = f"'{coarse[0]}'" if len(coarse) == 1 else f"{len(coarse)} objects, such as '{coarse[0]}'"
+        note = f"{names}: shadows keep the edges of coarse smooth meshes, which Cycles' Geometry Offset softens"
+        findings.add("approximated", "shadow terminator", note)
 
 
 def _note_sharing(shared: Shared, findings: Findings) -> None:

@@ -40,6 +40,17 @@ class LocalMesh:
     texture_space: TextureSpace = UNIT_TEXTURE_SPACE
     strands: bool = False
 
+    def tilt(self) -> float:
+        """Mean angle between a corner's normal and its triangle's, by area, in radians; 0 for flat shading."""
+        corners = self.positions.reshape(-1, 3, 3).astype(np.float64)
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = np.linalg.norm(cross, axis=1)
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            cosine = np.einsum("tcd,td->tc", self.normals.reshape(-1, 3, 3), cross / area[:, None])
+        angle = np.arccos(np.clip(cosine, -1, 1)).mean(axis=1)
+        fine = np.isfinite(angle) & np.isfinite(area)
+        return float(np.average(angle[fine], weights=area[fine])) if area[fine].sum() > 0 else 0.0
+
     def digest(self) -> bytes:
         """Hash of all content: equal for meshes that evaluate to the same geometry with the same materials."""
         state = hashlib.blake2b(digest_size=16)

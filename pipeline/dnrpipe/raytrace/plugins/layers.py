@@ -19,7 +19,7 @@ import numpy as np
 
 from . import energy
 from .energy import look_up, row_of, table_of
-from .nesting import parameter
+from .nesting import evaluated_once, parameter
 
 SHEEN_ROUGHNESS = (0.1, 0.3, 0.5, 0.7, 1.0)
 SHEEN_COSINES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
@@ -85,7 +85,7 @@ def register(mi: Any) -> None:
     def f0_of(eta: float) -> float:
         return ((eta - 1) / (eta + 1)) ** 2
 
-    class Principled(mi.BSDF):
+    class Principled(evaluated_once(mi)):
         """Textures ``base_color``, ``specular_tint``, ``sheen_tint``, ``coat_tint`` (colours) and ``roughness``,
         ``metallic``, ``coat``, ``sheen`` (scalars in [0, 1]); numbers ``eta``, ``coat_eta`` (>= 1),
         ``coat_roughness``, ``sheen_roughness``. One-sided, reflection only.
@@ -211,12 +211,6 @@ def register(mi: Any) -> None:
             front = active & (si.wi.z > 0) & (wo.z > 0)
             value, pdf = self._value(self._wanted(ctx, self._layers(si, front)), si.wi, wo)
             return dr.select(front, value, 0), dr.select(front, pdf, 0)
-
-        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self.eval_pdf(ctx, si, wo, active)[0]
-
-        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self.eval_pdf(ctx, si, wo, active)[1]
 
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
             front = active & (si.wi.z > 0)

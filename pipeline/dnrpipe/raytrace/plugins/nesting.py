@@ -1,4 +1,4 @@
-"""What plugins share: finding the objects nested in them."""
+"""What plugins share: finding the objects nested in them, numbers as data, one evaluation for value and density."""
 
 from __future__ import annotations
 
@@ -30,3 +30,16 @@ def parameter(mi: Any, value: float) -> Any:
     import drjit as dr
 
     return dr.opaque(mi.Float, value) if dr.is_jit_v(mi.Float) else value
+
+
+def evaluated_once(mi: Any) -> Any:
+    """Base class of BSDFs that define ``eval_pdf``: what asks for one half leaves the other to the compiler to drop."""
+
+    class EvaluatedOnce(mi.BSDF):
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self.eval_pdf(ctx, si, wo, active)[0]
+
+        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return self.eval_pdf(ctx, si, wo, active)[1]
+
+    return EvaluatedOnce

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .nesting import only
+from .nesting import evaluated_once, only
 
 LEAST_FACING = 0.01
 """Least cosine between a diffuse lobe's bent normal and the direction to the viewer."""
@@ -16,7 +16,7 @@ def register(mi: Any) -> None:
     """``dnr_normal`` for the current variant."""
     import drjit as dr
 
-    class BentNormal(mi.BSDF):
+    class BentNormal(evaluated_once(mi)):
         """``normal``: texture of unit normals, n * 0.5 + 0.5 (raw), in ``space`` world (default) or tangent. One
         nested BSDF.
 
@@ -108,16 +108,6 @@ def register(mi: Any) -> None:
             turned = bent.to_local(si.to_world(wo))
             good = active & (mi.Frame3f.cos_theta(wo) * mi.Frame3f.cos_theta(turned) > 0)
             return bent, turned, good
-
-        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            bent, turned, good = self._bent(si, wo, active)
-            return dr.select(
-                good, self.nested.eval(ctx, bent, turned, good) * self._softened(si.sh_frame.n, bent, turned, wo), 0
-            )
-
-        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            bent, turned, good = self._bent(si, wo, active)
-            return dr.select(good, self.nested.pdf(ctx, bent, turned, good), 0)
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
             bent, turned, good = self._bent(si, wo, active)

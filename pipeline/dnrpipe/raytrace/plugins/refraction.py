@@ -8,14 +8,14 @@ from typing import Any
 
 from . import energy
 from .energy import look_up, row_of, table_of
-from .nesting import only, parameter
+from .nesting import evaluated_once, only, parameter
 
 
 def register(mi: Any) -> None:
     """``dnr_refraction`` and ``dnr_interface`` for the current variant."""
     import drjit as dr
 
-    class Scaled(mi.BSDF):
+    class Scaled(evaluated_once(mi)):
         """A nested BSDF times `_gain`."""
 
         def _nest(self, props: Any, name: str) -> None:
@@ -29,12 +29,6 @@ def register(mi: Any) -> None:
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
             found, weight = self.nested.sample(self._context(ctx), si, sample1, sample2, active)
             return found, weight * self._gain(si, found.wo, active)
-
-        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self.nested.eval(self._context(ctx), si, wo, active) * self._gain(si, wo, active)
-
-        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self.nested.pdf(self._context(ctx), si, wo, active)
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
             value, density = self.nested.eval_pdf(self._context(ctx), si, wo, active)
@@ -81,8 +75,10 @@ def register(mi: Any) -> None:
             found, weight = super().sample(ctx, si, sample1, sample2, active)
             return found, dr.select(active, weight, 0)
 
-        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return super().eval(ctx, si, wo, active & self._asked(ctx))
+        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+            active = active & self._asked(ctx)
+            value, density = super().eval_pdf(ctx, si, wo, active)
+            return dr.select(active, value, 0), dr.select(active, density, 0)
 
         def to_string(self) -> str:
             return "dnr_refraction[]"

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from .nesting import nested
+from .nesting import evaluated_once, nested
 
 
 def register(mi: Any) -> None:
     """``dnr_add`` for the current variant."""
     import drjit as dr
 
-    class Sum(mi.BSDF):
+    class Sum(evaluated_once(mi)):
         """Two nested BSDFs f and g: f + g, sampled by one of them at even odds. It may reflect more than it gets."""
 
         def __init__(self, props: Any) -> None:
@@ -39,12 +39,6 @@ def register(mi: Any) -> None:
             weight = dr.select(delta, weight * 2, value / dr.maximum(density, 1e-30))
             found.pdf = dr.select(usable, found.pdf, 0)
             return found, dr.select(usable, weight, 0)
-
-        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self.f.eval(ctx, si, wo, active) + self.g.eval(ctx, si, wo, active)
-
-        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return 0.5 * (self.f.pdf(ctx, si, wo, active) + self.g.pdf(ctx, si, wo, active))
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
             value_f, pdf_f = self.f.eval_pdf(ctx, si, wo, active)

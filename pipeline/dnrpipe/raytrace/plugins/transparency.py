@@ -6,14 +6,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from .nesting import nested
+from .nesting import evaluated_once, nested
 
 
 def register(mi: Any) -> None:
     """``dnr_transparent`` and ``dnr_translucent`` for the current variant."""
     import drjit as dr
 
-    class Transparent(mi.BSDF):
+    class Transparent(evaluated_once(mi)):
         """Mitsuba's ``mask`` with a colour: opacity a, tint c, nested f: ``a f + (1 - a) c`` straight on.
 
         ``transmittance``: texture c (default 1). ``opacity``: texture a in [0, 1] (default 0). A nested BSDF, to be
@@ -58,16 +58,6 @@ def register(mi: Any) -> None:
             found.pdf *= opacity
             return dr.select(through, straight, found), dr.select(through, tint, weight)
 
-        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            if self.nested is None:
-                return mi.Spectrum(0.0)
-            return self.nested.eval(ctx, si, wo, active) * self._opacity(si, active)
-
-        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            if self.nested is None:
-                return mi.Float(0.0)
-            return self.nested.pdf(ctx, si, wo, active) * self._opacity(si, active)
-
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
             if self.nested is None:
                 return mi.Spectrum(0.0), mi.Float(0.0)
@@ -98,7 +88,7 @@ def register(mi: Any) -> None:
 
     mi.register_bsdf("dnr_transparent", Transparent)
 
-    class Translucent(mi.BSDF):
+    class Translucent(evaluated_once(mi)):
         """Lambertian, but to the other side: ``color`` / π for wo across the surface from wi, 0 elsewhere.
 
         ``color``: texture in [0, 1], the share that comes through. Both sides are alike.
@@ -123,12 +113,6 @@ def register(mi: Any) -> None:
             found.wo, found.eta = wo, 1.0
             found.sampled_type = mi.UInt32(int(mi.BSDFFlags.DiffuseTransmission))
             return found, dr.select(good, self._color(si, good), 0)
-
-        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self.eval_pdf(ctx, si, wo, active)[0]
-
-        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            return self.eval_pdf(ctx, si, wo, active)[1]
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
             if not ctx.is_enabled(mi.BSDFFlags.DiffuseTransmission, 0):
