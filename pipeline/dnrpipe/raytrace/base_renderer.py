@@ -66,7 +66,7 @@ class BaseRenderer:
         self.tables = mi.UInt32(ORDER.ravel()), self.paths.steps
         prepare_emitters(mi, scene)
         # Recorded at the first call: tracing the plugins anew would take longer than the frame itself.
-        self.kernel = Recorded(self._kernel)
+        self.kernel = Recorded(self._kernel, scene)
 
     def frame(self, view: Any) -> dict[str, np.ndarray]:
         """Channels of BASE_CHANNELS and of the G-buffer: float32 [H, W] each, linear Rec.709, premultiplied.

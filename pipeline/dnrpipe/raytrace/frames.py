@@ -202,7 +202,6 @@ class Frames:
         mi, scene, integrator = self.mi, self.scene, self.integrator
         rays, means, prototype = self._rays, self._means, mi.load_dict({"type": "independent"})
 
-        @Recorded
         def kernel(camera: list[Any], seed: Any, samples: Any) -> list[Any]:
             sampler = prototype.fork()
             ray = rays(sampler, camera, seed, samples, spp, cells=1)
@@ -210,7 +209,7 @@ class Frames:
             colour = mi.Color3f(colour)
             return means([colour.x, colour.y, colour.z, dr.select(valid, mi.Float(1), mi.Float(0))], spp)
 
-        return kernel
+        return Recorded(kernel, scene)
 
     def _auxiliary_kernel(self, count: int) -> Any:
         import drjit as dr

@@ -31,6 +31,7 @@ from .lobes import (
     is_among,
     is_rough,
     lets_through,
+    media_of,
     reflectance,
     specular_context,
 )
@@ -64,8 +65,7 @@ class LightBaker:
         bsdfs = bsdfs_of(scene)
         self.unsplit = [b for b in bsdfs if ignores_context(b)]
         self.glossy = any(mi.has_flag(b.flags(), mi.BSDFFlags.Glossy) for b in bsdfs)
-        inner = [shape.interior_medium() for shape in scene.shapes() if shape.is_medium_transition()]
-        self.media = list({id(medium): medium for medium in inner if medium is not None}.values())
+        self.media = media_of(scene)
         self.lost = 0
 
     def bake(self, size: int, spp: int, seed: int) -> np.ndarray:

@@ -18,6 +18,12 @@ def bsdfs_of(scene: Any) -> list[Any]:
     return list({id(b): b for b in [shape.bsdf() for shape in scene.shapes()] if b is not None}.values())
 
 
+def media_of(scene: Any) -> list[Any]:
+    """The media inside the scene's shapes, each once."""
+    inner = [shape.interior_medium() for shape in scene.shapes() if shape.is_medium_transition()]
+    return list({id(medium): medium for medium in inner if medium is not None}.values())
+
+
 def lets_through(mi: Any, scene: Any) -> bool:
     """Whether a surface of the scene passes light straight on."""
     return any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in bsdfs_of(scene))

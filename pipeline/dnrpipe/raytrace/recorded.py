@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from .lobes import media_of
+
 
 @contextmanager
 def without_collection() -> Iterator[None]:
@@ -25,12 +27,18 @@ def without_collection() -> Iterator[None]:
 
 
 class Recorded:
-    """A function of Dr.Jit arrays, recorded at its first call and replayed afterwards."""
+    """A function of Dr.Jit arrays, recorded at its first call and replayed afterwards.
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    scene: what the function renders. Pointers to its media go in with the arguments: Dr.Jit finds emitters, shapes and
+    BSDFs from a scene, but no media, and refuses to record calls of them.
+    """
+
+    def __init__(self, function: Callable[..., Any], scene: Any = None) -> None:
         import drjit as dr
+        import mitsuba as mi
 
-        self.frozen: Any = dr.freeze(function)
+        media = [mi.MediumPtr(medium) for medium in media_of(scene)] if scene is not None else []
+        self.frozen: Any = dr.freeze(function, state_fn=lambda *arguments: media)
 
     @property
     def n_recordings(self) -> int:
