@@ -288,7 +288,7 @@ def test_water_takes_its_share_of_the_light_on_the_way(tmp_path: Path) -> None:
     basin = {"type": "cube", "to_world": place, "b": {"type": "dielectric", "int_ior": 1.33}, "interior": water}
     # A second medium: of several, Dr.Jit records calls only where it is told of them.
     aside = mi.ScalarTransform4f().translate([-3, 0, 0.4]).scale(0.1)
-    ink = basin | {"to_world": aside, "interior": {**water, "sigma_t": rgb(9.0, 8.0, 7.0)}}
+    ink = basin | {"to_world": aside, "interior": {**water, "sigma_t": rgb(0.9, 0.8, 0.7)}}
     matte = {"type": "twosided", "b": {"type": "diffuse", "reflectance": rgb(0.8, 0.8, 0.8)}}
     scene = corner_room(tmp_path, matte, matte, {"type": "constant"}, basin=basin, ink=ink)
     baked = LightBaker(mi, scene, onwards(23, kind="volpath")).bake(64, 512, 0)
