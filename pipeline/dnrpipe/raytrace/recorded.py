@@ -29,8 +29,9 @@ def without_collection() -> Iterator[None]:
 class Recorded:
     """A function of Dr.Jit arrays, recorded at its first call and replayed afterwards.
 
-    scene: what the function renders. Pointers to its media go in with the arguments: Dr.Jit finds emitters, shapes and
-    BSDFs from a scene, but no media, and refuses to record calls of them.
+    scene: what the function renders. Pointers to its media go in with the arguments: calls of media are refused where
+    the process holds others than the scene's (`second_targets`), unless a pointer says that all of them are meant. Of
+    emitters, shapes and BSDFs the scene holds such pointers.
     """
 
     def __init__(self, function: Callable[..., Any], scene: Any = None) -> None:
