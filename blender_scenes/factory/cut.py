@@ -105,7 +105,9 @@ def books(dice: Dice) -> Thing:
         for k in range(dice.whole(1, 6)):
             thick = dice.uniform(0.06, 0.18)
             book = _book(thick, dice.uniform(0.7, 1.0), dice.uniform(0.5, 0.7))
-            parts.append((Shape(book.points, book.faces, book.uv, [2 * (k % 3) * (1 - s) + s for s in book.slots]), thick))
+            parts.append(
+                (Shape(book.points, book.faces, book.uv, [2 * (k % 3) * (1 - s) + s for s in book.slots]), thick)
+            )
         level = sum(high + 0.001 for _, high in parts)
         roles = ("thing", "paper", "plain", "paper", "cloth")
         return Thing("Books", _piled(parts, dice, 0.04), roles, smooth=None, top=(0, 0, level, 0.22))

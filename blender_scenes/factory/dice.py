@@ -18,6 +18,12 @@ def linear(colour: Rgb) -> Rgb:
     return r, g, b
 
 
+def scaled(colour: Rgb, factor: float) -> Rgb:
+    """Lighter or darker by a factor."""
+    r, g, b = colour
+    return r * factor, g * factor, b * factor
+
+
 class Dice:
     """A seeded generator with the draws that scenes need."""
 
@@ -51,10 +57,11 @@ class Dice:
         return int(self.rng.integers(1 << 30))
 
     def shown(self, saturation: tuple[float, float] = (0.0, 0.85), value: tuple[float, float] = (0.12, 0.92)) -> Rgb:
-        """Display-encoded colour of any hue. Low saturations are as common as high ones are rare in rooms."""
+        """Display-encoded colour. Warm and weak hues are more common than others, as about us."""
         low, high = saturation
         strength = low + (high - low) * self.rng.random() ** 1.4
-        return colorsys.hsv_to_rgb(self.rng.random(), strength, self.rng.uniform(*value))
+        hue = self.rng.uniform(0.0, 0.15) if self.chance(0.4) else self.rng.random()
+        return colorsys.hsv_to_rgb(hue, strength, self.rng.uniform(*value))
 
     def colour(self, saturation: tuple[float, float] = (0.0, 0.85), value: tuple[float, float] = (0.12, 0.92)) -> Rgb:
         """Linear colour of any hue."""

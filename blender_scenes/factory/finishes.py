@@ -49,7 +49,9 @@ class Finishes:
                 self.grainy: 0.4,
             },
             "ground": {self.printed: 6.0, self.matte: 2.0, self.plastic: 1.0, self.brushed: 0.3, self.grainy: 0.5},
+            "terrain": {self.natural: 3.0, self.printed: 1.0, self.matte: 0.3},
             "wall": {self.printed: 3.0, self.paint: 4.0, self.grainy: 0.3},
+            "ceiling": {self.paint: 5.0, self.printed: 1.0},
             "wood": {self.timber: 3.0, self.paint: 1.0, self.plastic: 0.5},
             "cloth": {self.cloth: 3.0, self.velvet: 1.0, self.matte: 0.5},
             "metal": {self.metal: 3.0, self.brushed: 1.0, self.worn: 0.5},
@@ -177,6 +179,11 @@ class Finishes:
         if self.dice.chance(0.15):
             principled(made).inputs["Coat Weight"].default_value = 1.0
         return made
+
+    def natural(self) -> Material:
+        """Sand, soil, gravel or paving."""
+        made = material(self._number("Terrain"), (0.3, 0.28, 0.25), Roughness=self.dice.uniform(0.7, 1.0))
+        return self._dress(made, self.dice.pick([textures.grit, textures.grit, textures.chips, textures.tiles]), 1.0)
 
     def timber(self) -> Material:
         made = material(self._number("Timber"), (0.3, 0.2, 0.1), Roughness=self.dice.uniform(0.2, 0.7))

@@ -24,12 +24,16 @@ def table(dice: Dice) -> Thing:
     high, wide, deep = dice.uniform(0.15, 0.33), dice.uniform(0.35, 0.8), dice.uniform(0.3, 0.5)
     if dice.chance(0.35):
         radius = wide / 2
-        foot = lathe([(0.0, 0.0), (radius * 0.6, 0.0), (radius * 0.55, 0.02), (0.03, 0.04), (0.03, high), (0, high)], 28)
+        foot = lathe(
+            [(0.0, 0.0), (radius * 0.6, 0.0), (radius * 0.55, 0.02), (0.03, 0.04), (0.03, high), (0, high)], 28
+        )
         shape = join([lathe(rounded_disc(radius, high, high + 0.025, 0.008), 48), foot.painted(1)])
         return Thing("Round table", shape, ("wood", "metal"), top=(0, 0, high + 0.025, radius * 0.8))
     legs = [leg.painted(1) for leg in _legs(wide / 2 - 0.03, deep / 2 - 0.03, high, 0.03)]
     shape = join([box((wide, deep, 0.025), bevel=0.004, at=(0, 0, high + 0.0125), scale=2.0), *legs])
-    return Thing("Table", shape, ("wood", dice.pick(["wood", "metal"])), smooth=None, top=(0, 0, high + 0.025, deep * 0.45))
+    return Thing(
+        "Table", shape, ("wood", dice.pick(["wood", "metal"])), smooth=None, top=(0, 0, high + 0.025, deep * 0.45)
+    )
 
 
 def chair(dice: Dice) -> Thing:
@@ -130,7 +134,10 @@ def fireplace(dice: Dice) -> Thing:
     """A hearth with glowing embers."""
     wide, high, deep = 0.5, 0.4, 0.16
     parts = [box((0.1, deep, high), at=(s * (wide / 2 - 0.05), 0, high / 2)) for s in (-1, 1)]
-    parts += [box((wide, deep, 0.12), at=(0, 0, high + 0.06)), box((wide, 0.02, high), at=(0, deep / 2, high / 2)).painted(1)]
+    parts += [
+        box((wide, deep, 0.12), at=(0, 0, high + 0.06)),
+        box((wide, 0.02, high), at=(0, deep / 2, high / 2)).painted(1),
+    ]
     parts.append(box((wide + 0.08, deep + 0.06, 0.03), at=(0, -0.02, high + 0.135)).painted(2))
     for k in range(4):
         ember = ball(0.035, 6, 10).moved((-0.09 + 0.06 * k, -0.01, 0.035 + 0.02 * (k % 2)))

@@ -8,9 +8,9 @@ import bpy
 import numpy as np
 from building import area_light, flat_world, image_world, point_light, sun_light
 from mathutils import Vector
-from patterns import smoothstep, spectral_noise, studio_sky, texel_grid
+from patterns import SoftBox, smoothstep, spectral_noise, studio_sky, texel_grid
 
-from factory.dice import Dice, Rgb
+from factory.dice import Dice, Rgb, scaled
 
 WIDTH = 256  # of sky pictures
 
@@ -26,27 +26,27 @@ def tint(dice: Dice, strength: float = 0.5) -> Rgb:
     return (1.0, 1 - 0.55 * far, 1 - 1.2 * far) if kind == "warm" else (1 - 0.8 * far, 1 - 0.35 * far, 1.0)
 
 
-def _gradient(dice: Dice, boxes: list[tuple[float, float, float, float, Rgb]], strength: float) -> np.ndarray:
-    horizon = tuple(0.7 * c for c in tint(dice, 0.8))
+def _gradient(dice: Dice, boxes: list[SoftBox], strength: float) -> np.ndarray:
+    horizon = scaled(tint(dice, 0.8), 0.7)
     zenith = dice.pick([(0.16, 0.30, 0.70), (0.34, 0.50, 0.80), (0.5, 0.5, 0.52), (0.08, 0.10, 0.22), (0.6, 0.4, 0.4)])
-    ground = tuple(c * dice.uniform(0.1, 0.5) for c in (1.0, 0.9, 0.8))
-    return studio_sky(boxes, zenith, horizon, ground, strength, WIDTH)  # type: ignore[arg-type]
+    ground = scaled((1.0, 0.9, 0.8), dice.uniform(0.1, 0.5))
+    return studio_sky(boxes, zenith, horizon, ground, strength, WIDTH)
 
 
 def sky_picture(dice: Dice, kind: str) -> np.ndarray:
     """Linear radiance [H, 2H, 3]: "studio" soft boxes, "sun" in a clear sky, "clouds", or a "sunset"."""
     if kind == "studio":
-        boxes = [
+        boxes: list[SoftBox] = [
             (
                 dice.uniform(-180, 180),
                 dice.uniform(10, 75),
                 dice.log(5, 30),
                 dice.log(5, 25),
-                tuple(dice.log(2, 20) * c for c in tint(dice)),
+                scaled(tint(dice), dice.log(2, 20)),
             )
             for _ in range(dice.whole(1, 4))
         ]
-        return _gradient(dice, boxes, dice.log(0.05, 0.6))  # type: ignore[arg-type]
+        return _gradient(dice, boxes, dice.log(0.05, 0.6))
     sky = _gradient(dice, [], dice.uniform(0.4, 1.0))
     u, v = texel_grid(WIDTH // 2, WIDTH)
     azimuth, elevation = (0.5 - u) * 2 * np.pi, (v - 0.5) * np.pi
@@ -69,7 +69,9 @@ def image_sky(dice: Dice, kind: str) -> None:
     image_world("Sky", sky_picture(dice, kind), 1.0)
 
 
-def _spot(name: str, at: Rgb, target: Rgb, power: float, radius: float, angle: float, blend: float, colour: Rgb) -> None:
+def _spot(
+    name: str, at: Rgb, target: Rgb, power: float, radius: float, angle: float, blend: float, colour: Rgb
+) -> None:
     body = point_light(name, at, power, radius, colour)
     lamp = bpy.data.lights.new(name, "SPOT")
     lamp.energy, lamp.color, lamp.shadow_soft_size = power, colour, radius
@@ -80,13 +82,18 @@ def _spot(name: str, at: Rgb, target: Rgb, power: float, radius: float, angle: f
     body.rotation_euler = (Vector(target) - Vector(at)).to_track_quat("-Z", "Y").to_euler()
 
 
+def _point(values: np.ndarray) -> Rgb:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
 def lamp(dice: Dice, kind: str, reach: float, target: Rgb = (0, 0, 0.1), share: float = 1.0) -> None:
     """A lamp of ``kind`` above a scene of radius ``reach``, aimed near ``target``."""
     turn, lift = dice.uniform(0, 2 * np.pi), dice.uniform(0.35, 1.35)
     far = reach * dice.uniform(1.2, 2.2)
-    away = (np.cos(turn) * np.cos(lift), np.sin(turn) * np.cos(lift), np.sin(lift))
-    at: Rgb = tuple(float(t + far * a) for t, a in zip(target, away, strict=True))  # type: ignore[assignment]
-    aim: Rgb = tuple(float(t + 0.2 * reach * dice.uniform(-1, 1)) for t in target)  # type: ignore[assignment]
+    away = np.array([np.cos(turn) * np.cos(lift), np.sin(turn) * np.cos(lift), np.sin(lift)])
+    at = _point(np.array(target) + far * away)
+    aim = _point(np.array(target) + 0.2 * reach * dice.rng.uniform(-1, 1, 3))
     power, colour = 30 * far**2 * share * dice.log(0.4, 2.5), tint(dice)
     if kind == "area":
         wide = reach * dice.log(0.08, 1.2)
@@ -97,14 +104,13 @@ def lamp(dice: Dice, kind: str, reach: float, target: Rgb = (0, 0, 0.1), share: 
         angle = dice.uniform(25, 70)
         _spot("Spot lamp", at, aim, power * 2, reach * dice.log(0.005, 0.1), angle, dice.uniform(0, 0.8), colour)
     else:
-        away_from: Rgb = tuple(-a for a in away)  # type: ignore[assignment]
-        sun_light("Sun", away_from, 3 * share * dice.log(0.5, 2.5), dice.log(0.3, 12), colour)
+        sun_light("Sun", _point(-away), 3 * share * dice.log(0.5, 2.5), dice.log(0.3, 12), colour)
 
 
 def plain_world(dice: Dice, low: float, high: float) -> None:
     """One colour, dark to bright."""
     strength = dice.log(low, high)
-    flat_world(tuple(0.3 + 0.7 * c for c in tint(dice)), strength)  # type: ignore[arg-type]
+    flat_world(_point(0.3 + 0.7 * np.array(tint(dice))), strength)
 
 
 RIGS: dict[str, float] = {

@@ -9,11 +9,15 @@ from typing import Any
 import bpy
 import numpy as np
 
-SIZE, SAMPLES = 32, 8
+SIZE, SAMPLES, BLOCK = 32, 8, 4
 
 
 def surfaces() -> np.ndarray:
-    """Linear colours [N, 3] of the pixels that show a surface."""
+    """Linear colours [N, 3] of blocks of pixels that show a surface.
+
+    Blocks, as the display curve clips what noise makes bright and would call noisy scenes dark; and nothing clamped,
+    as lamps have any level before they are metered.
+    """
     scene: Any = bpy.context.scene
     render, cycles, settings = scene.render, scene.cycles, scene.render.image_settings
     wanted = {
@@ -26,6 +30,7 @@ def surfaces() -> np.ndarray:
         (render, "filepath"): render.filepath,
         (cycles, "samples"): SAMPLES,
         (cycles, "use_denoising"): False,
+        (cycles, "sample_clamp_indirect"): 0.0,
         (cycles, "use_adaptive_sampling"): False,
         (settings, "file_format"): "OPEN_EXR",
         (settings, "color_mode"): "RGBA",
@@ -42,8 +47,10 @@ def surfaces() -> np.ndarray:
         bpy.data.images.remove(image)
         for (owner, name), value in before.items():
             setattr(owner, name, value)
-    pixels = pixels.reshape(-1, 4)
-    return np.nan_to_num(pixels[pixels[:, 3] > 0.5][:, :3])
+    side = SIZE // BLOCK
+    blocks = np.nan_to_num(pixels).reshape(side, BLOCK, side, BLOCK, 4).mean(axis=(1, 3)).reshape(-1, 4)
+    blocks = blocks[blocks[:, 3] > 0.5]
+    return blocks[:, :3] / blocks[:, 3:]
 
 
 def factor_for(colours: np.ndarray, wanted: float) -> float:
@@ -63,8 +70,9 @@ def factor_for(colours: np.ndarray, wanted: float) -> float:
 
 def scale_light(factor: float) -> None:
     """Multiply all that shines: lamps, the world, emission."""
-    for lamp in bpy.data.lights:
-        lamp.energy *= factor  # type: ignore[attr-defined]
+    lamps: Any = bpy.data.lights
+    for lamp in lamps:
+        lamp.energy *= factor
     owners = [w for w in bpy.data.worlds if w.node_tree] + [m for m in bpy.data.materials if m.node_tree]
     for owner in owners:
         for node in owner.node_tree.nodes:

@@ -32,7 +32,7 @@ WEIGHTS: dict[str, float] = {
     "many": 2.5,
     "remix": 3.0,
 }
-ATTEMPTS = 4
+ATTEMPTS = 6
 
 
 def family_of(seed: int) -> str:
@@ -49,9 +49,11 @@ def make(seed: int, family: str | None = None) -> str:
     for attempt in range(ATTEMPTS):
         if _make(Dice(seed, 2, attempt), family):
             break
+    else:
+        raise RuntimeError(f"seed {seed} made no {family} that can be seen in {ATTEMPTS} attempts")
     scene = bpy.context.scene
     scene["factory_seed"], scene["factory_family"] = seed, family
-    scene.setdefault("factory_base", "") if hasattr(scene, "setdefault") else None
+    scene["factory_base"] = scene.get("factory_base", "")
     return family
 
 
@@ -68,7 +70,7 @@ def _make(dice: Dice, family: str) -> bool:
     view.view_transform = dice.weighted({"Standard": 4.0, "AgX": 2.0, "Filmic": 1.0})
     colours = meter.surfaces()
     wanted = 0.12 + 0.56 * float(dice.rng.beta(2.0, 2.4))
-    if len(colours) < 0.1 * meter.SIZE**2 or np.quantile(colours, 0.6) <= 1e-7 or clear < 0.2:
+    if len(colours) < 0.1 * (meter.SIZE / meter.BLOCK) ** 2 or np.quantile(colours, 0.6) <= 1e-7 or clear < 0.2:
         return False
     meter.scale_light(meter.factor_for(colours, wanted))
     return True

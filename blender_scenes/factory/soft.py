@@ -102,7 +102,14 @@ def leaves(dice: Dice, spots: np.ndarray, size: float, lean: tuple[float, float]
     """A card at each spot [N, 3], turned at random."""
     wide = dice.uniform(0.35, 0.8)
     cards = [
-        _card(size * dice.uniform(0.7, 1.2), size * wide, dice.uniform(0.1, 1.2), dice.uniform(*lean), dice.uniform(0, 360), p)
+        _card(
+            size * dice.uniform(0.7, 1.2),
+            size * wide,
+            dice.uniform(0.1, 1.2),
+            dice.uniform(*lean),
+            dice.uniform(0, 360),
+            p,
+        )
         for p in spots
     ]
     return join(cards)
@@ -148,7 +155,9 @@ def pot_plant(dice: Dice) -> Thing:
     for _ in range(dice.whole(4, 9)):
         turn, reach, tall = dice.uniform(0, 2 * np.pi), dice.uniform(0.02, 0.3), dice.uniform(0.3, 0.9)
         end = np.array([reach * np.cos(turn), reach * np.sin(turn), 0.3 + tall])
-        stalk = spline(np.array([end * np.array([0.2, 0.2, 0]) + (0, 0, 0.29), end * np.array([0.4, 0.4, 0.6]), end]), 4)
+        stalk = spline(
+            np.array([end * np.array([0.2, 0.2, 0]) + (0, 0, 0.29), end * np.array([0.4, 0.4, 0.6]), end]), 4
+        )
         parts.append(tube(stalk, 0.008, 6).painted(2))
         spots.append(stalk[4:])
     parts.append(leaves(dice, np.concatenate(spots), dice.uniform(0.2, 0.35), (-20, 60)).painted(3))

@@ -11,6 +11,7 @@ from solids import mesh_of, place
 from factory.dice import Dice
 from factory.finishes import Finishes
 from factory.thing import Thing
+from factory.things import small
 
 Point = tuple[float, float, float]
 
@@ -73,13 +74,13 @@ class Stage:
             self.put(fitted, (*spot, level), turn)
             highest = max(highest, level + float(fitted.size[2]))
             if fitted.top is not None and self.dice.chance(0.4):
-                from factory.things import small
-
                 x, y, z, radius = fitted.top
                 if radius < 0.025:
                     continue
                 upper = small(self.dice).fitted(radius, 2 * radius)
                 c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
-                self.put(upper, (spot[0] + c * x - s * y, spot[1] + s * x + c * y, level + z), self.dice.uniform(0, 360))
+                self.put(
+                    upper, (spot[0] + c * x - s * y, spot[1] + s * x + c * y, level + z), self.dice.uniform(0, 360)
+                )
                 highest = max(highest, level + z + float(upper.size[2]))
         return highest

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from patterns import mix, plain, planks, smoothstep, spectral_noise, texel_grid, weave, wood
 
-from factory.dice import Dice
+from factory.dice import Dice, scaled
 
 SIZE = 256
 Picture = tuple[np.ndarray, np.ndarray]
@@ -40,11 +40,11 @@ def boards(dice: Dice) -> Picture:
     """Planed wood or a floor of it."""
     light = dice.pick([(0.62, 0.44, 0.27), (0.78, 0.63, 0.45), (0.45, 0.29, 0.19), (0.72, 0.66, 0.58)])
     light = dice.near(light, 0.08)
-    dark = tuple(c * dice.uniform(0.45, 0.75) for c in light)
+    dark = scaled(light, dice.uniform(0.45, 0.75))
     if dice.chance(0.5):
-        colour = planks(SIZE, dice.seed(), dark, light, dice.whole(3, 8), dice.whole(1, 3))  # type: ignore[arg-type]
+        colour = planks(SIZE, dice.seed(), dark, light, dice.whole(3, 8), dice.whole(1, 3))
     else:
-        colour = wood(SIZE, SIZE, dice.seed(), dark, light, dice.uniform(3, 12))  # type: ignore[arg-type]
+        colour = wood(SIZE, SIZE, dice.seed(), dark, light, dice.uniform(3, 12))
     return colour, np.clip(colour.mean(axis=-1) * 1.3, 0, 1)
 
 
@@ -106,7 +106,9 @@ def marble(dice: Dice) -> Picture:
     vein = np.exp(-folds * dice.uniform(4, 12)) * _unit(_noise(dice, 1.6), 0.4)
     cloud = _unit(_noise(dice, 1.8, 1.0))
     base = dice.shown((0.0, 0.3), (0.3, 0.95))
-    colour = mix(mix(plain(SIZE, SIZE, base), dice.near(base, 0.15), cloud), dice.shown((0.0, 0.5)), np.clip(vein, 0, 1))
+    colour = mix(
+        mix(plain(SIZE, SIZE, base), dice.near(base, 0.15), cloud), dice.shown((0.0, 0.5)), np.clip(vein, 0, 1)
+    )
     return colour, cloud * 0.2
 
 
@@ -129,7 +131,9 @@ def blotches(dice: Dice) -> Picture:
     first = _unit(coarse, 0.3)
     if dice.chance(0.35):
         first = smoothstep(0.45, 0.55, first)
-    return mix(mix(plain(SIZE, SIZE, a), b, first), c, 0.4 * _unit(fine)), np.clip(0.6 * first + 0.4 * _unit(fine), 0, 1)
+    return mix(mix(plain(SIZE, SIZE, a), b, first), c, 0.4 * _unit(fine)), np.clip(
+        0.6 * first + 0.4 * _unit(fine), 0, 1
+    )
 
 
 def grit(dice: Dice) -> Picture:
@@ -207,7 +211,7 @@ def leaf(dice: Dice, size: int = 128) -> np.ndarray:
     u, v = texel_grid(size, size)
     x = np.abs(2 * u - 1)
     green = dice.pick([(0.2, 0.42, 0.12), (0.35, 0.5, 0.15), (0.55, 0.45, 0.15), (0.6, 0.2, 0.12), (0.16, 0.34, 0.2)])
-    light, dark = dice.near(green, 0.12), tuple(c * 0.6 for c in green)
+    light, dark = dice.near(green, 0.12), scaled(green, 0.6)
     kind = dice.pick(["oval", "lobed", "blade", "fern", "flower"])
     if kind == "oval":
         outline = dice.uniform(0.4, 0.9) * np.sin(np.pi * np.clip(v, 0, 1) ** dice.uniform(0.6, 1.1)) ** 0.8
@@ -240,6 +244,8 @@ def net(dice: Dice, size: int = 128) -> np.ndarray:
     count = dice.whole(3, 9)
     x, y = (u * count) % 1 - 0.5, (v * count) % 1 - 0.5
     open_share = dice.uniform(0.25, 0.42)
-    hole = dice.pick([np.hypot(x, y) < open_share, np.maximum(np.abs(x), np.abs(y)) < open_share, np.abs(x) < open_share])
+    hole = dice.pick(
+        [np.hypot(x, y) < open_share, np.maximum(np.abs(x), np.abs(y)) < open_share, np.abs(x) < open_share]
+    )
     colour = plain(size, size, dice.shown())
     return np.concatenate([colour, (~hole)[..., None] * 1.0], axis=-1)

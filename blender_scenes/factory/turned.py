@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from shapes import ball_profile, curve_profile, rounded_disc
-from solids import Shape, ball, join, lathe, tube
+from solids import Shape, ball, grid, join, lathe, tube
 
 from factory.dice import Dice
 from factory.thing import Thing, resting
@@ -44,7 +44,7 @@ def rod(dice: Dice) -> Thing:
 def cone(dice: Dice) -> Thing:
     tip = dice.pick([0.0, dice.uniform(0.1, 0.4)])
     profile = [(0.0, 0.0), (0.48, 0.0), (0.5, 0.02), (tip + 0.01, 1.0), (tip, 1.01), (0.0, 1.01)]
-    return Thing("Cone", lathe(profile if tip else profile[:-2] + [(0.0, 1.01)], dice.pick([4, 6, 40, 40])))
+    return Thing("Cone", lathe(profile if tip else [*profile[:-2], (0.0, 1.01)], dice.pick([4, 6, 40, 40])))
 
 
 def torus(dice: Dice) -> Thing:
@@ -98,7 +98,9 @@ def mug(dice: Dice) -> Thing:
     roles: tuple[str, ...] = ("ceramic",)
     if dice.chance(0.6):
         level = height * dice.uniform(0.6, 0.85)
-        parts.append(lathe([(0.0, level - 0.02), (waist - 0.045, level - 0.02), (waist - 0.045, level), (0, level)], 32))
+        parts.append(
+            lathe([(0.0, level - 0.02), (waist - 0.045, level - 0.02), (waist - 0.045, level), (0, level)], 32)
+        )
         parts[-1] = parts[-1].painted(1)
         roles = ("ceramic", "plain")
     return Thing("Mug", resting(join(parts)), roles)
@@ -139,15 +141,17 @@ def bottle(dice: Dice) -> Thing:
 def fruit(dice: Dice) -> Thing:
     """Apple, pear, orange, pumpkin: a dented ball with ribs and a stalk."""
     rows, columns = 22, 40
-    lat, turn = np.meshgrid(np.linspace(-np.pi / 2, np.pi / 2, rows + 1), np.linspace(0, 2 * np.pi, columns + 1), indexing="ij")
+    lat, turn = np.meshgrid(
+        np.linspace(-np.pi / 2, np.pi / 2, rows + 1), np.linspace(0, 2 * np.pi, columns + 1), indexing="ij"
+    )
     dent, ribs = dice.uniform(0.0, 0.4), dice.pick([0.0, 0.0, 0.08])
     reach = 0.5 * (1 - dent * np.abs(np.sin(lat)) ** 6) * (1 + ribs * np.cos(dice.whole(6, 10) * turn) * np.cos(lat))
     reach *= 1 - dice.pick([0.0, 0.35]) * np.clip(np.sin(lat), 0, 1)
     long = dice.uniform(0.8, 1.25)
-    profile = np.stack([reach * np.cos(lat) * np.cos(turn), reach * np.cos(lat) * np.sin(turn), long * reach * np.sin(lat)], -1)
+    profile = np.stack(
+        [reach * np.cos(lat) * np.cos(turn), reach * np.cos(lat) * np.sin(turn), long * reach * np.sin(lat)], -1
+    )
     uv = np.stack([turn / (2 * np.pi), lat / np.pi + 0.5], axis=-1)
-    from solids import grid
-
     profile[0, :, :2] = profile[-1, :, :2] = 0
     body = grid(profile[:, :-1], uv, wrap=True)
     top = profile[-1, 0, 2]
@@ -159,7 +163,9 @@ def candle(dice: Dice) -> Thing:
     """Wax with a flame."""
     tall = dice.uniform(0.5, 1.4)
     wax = lathe(rounded_disc(0.2, 0.0, tall, 0.03), 32)
-    flame = lathe(curve_profile([(0.0, tall + 0.03), (0.05, tall + 0.1), (0.025, tall + 0.2), (0.0, tall + 0.3)], 5), 16)
+    flame = lathe(
+        curve_profile([(0.0, tall + 0.03), (0.05, tall + 0.1), (0.025, tall + 0.2), (0.0, tall + 0.3)], 5), 16
+    )
     wick = lathe([(0.0, tall - 0.01), (0.008, tall - 0.01), (0.008, tall + 0.06), (0.0, tall + 0.06)], 8)
     dish = lathe([(0.0, -0.03), (0.3, -0.03), (0.34, 0.03), (0.32, 0.03), (0.28, 0.0), (0.0, 0.0)], 32)
     parts = [wax, flame.painted(1), wick.painted(2), dish.painted(3)]
@@ -181,7 +187,9 @@ def lantern(dice: Dice) -> Thing:
 def lamp(dice: Dice) -> Thing:
     """Table lamp: foot, stem, an open shade of cloth about a glowing bulb."""
     stem = dice.uniform(0.5, 0.9)
-    foot = curve_profile([(0.26, 0.0), (0.24, 0.05), (0.05, 0.12), (dice.uniform(0.03, 0.18), stem / 2), (0.03, stem)], 5)
+    foot = curve_profile(
+        [(0.26, 0.0), (0.24, 0.05), (0.05, 0.12), (dice.uniform(0.03, 0.18), stem / 2), (0.03, stem)], 5
+    )
     low, high, tall = dice.uniform(0.35, 0.5), dice.uniform(0.15, 0.4), dice.uniform(0.3, 0.5)
     shade = lathe([(low, stem - 0.05), (high, stem - 0.05 + tall)], 40).painted(1)
     bulb = ball(0.07, 10, 20).moved((0, 0, stem + 0.09)).painted(2)

@@ -37,7 +37,9 @@ def tangle(dice: Dice) -> Thing:
     """A cable thrown down, or twisted sculpture: a closed curve through random knots."""
     flat = dice.pick([0.12, 0.12, 0.9])
     knots = dice.rng.uniform(-0.45, 0.45, (dice.whole(5, 10), 3)) * np.array([1, 1, flat])
-    return Thing("Tangle", resting(tube(loop_spline(knots, 14), dice.uniform(0.012, 0.05), 8, closed=True)), _role(dice))
+    return Thing(
+        "Tangle", resting(tube(loop_spline(knots, 14), dice.uniform(0.012, 0.05), 8, closed=True)), _role(dice)
+    )
 
 
 def cage(dice: Dice) -> Thing:

@@ -6,12 +6,12 @@ from typing import Any
 
 import bpy
 import numpy as np
-from solids import box, lathe, mesh_of, place
 from shapes import rounded_disc
+from solids import ball, box, lathe, mesh_of, place
 
 from factory import cut, soft, turned
 from factory.dice import Dice
-from factory.families.table import _disc
+from factory.families.table import disc
 from factory.lighting import rig
 from factory.stage import Stage
 from factory.thing import Thing
@@ -83,7 +83,8 @@ def _heap(dice: Dice, count: int, reach: float) -> tuple[np.ndarray, float]:
             out.append(spot)
         layer, wide = layer + 1, wide - 1
     spots = np.array(out[:count])
-    return spots * min(1.0, reach / max(np.abs(spots[:, :2]).max(), 1e-6)), radius
+    fit = min(1.0, reach / max(np.abs(spots[:, :2]).max(), 1e-6))
+    return spots * fit, radius * fit
 
 
 def _bricks(stage: Stage, count: int) -> float:
@@ -140,7 +141,12 @@ def _dominoes(stage: Stage, count: int) -> float:
     tall = dice.uniform(0.12, 0.2)
     coin = lathe(rounded_disc(tall / 2, -0.012, 0.012, 0.004), 24)
     turn = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
-    shape = dice.pick([box((tall * 0.5, 0.022, tall), bevel=0.004, at=(0, 0, tall / 2)), coin.moved(turn=turn).moved((0, 0, tall / 2))])
+    shape = dice.pick(
+        [
+            box((tall * 0.5, 0.022, tall), bevel=0.004, at=(0, 0, tall / 2)),
+            coin.moved(turn=turn).moved((0, 0, tall / 2)),
+        ]
+    )
     meshes = [stage.mesh(Thing("Domino", shape, smooth=30), again=0.0) for _ in range(dice.whole(1, 3))]
     a = 0.0
     for k in range(min(count, 160)):
@@ -160,7 +166,7 @@ def build(stage: Stage) -> Draw:
     if dice.chance(0.5):
         stage.put(Thing("Floor", box((3.2, 3.2, 0.04), at=(0, 0, -0.0205)), ("ground",), smooth=None))
     else:
-        stage.put(Thing("Disc", _disc(1.55, 0.08), ("ground",)), (0, 0, -0.0005))
+        stage.put(Thing("Disc", disc(1.55, 0.08), ("ground",)), (0, 0, -0.0005))
     if kind == "bricks":
         height = _bricks(stage, count)
     elif kind == "city":
@@ -169,17 +175,17 @@ def build(stage: Stage) -> Draw:
         height = _dominoes(stage, count)
     else:
         count = min(count, 400) if kind == "heap" else count
-        spots, radius = {"grid": _lattice, "heap": _heap}[kind](dice, count, 0.95) if kind != "spiral" else _spiral(count, 1.0)
-        meshes = [lathe_ball(stage, radius)] if kind == "heap" else []
+        spots, radius = (
+            {"grid": _lattice, "heap": _heap}[kind](dice, count, 0.95) if kind != "spiral" else _spiral(count, 1.0)
+        )
+        meshes = [_heap_ball(stage, radius)] if kind == "heap" else []
         meshes = meshes or _pool(stage, radius, dice.whole(1, 4), TRIANGLES // len(spots))
         _strew(stage, meshes, spots, dice.rng.uniform(0, 360, len(spots)))
         height = float(spots[:, 2].max()) + 2 * radius
     rig(dice, 1.4, (0, 0, height / 3))
-    return around((0, 0, height / 3), max(dice.uniform(0.4, 1.0), height * 0.6), elevation=(10.0, 60.0))
+    return around((0, 0, height / 3), max(dice.uniform(0.5, 1.15), height * 0.6), elevation=(10.0, 60.0))
 
 
-def lathe_ball(stage: Stage, radius: float) -> bpy.types.Mesh:
+def _heap_ball(stage: Stage, radius: float) -> bpy.types.Mesh:
     """A ball of a heap: its layers fit balls."""
-    from solids import ball
-
     return stage.mesh(Thing("Ball", ball(radius * 0.995, 8, 14).moved((0, 0, radius))), again=0.0)

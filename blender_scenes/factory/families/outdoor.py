@@ -26,7 +26,7 @@ def _ground(dice: Dice) -> Thing:
     far = np.clip(np.hypot(x, y) / REACH - 0.75, 0, 1)
     z = 0.5 * far * np.abs(spectral_noise(cells, cells, dice.seed(), slope=1.9)) - 0.002
     repeat = dice.pick([2.0, 4.0, 6.0])
-    return Thing("Ground", grid(np.stack([x, y, z], axis=-1), grid_uv(cells, cells, repeat, repeat)), ("ground",), 70)
+    return Thing("Ground", grid(np.stack([x, y, z], axis=-1), grid_uv(cells, cells, repeat, repeat)), ("terrain",), 70)
 
 
 def fence(dice: Dice, length: float) -> Thing:
@@ -38,7 +38,13 @@ def fence(dice: Dice, length: float) -> Thing:
     for x in np.arange(-length / 2, length / 2, step):
         wide = step * 0.6
         if pointed:
-            outline = [(-wide / 2, 0.0), (wide / 2, 0.0), (wide / 2, high - 0.04), (0.0, high), (-wide / 2, high - 0.04)]
+            outline = [
+                (-wide / 2, 0.0),
+                (wide / 2, 0.0),
+                (wide / 2, high - 0.04),
+                (0.0, high),
+                (-wide / 2, high - 0.04),
+            ]
             board = extruded(outline, 0.015).moved(turn=np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]))
             parts.append(board.moved((x, 0, 0)))
         else:
@@ -73,7 +79,10 @@ def bench(dice: Dice) -> Thing:
     parts += [box((0.7, 0.015, 0.06), at=(0, 0.12, 0.28 + 0.08 * k)) for k in range(2)]
     for s in (-0.28, 0.28):
         path = np.array([(s, -0.09, 0.0), (s, -0.09, 0.19), (s, 0.1, 0.19), (s, 0.13, 0.4)])
-        parts += [tube(path, 0.012, 8).painted(1), tube(np.array([(s, 0.1, 0.19), (s, 0.12, 0.0)]), 0.012, 8).painted(1)]
+        parts += [
+            tube(path, 0.012, 8).painted(1),
+            tube(np.array([(s, 0.1, 0.19), (s, 0.12, 0.0)]), 0.012, 8).painted(1),
+        ]
     return Thing("Bench", join(parts), ("wood", "metal"), smooth=40)
 
 
@@ -108,8 +117,15 @@ def build(stage: Stage) -> Draw:
         if spot is not None:
             radius = stage.taken[-1][2]
             pool = lathe([(0.0, 0.0), (radius * 0.93, 0.0), (radius * 0.93, 0.012), (0.0, 0.012)], 48)
-            rim = tube(radius * np.array([(np.cos(a), np.sin(a), 0.03) for a in np.arange(32) * np.pi / 16]), 0.03, 8, closed=True)
-            stage.put(Thing("Pool", join([pool, rim.painted(1)]), (dice.pick(["liquid", "mirror"]), "ground")), (*spot, 0))
+            rim = tube(
+                radius * np.array([(np.cos(a), np.sin(a), 0.03) for a in np.arange(32) * np.pi / 16]),
+                0.03,
+                8,
+                closed=True,
+            )
+            stage.put(
+                Thing("Pool", join([pool, rim.painted(1)]), (dice.pick(["liquid", "mirror"]), "ground")), (*spot, 0)
+            )
     plants = [soft.tree, soft.bush, soft.tuft, soft.pot_plant]
     others = [soft.rock, soft.rock, cut.house, cut.crate, cut.stairs, bench, furniture.table, furniture.chair]
     makers = [dice.pick(plants) for _ in range(dice.whole(1, 4))] + [dice.pick(others) for _ in range(dice.whole(1, 4))]

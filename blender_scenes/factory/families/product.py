@@ -8,7 +8,7 @@ from solids import box
 
 from factory import cut, soft, turned, wiry
 from factory.dice import Dice
-from factory.families.table import _disc, _sweep
+from factory.families.table import backdrop, disc
 from factory.lighting import lamp, plain_world, rig
 from factory.stage import Stage
 from factory.thing import Thing
@@ -41,9 +41,9 @@ def build(stage: Stage) -> Draw:
     dice = stage.dice
     kind = dice.weighted({"paper": 3.0, "disc": 2.0, "floor": 2.0, "mirror": 0.8, "none": 1.0})
     if kind == "paper":
-        stage.put(_sweep(dice, 1.1))
+        stage.put(backdrop(dice, 1.1))
     elif kind == "disc":
-        stage.put(Thing("Disc", _disc(0.75, dice.uniform(0.03, 0.4)), (dice.pick(["plain", "ground", "metal"]),)))
+        stage.put(Thing("Disc", disc(0.75, dice.uniform(0.03, 0.4)), (dice.pick(["plain", "ground", "metal"]),)))
     elif kind in ("floor", "mirror"):
         role = "mirror" if kind == "mirror" else dice.pick(["plain", "ground"])
         stage.put(Thing("Floor", box((3.0, 3.0, 0.04), at=(0, 0, -0.02)), (role,), smooth=None))
@@ -61,4 +61,4 @@ def build(stage: Stage) -> Draw:
         rig(dice, 1.0, (0, 0, height / 2))
     azimuth = (-50.0, 50.0) if kind == "paper" else (-180.0, 180.0)
     elevation = (-10.0, 40.0) if kind == "none" else (6.0, 45.0)
-    return around((0, 0, 0.42 * height), max(0.42 * height, 0.45), azimuth=azimuth, elevation=elevation)
+    return around((0, 0, 0.42 * height), max(0.62 * height, 0.55), azimuth=azimuth, elevation=elevation)

@@ -87,9 +87,7 @@ def _relight(dice: Dice, reach: float, target: tuple[float, float, float]) -> No
 
 
 def _bounds() -> tuple[np.ndarray, np.ndarray]:
-    corners = [
-        o.matrix_world @ Vector(c) for o in bpy.data.objects if o.type in ("MESH", "CURVE") for c in o.bound_box
-    ]
+    corners = [o.matrix_world @ Vector(c) for o in bpy.data.objects if o.type in ("MESH", "CURVE") for c in o.bound_box]
     points = np.array(corners)
     return points.min(0), points.max(0)
 

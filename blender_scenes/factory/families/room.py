@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import bpy
 import numpy as np
 from building import area_light, flat_world, point_light, sun_light
-from solids import Shape, box, grid, join, lathe
 from shapes import grid_uv
+from solids import Shape, ball, box, grid, join, lathe
 
 from factory import furniture, soft
 from factory.dice import Dice
@@ -114,7 +113,7 @@ class Room:
         stage.put(Thing("Floor", box(size, at=(0, 0, -THICK / 2), scale=1.0), ("ground",), smooth=None))
         if kind != "no ceiling":
             ceiling = box(size, at=(0, 0, self.h + THICK / 2), scale=1.0)
-            stage.put(Thing("Ceiling", ceiling, (dice.pick(["paint", "wall"]) if False else "wall",), smooth=None))
+            stage.put(Thing("Ceiling", ceiling, ("ceiling",), smooth=None))
         gone = 2 if kind == "open side" else -1
         self.open = kind != "closed"
         for k in range(4):
@@ -169,7 +168,7 @@ class Room:
     def furnish(self) -> None:
         """Pieces along the walls, then free ones, a rug, pictures."""
         dice = self.dice
-        for _ in range(dice.whole(2, 5)):
+        for _ in range(dice.whole(4, 8)):
             thing = dice.weighted(ALONG)(dice)
             for _ in range(12):
                 k = dice.whole(0, 3)
@@ -183,7 +182,7 @@ class Room:
                 if self._fits(x, y, hx, hy):
                     self._stand(thing, x, y, k)
                     break
-        for _ in range(dice.whole(1, 4)):
+        for _ in range(dice.whole(2, 6)):
             thing = dice.weighted(FREE)(dice)
             if thing.name == "Pot plant":
                 thing = thing.fitted(0.22, 0.6)
@@ -247,13 +246,14 @@ class Room:
         elif kind == "hanging":
             shade = lathe([(dice.uniform(0.08, 0.16), -0.05), (0.03, 0.05)], 32)
             cord = box((0.006, 0.006, 0.2), at=(0, 0, 0.13)).painted(1)
-            self.stage.put(Thing("Hanging lamp", join([shade, cord]), (dice.pick(["shade", "metal", "plain"]), "plain")), (x, y, self.h - 0.235))
+            self.stage.put(
+                Thing("Hanging lamp", join([shade, cord]), (dice.pick(["shade", "metal", "plain"]), "plain")),
+                (x, y, self.h - 0.235),
+            )
             point_light("Hanging bulb", (x, y, self.h - 0.255), power, dice.log(0.006, 0.025), tint(dice))
         elif kind == "bulb":
             point_light("Bare bulb", (x, y, dice.uniform(0.55, 0.9) * self.h), power, dice.log(0.004, 0.03), tint(dice))
         elif kind == "ball":
-            from solids import ball
-
             glow = Thing("Glowing ball", ball(dice.uniform(0.05, 0.12), 14, 28), ("bulb",))
             self.stage.put(glow, (x, y, self.h - 0.2))
         else:
@@ -267,5 +267,4 @@ def build(stage: Stage) -> Draw:
     room.light()
     low = np.array([-room.w + 0.15, -room.d + 0.15, 0.28])
     high = np.array([room.w - 0.15, room.d - 0.15, room.h * 0.78])
-    bpy.context.scene["factory_inside"] = True
     return inside(low, high, room.blocked)

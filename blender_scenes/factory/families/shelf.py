@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from building import area_light, point_light
 from solids import Shape, box, join
 
 from factory import cut
 from factory.dice import Dice
-from factory.lighting import lamp, plain_world, rig
+from factory.lighting import lamp, plain_world, rig, tint
 from factory.stage import Stage
 from factory.thing import Thing
 from factory.things import small
@@ -71,7 +72,9 @@ def build(stage: Stage) -> Draw:
             box((reach, 0.04, high + 2 * reach), at=(s * (left + reach / 2), y, high / 2), scale=1.0) for s in (-1, 1)
         ]
         walls.append(box((2 * left, 0.04, reach), at=(0, y, high + reach / 2), scale=1.0))
-        walls.append(box((2 * left, 0.04, reach - thick / 2), at=(0, y, -thick / 2 - (reach - thick / 2) / 2), scale=1.0))
+        walls.append(
+            box((2 * left, 0.04, reach - thick / 2), at=(0, y, -thick / 2 - (reach - thick / 2) / 2), scale=1.0)
+        )
         stage.put(Thing("Niche wall", join(walls), ("wall",), smooth=None))
     elif dice.chance(0.6):
         floor = box((wide + 1.4, deep + 1.6, 0.03), at=(0, -0.4, -thick / 2 - 0.016), scale=1.0)
@@ -81,18 +84,14 @@ def build(stage: Stage) -> Draw:
         rig(dice, 1.2, middle)
     else:  # lamps in front, a strip in a cell: most of the light in there has bounced
         plain_world(dice, 0.02, 0.5)
-        area_at_front(dice, wide, tall, deep)
+        _front_lamps(dice, wide, tall, deep)
         if dice.chance(0.3):
             lamp(dice, "spot", 1.2, middle)
-    return around(middle, max(tall, wide) * dice.uniform(0.3, 0.6), azimuth=(-42.0, 42.0), elevation=(-8.0, 30.0))
+    return around(middle, max(tall, wide) * dice.uniform(0.4, 0.75), azimuth=(-42.0, 42.0), elevation=(-8.0, 30.0))
 
 
-def area_at_front(dice: Dice, wide: float, tall: float, deep: float) -> None:
+def _front_lamps(dice: Dice, wide: float, tall: float, deep: float) -> None:
     """A lamp before the case, to one side, or a small one inside."""
-    from building import area_light, point_light
-
-    from factory.lighting import tint
-
     if dice.chance(0.4):
         at = (dice.uniform(-0.3, 0.3) * wide, -0.2 * deep, tall * dice.uniform(0.4, 0.95))
         point_light("Cabinet lamp", at, 6.0, dice.log(0.004, 0.03), tint(dice))

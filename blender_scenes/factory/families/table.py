@@ -14,7 +14,7 @@ from factory.things import small
 from factory.views import Draw, around
 
 
-def _disc(radius: float, thick: float) -> Shape:
+def disc(radius: float, thick: float) -> Shape:
     """Round slab whose top is z = 0; UVs from above."""
     shape = lathe([(r, z - thick) for r, z in rounded_disc(radius, 0.0, thick, min(0.03, thick * 0.4))], 72)
     corners = shape.points[np.concatenate([list(f) for f in shape.faces])]
@@ -24,10 +24,10 @@ def _disc(radius: float, thick: float) -> Shape:
 def _support(dice: Dice, kind: str, reach: float, side: float) -> Thing:
     """What the things stand on; its top is z = 0."""
     if kind == "plinth":
-        return Thing("Plinth", _disc(reach, dice.uniform(0.04, 0.5)), ("ground",))
+        return Thing("Plinth", disc(reach, dice.uniform(0.04, 0.5)), ("ground",))
     if kind == "pedestal":
         foot = lathe([(0.0, -1.0), (0.5, -1.0), (0.3, -0.85), (0.25, -0.1), (0.0, -0.1)], 40).painted(1)
-        return Thing("Pedestal", join([_disc(reach, 0.08), foot]), ("ground", "thing"))
+        return Thing("Pedestal", join([disc(reach, 0.08), foot]), ("ground", "thing"))
     thick = dice.uniform(0.03, 0.15)
     top = box((2 * reach, 2 * side, thick), bevel=0.008, at=(0, 0, -thick / 2))
     if kind == "slab":
@@ -40,7 +40,7 @@ def _support(dice: Dice, kind: str, reach: float, side: float) -> Thing:
     return Thing("Table", join([top, *legs]), ("wood", "wood"), smooth=None)
 
 
-def _sweep(dice: Dice, reach: float) -> Thing:
+def backdrop(dice: Dice, reach: float) -> Thing:
     """A studio's paper: floor that bends up into a wall."""
     bend = dice.uniform(0.2, 0.6)
     turn = np.linspace(0, np.pi / 2, 12)
@@ -59,7 +59,7 @@ def build(stage: Stage) -> Draw:
     if kind in ("slab", "table"):
         side = reach * dice.uniform(0.5, 1.0)
     if kind == "paper":
-        stage.put(_sweep(dice, reach))
+        stage.put(backdrop(dice, reach))
     elif kind == "floor":
         wide = 1.7 * reach
         stage.put(Thing("Floor", box((2 * wide, 2 * wide, 0.05), at=(0, 0, -0.025)), ("ground",), smooth=None))
@@ -72,7 +72,9 @@ def build(stage: Stage) -> Draw:
         azimuth = _walls(stage, reach if side is None else side, reach)
     count = dice.whole(5, 14)
     sizes = [dice.log(0.08, 0.3) for _ in range(count)]
-    height = stage.scatter([small(dice) for _ in sizes], sizes, 0.0, reach * 0.95, None if side is None else side * 0.95)
+    height = stage.scatter(
+        [small(dice) for _ in sizes], sizes, 0.0, reach * 0.95, None if side is None else side * 0.95
+    )
     rig(dice, reach * 1.2, (0, 0, height * 0.3))
     return around((0, 0, 0.25 * height), reach * dice.uniform(0.55, 1.0), azimuth=azimuth)
 
