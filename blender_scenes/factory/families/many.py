@@ -6,7 +6,6 @@ from typing import Any
 
 import bpy
 import numpy as np
-from shapes import rounded_disc
 from solids import ball, box, lathe, mesh_of, place
 
 from factory import cut, soft, turned
@@ -139,7 +138,8 @@ def _dominoes(stage: Stage, count: int) -> float:
     """A spiral of standing tiles or coins."""
     dice = stage.dice
     tall = dice.uniform(0.12, 0.2)
-    coin = lathe(rounded_disc(tall / 2, -0.012, 0.012, 0.004), 24)
+    edge = [(0.0, -0.012), (tall / 2 - 0.004, -0.012), (tall / 2, -0.008)]
+    coin = lathe([*edge, *[(r, -z) for r, z in edge[::-1]]], 24)
     turn = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
     shape = dice.pick(
         [

@@ -43,14 +43,14 @@ def build(stage: Stage) -> Draw:
     if kind == "paper":
         stage.put(backdrop(dice, 1.1))
     elif kind == "disc":
-        stage.put(Thing("Disc", disc(0.75, dice.uniform(0.03, 0.4)), (dice.pick(["plain", "ground", "metal"]),)))
+        stage.put(Thing("Disc", disc(1.05, dice.uniform(0.03, 0.4)), (dice.pick(["plain", "ground", "metal"]),)))
     elif kind in ("floor", "mirror"):
         role = "mirror" if kind == "mirror" else dice.pick(["plain", "ground"])
         stage.put(Thing("Floor", box((3.0, 3.0, 0.04), at=(0, 0, -0.02)), (role,), smooth=None))
     count = dice.weighted({1: 3.0, 2: 1.0, 3: 1.0})
-    sizes = [dice.uniform(0.4, 0.6) if count == 1 else dice.uniform(0.2, 0.36) for _ in range(count)]
+    sizes = [dice.uniform(0.6, 0.85) if count == 1 else dice.uniform(0.3, 0.5) for _ in range(count)]
     heroes = [dice.weighted(HEROES)(dice) for _ in sizes]
-    height = stage.scatter(heroes, sizes, 0.0, 0.72)
+    height = stage.scatter(heroes, sizes, 0.0, 1.0)
     if dice.chance(0.7):
         plain_world(dice, *dice.pick([(0.005, 0.05), (0.3, 1.5)]))
         for _ in range(dice.whole(1, 3)):
@@ -61,4 +61,4 @@ def build(stage: Stage) -> Draw:
         rig(dice, 1.0, (0, 0, height / 2))
     azimuth = (-50.0, 50.0) if kind == "paper" else (-180.0, 180.0)
     elevation = (-10.0, 40.0) if kind == "none" else (6.0, 45.0)
-    return around((0, 0, 0.42 * height), max(0.62 * height, 0.55), azimuth=azimuth, elevation=elevation)
+    return around((0, 0, 0.42 * height), max(0.62 * height, 0.7), azimuth=azimuth, elevation=elevation)

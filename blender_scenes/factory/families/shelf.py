@@ -43,7 +43,7 @@ def _fill(stage: Stage, x0: float, x1: float, z: float, high: float, deep: float
         return
     x = x0 + 0.01
     while x < x1 - 0.06:
-        radius = min(dice.log(0.05, 0.2), (x1 - x) / 2 - 0.005, deep / 2)
+        radius = min(dice.log(0.05, 0.24), (x1 - x) / 2 - 0.005, deep / 2)
         if radius < 0.03:
             break
         thing = small(dice).fitted(radius, high * 0.92)
@@ -55,9 +55,10 @@ def _fill(stage: Stage, x0: float, x1: float, z: float, high: float, deep: float
 def build(stage: Stage) -> Draw:
     dice = stage.dice
     rows, columns = dice.pick([(1, 1), (1, 2), (2, 1), (2, 2), (3, 1), (3, 2), (2, 3), (4, 1)])
-    cell = dice.uniform(0.38, 0.6)
-    tall, wide = rows * cell, max(columns * dice.uniform(0.5, 0.9), 0.8)
-    deep = dice.uniform(0.3, 0.55)
+    grow = 1.7 if rows * columns < 3 else 1.0
+    cell = grow * dice.uniform(0.38, 0.6)
+    tall, wide = rows * cell, max(grow * columns * dice.uniform(0.5, 0.9), 0.8)
+    deep = grow * dice.uniform(0.3, 0.55)
     case, thick = _case(dice, wide, tall, deep, rows, columns)
     stage.put(case)
     for row in range(rows):
