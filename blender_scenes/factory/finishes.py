@@ -22,12 +22,14 @@ METALS: list[Rgb] = [
 ]
 
 
+SHEETS = 7  # pairs of colour and normal pictures in a scene
+
+
 class Finishes:
     """Makes materials and hands some of them out again, as artists do. Pictures are few, so that files stay small."""
 
-    def __init__(self, dice: Dice, pictures: int = 7) -> None:
+    def __init__(self, dice: Dice) -> None:
         self.dice = dice
-        self.pictures = pictures
         self.made: dict[str, list[Material]] = {}
         self.drawn: list[tuple[Image, Image]] = []
         self.kinds: dict[str, dict[Callable[[], Material], float]] = {
@@ -145,7 +147,7 @@ class Finishes:
 
     def _sheet(self, pattern: Callable[[Dice], textures.Picture] | None = None) -> tuple[Image, Image]:
         """(colour, normal) pictures: new ones while the file may grow, else some that are there."""
-        if self.drawn and (len(self.drawn) >= self.pictures or (pattern is None and self.dice.chance(0.2))):
+        if self.drawn and (len(self.drawn) >= SHEETS or (pattern is None and self.dice.chance(0.2))):
             return self.dice.pick(self.drawn)
         draw = pattern or self.dice.weighted(textures.PATTERNS)
         colour, height = draw(self.dice)

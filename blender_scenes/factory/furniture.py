@@ -95,7 +95,7 @@ def cabinet(dice: Dice) -> Thing:
             at = (x, -deep / 2 - 0.004, z)
             parts.append(box((wide / columns - 0.015, 0.012, high / rows - 0.015), bevel=0.003, at=at, scale=1.5))
             parts.append(ball(0.012, 8, 12).moved((x, -deep / 2 - 0.02, z)).painted(1))
-    parts += [foot.moved((0, 0, 0)) for foot in _legs(wide / 2 - 0.02, deep / 2 - 0.02, 0.02, 0.03)]
+    parts += _legs(wide / 2 - 0.02, deep / 2 - 0.02, 0.02, 0.03)
     top = (0.0, 0.0, high + 0.02, deep * 0.45)
     return Thing("Cabinet", join(parts), ("wood", "metal"), smooth=30, top=top)
 

@@ -19,9 +19,9 @@ Point = tuple[float, float, float]
 class Stage:
     """One scene in the making."""
 
-    def __init__(self, dice: Dice, pictures: int = 7) -> None:
+    def __init__(self, dice: Dice) -> None:
         self.dice = dice
-        self.finish = Finishes(dice, pictures)
+        self.finish = Finishes(dice)
         self.taken: list[tuple[float, float, float]] = []
         self.count = 0
 

@@ -92,9 +92,9 @@ def _bounds() -> tuple[np.ndarray, np.ndarray]:
     return points.min(0), points.max(0)
 
 
-def build(stage: Stage, base: str | None = None) -> Draw:
+def build(stage: Stage) -> Draw:
     dice = stage.dice
-    name = base or dice.weighted(BASES)
+    name = dice.weighted(BASES)
     open_base(name)
     bpy.context.scene["factory_base"] = name
     view: Any = bpy.context.scene.view_settings
