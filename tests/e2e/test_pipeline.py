@@ -109,6 +109,7 @@ def test_a_larger_budget_traces_the_new_views_only(tiny: Path, tmp_path: Path) -
     assert sorted(traced) == sorted(f"{kind}train/{name}" for kind in ("", "base/") for name in new - old)
 
 
+@pytest.mark.robustness
 def test_going_back_after_an_interrupted_change_is_not_up_to_date(tiny: Path, tmp_path: Path) -> None:
     """A run with other samples overwrites one view and is killed; the old samples must come back."""
     copy = tmp_path / "demo.dnr"
@@ -166,6 +167,7 @@ def test_a_changed_texture_is_noticed(tmp_path: Path) -> None:
     assert means[1][2] > 2 * means[1][0] > 0  # and now blue
 
 
+@pytest.mark.robustness
 def test_no_validation_and_no_test_views(tmp_path: Path, demo_blend: Path) -> None:
     off = ("--set", "cameras.val=0", "--set", "cameras.test=0")
     quick = {"DNRPIPE_SELECT__STEP1__EPOCHS": "1", "DNRPIPE_FINETUNE__STEP2__EPOCHS": "1", "DNRPIPE_RAYTRACE__SPP": "4"}
