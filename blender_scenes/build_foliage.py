@@ -13,6 +13,7 @@ import numpy as np
 from bpy.types import Material
 from building import (
     camera,
+    cut_out_leaf,
     image_world,
     main,
     make_image,
@@ -59,14 +60,7 @@ def leaves() -> Material:
     lift = node(made, "HueSaturation", inputs={"Hue": 0.48, "Saturation": 1.15, "Value": 1.5})
     wire(made, shown.outputs["Color"], lift.inputs["Color"])
     wire(made, lift.outputs["Color"], through.inputs["Color"])
-    both = node(made, "MixShader", inputs={"Fac": 0.35})
-    wire(made, principled(made).outputs["BSDF"], both.inputs[1])
-    wire(made, through.outputs["BSDF"], both.inputs[2])
-    cut = node(made, "MixShader")
-    wire(made, shown.outputs["Alpha"], cut.inputs["Fac"])
-    wire(made, node(made, "BsdfTransparent").outputs["BSDF"], cut.inputs[1])
-    wire(made, both.outputs["Shader"], cut.inputs[2])
-    wire(made, cut.outputs["Shader"], made.node_tree.nodes["Material Output"].inputs["Surface"])
+    cut_out_leaf(made, shown, through, 0.35)
     return made
 
 

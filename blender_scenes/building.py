@@ -110,6 +110,18 @@ def wire(owner: bpy.types.Material | bpy.types.World, output: Any, target: Any) 
     owner.node_tree.links.new(output, target)
 
 
+def cut_out_leaf(made: bpy.types.Material, shown: Any, through: Any, share: float) -> None:
+    """The Principled BSDF with ``share`` of the shader ``through``, cut out by the alpha of the image ``shown``."""
+    both = node(made, "MixShader", inputs={"Fac": share})
+    wire(made, principled(made).outputs["BSDF"], both.inputs[1])
+    wire(made, through.outputs["BSDF"], both.inputs[2])
+    cut = node(made, "MixShader")
+    wire(made, shown.outputs["Alpha"], cut.inputs["Fac"])
+    wire(made, node(made, "BsdfTransparent").outputs["BSDF"], cut.inputs[1])
+    wire(made, both.outputs["Shader"], cut.inputs[2])
+    wire(made, cut.outputs["Shader"], made.node_tree.nodes["Material Output"].inputs["Surface"])
+
+
 def picture(
     made: bpy.types.Material,
     image: bpy.types.Image,

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 from bpy.types import Image, Material
-from building import make_image, material, node, normal_picture, picture, principled, wire
+from building import cut_out_leaf, make_image, material, node, normal_picture, picture, principled, wire
 from patterns import normals_from_height, plain
 
 from factory import textures
@@ -291,14 +291,7 @@ class Finishes:
         shown = picture(made, image, "Base Color")
         through = node(made, "BsdfTranslucent")
         wire(made, shown.outputs["Color"], through.inputs["Color"])
-        both = node(made, "MixShader", inputs={"Fac": self.dice.uniform(0.2, 0.5)})
-        wire(made, principled(made).outputs["BSDF"], both.inputs[1])
-        wire(made, through.outputs["BSDF"], both.inputs[2])
-        cut = node(made, "MixShader")
-        wire(made, shown.outputs["Alpha"], cut.inputs["Fac"])
-        wire(made, node(made, "BsdfTransparent").outputs["BSDF"], cut.inputs[1])
-        wire(made, both.outputs["Shader"], cut.inputs[2])
-        wire(made, cut.outputs["Shader"], made.node_tree.nodes["Material Output"].inputs["Surface"])
+        cut_out_leaf(made, shown, through, self.dice.uniform(0.2, 0.5))
         return made
 
     def leaf(self) -> Material:
