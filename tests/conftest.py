@@ -128,7 +128,7 @@ def mitsuba_variant() -> Iterator[str]:
     (Freeing another test's scene while plugins are being recorded kills the process: dnrpipe.raytrace.recorded.)
     """
     mi = pytest.importorskip("mitsuba")
-    from dnrpipe.raytrace import paths, plugins
+    from dnrpipe.raytrace import plugins
     from dnrpipe.raytrace.recorded import without_collection
     from dnrpipe.raytrace.variants import choose_variant
 
@@ -136,8 +136,6 @@ def mitsuba_variant() -> Iterator[str]:
     os.environ.update(chosen.environment)
     mi.set_variant(chosen.variant)
     plugins.register(mi)
-    if not chosen.variant.startswith("scalar"):
-        paths.register(mi)
     gc.collect()
     with without_collection():
         yield chosen.variant

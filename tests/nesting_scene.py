@@ -20,6 +20,7 @@ from dnrpipe.core.settings import CameraSettings
 from dnrpipe.raytrace.engine import Engine
 
 WRAPPERS = ("mask", "dnr_transparent", "blendbsdf", "dnr_add", "dnr_normal", "normalmap", "bumpmap", "twosided")
+GLASS = ("dnr_refraction", "dnr_interface")
 LEAVES = ("dnr_principled", "dnr_refraction", "dnr_interface", "dnr_translucent", "roughconductor")
 RANGES = {"normal": (0.45, 0.55), "normalmap": (0.45, 0.55), "opacity": (0.4, 1), "transmittance": (0.5, 1)}
 INPUTS = {
@@ -59,7 +60,7 @@ def bsdf(parent: ET.Element, names: list[str], folder: Path) -> None:
         texture(element, name, folder, kind)
     if kind == "dnr_normal":
         ET.SubElement(element, "string", name="space", value="tangent")
-    if kind in ("dnr_interface", "dnr_refraction"):
+    if kind in GLASS:
         ET.SubElement(element, "float", name="eta", value="1.4")
         glass = ET.SubElement(element, "bsdf", type="roughdielectric")
         ET.SubElement(glass, "float", name="int_ior", value="1.4")
@@ -87,7 +88,7 @@ def main() -> None:
     view = look_at_view("view", np.array([0, -4.0, 0]), np.zeros(3), 12, CameraSettings(width=8, height=8))
     if engine.compiled:
         dr.set_flag(dr.JitFlag.KernelHistory, True)
-    samples = 512 if names[-1] in ("dnr_refraction", "dnr_interface") else 128  # light caught in glass is noisy
+    samples = 512 if names[-1] in GLASS else 128  # light caught in glass is noisy
     answer: dict[str, object] = {}
     for kind in ("path", "path-without-caustics") if engine.compiled else ("path",):
         integrator, _ = engine.integrator(bundle, kind, 4)

@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.nesting_scene import LEAVES, WRAPPERS
+from tests.nesting_scene import GLASS, LEAVES, WRAPPERS
 
 SCRIPT = Path(__file__).with_name("nesting_scene.py")
 ONE_SIDED = ("dnr_principled", "roughconductor")
 """Leaves that stand in ``twosided``, as the conversion writes them."""
-GLASS = ("dnr_refraction", "dnr_interface")
 PRODUCTION = ("mask", "dnr_normal", "twosided", "dnr_principled")
 PAIRS = [
     (outer, inner, "twosided", "dnr_principled")

@@ -19,10 +19,6 @@ WHITE = {"type": "constant"}
 def _variant(mitsuba_variant: str) -> None:
     if mitsuba_variant.startswith("scalar"):
         pytest.skip("the scalar variant has no path tracer of ours")
-    from dnrpipe.raytrace import paths, plugins
-
-    plugins.register(mi)
-    paths.register(mi)
 
 
 def sheet(opacity: float, distance: float = 0.0, kind: str = "mask") -> dict[str, Any]:

@@ -133,11 +133,10 @@ def test_the_collector_does_not_free_a_scene_while_another_is_rendered() -> None
 import gc
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
-from dnrpipe.raytrace import paths, plugins
+from dnrpipe.raytrace import plugins
 from dnrpipe.raytrace.engine import Engine
 from dnrpipe.raytrace.visibility import camera_integrator
 plugins.register(mi)
-paths.register(mi)
 
 tint = {"type": "rgb", "value": [0.2, 0.5, 0.8]}
 glass = {"type": "dnr_transparent", "transmittance": tint}

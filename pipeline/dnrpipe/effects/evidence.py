@@ -52,11 +52,7 @@ def gather(census: Census, bundle: Mapping[str, Sequence[str]], lenses: Sequence
     refracting = _where(materials, lambda m: m.refractive, lambda m: f"index {m.ior:.3g}" if m.ior else "")
     result: dict[EffectName, Evidence] = {
         "indirect": _indirect(census),
-        "refraction": _held(
-            bundle,
-            "refraction",
-            refracting,
-        ),
+        "refraction": _held(bundle, "refraction", refracting),
         "caustics": _caustics(materials, bundle),
         "volumes": _held(bundle, "volumes", _volumes(census)),
         "subsurface": _held(bundle, "subsurface", _where(materials, lambda m: m.subsurface)),

@@ -12,7 +12,7 @@ import numpy as np
 from dnrpipe.core.errors import UserError
 from dnrtrain.contract import View
 
-from . import paths, plugins
+from . import plugins
 from .auxiliary import auxiliary_integrator
 from .recorded import without_collection
 from .second_targets import second_targets
@@ -50,7 +50,6 @@ class Engine:
         plugins.register(mi)
         self.compiled = not variant.startswith("scalar")
         if self.compiled:
-            paths.register(mi)
             self._targets = second_targets(mi)
         else:
             _refuse_instances(bundles)

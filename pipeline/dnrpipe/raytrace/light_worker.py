@@ -14,10 +14,9 @@ from dnrtrain.contract import NPZ_ERRORS
 
 from .engine import BundleWorker
 from .lightmap import LightBaker
-from .lobes import lets_through
 from .tasks import LightAnswer, LightTask, costs_since
 from .texels import grouped_meshes
-from .visibility import ROULETTE_DEPTH
+from .visibility import ROULETTE_DEPTH, integrator_settings
 
 
 class Worker(BundleWorker):
@@ -49,11 +48,9 @@ class Worker(BundleWorker):
         kind, depth = task.integrator, task.max_depth - 1
         if kind == "direct" or depth < 2:
             return None
-        settings: dict[str, Any] = {"type": kind}
+        settings = integrator_settings(self.engine.mi, self.engine.scenes[str(self.bundle)], kind)
         if kind == "path-without-caustics":
-            settings = {"type": "dnr_path", "caustics": False, "after_diffuse": True}
-        elif kind == "path" and lets_through(self.engine.mi, self.engine.scenes[str(self.bundle)]):
-            settings = {"type": "dnr_path"}  # Mitsuba's is wrong there, see `paths`
+            settings["after_diffuse"] = True
         settings |= {"max_depth": depth, "rr_depth": ROULETTE_DEPTH, "hide_emitters": True}
         return self.engine.mi.load_dict(settings)
 

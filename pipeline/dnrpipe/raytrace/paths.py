@@ -81,18 +81,12 @@ def register(mi: Any) -> None:
             after = self.skip_area_emitters(scene, onwards, True, lamp)
             return dr.select(lamp, after.compute_surface_interaction(onwards, mi.RayFlags.All, lamp), si)
 
-        def _has_holes(self, scene: Any) -> bool:
-            return lets_through(mi, scene)
-
-        def _transmittance(self, scene: Any, si: Any, point: Any, active: Any) -> Any:
-            return transmittance(mi, scene, si, point, active)
-
         @dr.syntax
         def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> Any:
             import drjit as dr  # dr.syntax compiles this function anew, without the names around it
             import mitsuba as mi
 
-            context, holes = mi.BSDFContext(), self._has_holes(scene)
+            context, holes = mi.BSDFContext(), lets_through(mi, scene)
             ray = mi.Ray3f(ray)
             active = mi.Bool(active)
             radiance, throughput = mi.Spectrum(0), mi.Spectrum(1)
@@ -119,7 +113,7 @@ def register(mi: Any) -> None:
                 lit &= toward.pdf != 0
                 value, other = bsdf.eval_pdf(context, si, si.to_local(toward.d), lit)
                 if dr.hint(holes, mode="scalar"):
-                    arriving *= self._transmittance(scene, si, toward.p, lit & (dr.max(value) > 0))
+                    arriving *= transmittance(mi, scene, si, toward.p, lit & (dr.max(value) > 0))
                 share = dr.select(toward.delta, 1, power_heuristic(toward.pdf, other))
                 radiance += dr.select(lit, throughput * value * arriving * share, 0)
 

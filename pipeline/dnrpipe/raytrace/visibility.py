@@ -22,23 +22,31 @@ OWN: dict[str, dict[str, Any]] = {
 """Integrators of `paths`."""
 
 
+def integrator_settings(mi: Any, scene: Any, kind: str) -> dict[str, Any]:
+    """The plugin that stands for ``kind``: Mitsuba's ``direct``, ``path`` or ``volpath``, or one of ``OWN``.
+
+    Where surfaces let light straight through, ours takes the place of ``path``, which is wrong there (see `paths`);
+    under a scalar variant, ``volpath`` does.
+    """
+    import drjit as dr
+
+    if kind == "path" and lets_through(mi, scene):
+        return {"type": "dnr_path" if dr.is_jit_v(mi.Float) else "volpath"}
+    return dict(OWN.get(kind, {"type": kind}))
+
+
 def camera_integrator(mi: Any, scene: Any, max_depth: int, kind: str = "path") -> tuple[Any, str]:
     """(integrator, its name for the file's metadata): ``kind``, or ``kind+glow`` where surfaces glow.
 
-    kind: Mitsuba's ``direct``, ``path`` or ``volpath``, or one of ``OWN``. Roulette starts at a fixed depth: with
-    the same seed, a path cut at one depth is then the beginning of the path cut at a larger one, which the depth
-    pilot relies on. Where surfaces let light straight through, ours takes the place of ``path``, which is wrong there
-    (see `paths`); under a scalar variant, ``volpath`` does.
+    kind: see `integrator_settings`. Roulette starts at a fixed depth: with the same seed, a path cut at one depth is
+    then the beginning of the path cut at a larger one, which the depth pilot relies on.
     """
-    settings: dict[str, Any] = dict(OWN.get(kind, {"type": kind}))
-    holes = lets_through(mi, scene)
-    if holes and kind == "path":
-        settings["type"] = "dnr_path" if mi.variant().startswith(("llvm", "cuda")) else "volpath"
+    settings = integrator_settings(mi, scene, kind)
     if kind == "direct":
         settings |= {"emitter_samples": 1, "bsdf_samples": 1}
     else:
         settings |= {"max_depth": max_depth, "rr_depth": ROULETTE_DEPTH}
-    glow = {"shows_glow": True} if holes and settings["type"] == "dnr_path" else {}
+    glow = {"shows_glow": True} if settings["type"] == "dnr_path" and lets_through(mi, scene) else {}
     hidden = mi.load_dict({**settings, **glow, "hide_emitters": True})
     first_visible, found, name = first_visible_of(mi, scene), hidden, kind
     shapes = scene.shapes()

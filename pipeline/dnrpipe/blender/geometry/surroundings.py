@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import bpy
@@ -114,12 +114,18 @@ def _tree(depsgraph: Any) -> Any:
     return BVHTree.FromPolygons(np.concatenate(corners).tolist(), faces.tolist(), all_triangles=True)
 
 
+def _tries(found: Sequence[Standpoint]) -> Iterator[None]:
+    """Until enough are found, or there are few to find."""
+    for tried in range(TRIES):
+        if len(found) == STANDPOINTS or tried > PATIENCE + PATIENCE_EACH * len(found):
+            return
+        yield
+
+
 def _about(camera: np.ndarray, clear: Clear, reach: float, rng: np.random.Generator) -> list[Standpoint]:
     """Standpoints that the camera's place is joined to by free air, within a few times the reach."""
     places, found = [camera], list[Standpoint]()
-    for tried in range(TRIES):
-        if tried > PATIENCE + PATIENCE_EACH * len(found):
-            break
+    for _ in _tries(found):
         start = places[int(rng.integers(len(places)))]  # from any place found: round corners, too
         way = _direction(rng)
         ahead = min(clear(start, way), 2 * reach)
@@ -129,8 +135,6 @@ def _about(camera: np.ndarray, clear: Clear, reach: float, rng: np.random.Genera
             continue
         places.append(place)
         found.append(_standpoint(place, target))
-        if len(found) == STANDPOINTS:
-            break
     return found
 
 
@@ -149,9 +153,7 @@ def _along(
 ) -> list[Standpoint]:
     """Standpoints beside the path, that look at what the camera sees from it."""
     found: list[Standpoint] = []
-    for tried in range(TRIES):
-        if tried > PATIENCE + PATIENCE_EACH * len(found):
-            break
+    for _ in _tries(found):
         number = int(rng.integers(len(poses)))
         pose, stop = poses[number], stops[number]
         # The frame is not known here: a square picture of the sensor's width.
@@ -172,8 +174,6 @@ def _along(
         if _is_tight(place, clear, reach):
             continue
         found.append(_standpoint(place, target))
-        if len(found) == STANDPOINTS:
-            break
     return found
 
 

@@ -10,13 +10,18 @@ from __future__ import annotations
 
 from typing import Any
 
+from .. import paths
 from . import emitters, layers, lookups, normals, refraction, sums, transparency
 
 
 def register(mi: Any) -> None:
     """Make all ``dnr_*`` plugins known to the current variant of ``mi`` (the mitsuba module, variant set).
 
-    Calling it again for the same variant is harmless.
+    Of jit variants the integrator ``dnr_path``, too. Calling it again for the same variant is harmless.
     """
+    import drjit as dr
+
+    if dr.is_jit_v(mi.Float):
+        paths.register(mi)
     for family in (lookups, normals, sums, transparency, refraction, emitters, layers):
         family.register(mi)
