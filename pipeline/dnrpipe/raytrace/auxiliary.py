@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .lobes import bsdfs_of, lets_through
+from .lobes import bsdfs_of, lets_through, mean_of
 from .visibility import first_visible_of
 
 MAX_BOUNCES = 6
@@ -48,7 +48,7 @@ def shown_first(mi: Any, scene: Any) -> Any:
             hit: Any, direction: Any, sampler: Any, going: Any, left: Any, share: Any, straight: Any, any_: Any
         ) -> tuple[Any, ...]:
             bsdf = hit.bsdf()
-            through = dr.mean(bsdf.eval_null_transmission(hit, going))
+            through = mean_of(bsdf.eval_null_transmission(hit, going))
             passed = going & (sampler.next_1d(going) < through)
             bounced = going & ~passed & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
             pair = sampler.next_1d(going), sampler.next_2d(going)

@@ -10,6 +10,7 @@ Notation
     base     = mean over samples of the sum over the path's vertices of throughput (emission + rho E), and of S where
                the path ends at a rough lobe
     diffuse  = the first vertex's share of it
+    noise    = standard error of base's luminance by the spread of the pixel's samples; 0 with one sample
 
 The numbers that choose directions come from Kronecker sequences over the samples of a tile of TILE² pixels, the same
 in every frame: sample s of a pixel at place t of its tile has the number s TILE² + t.
@@ -36,6 +37,9 @@ CENTRES = (
     *("chain.U", "chain.V", "chain.mask", "chain.weight"),
     *("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z", "mask"),
 )
+NOISE = "noise"
+BRIGHTEST = 1e15
+"""Luminance above it counts as it where squares are summed."""
 LOST = "lost"
 """Whether a part of the sample was not finite and is left out; of a pixel, the share of such samples."""
 GBUFFER = ("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z")
@@ -62,7 +66,7 @@ class BaseRenderer:
         self.repaired = self.masked = 0
         sides = [np.concatenate([light[0, i], light[1, i]], axis=-1) for i in range(2)]
         self.light = [mi.Texture2f(mi.TensorXf(side), wrap_mode=dr.WrapMode.Clamp) for side in sides]
-        self.paths = SpecularPaths(scene, samples)
+        self.paths = SpecularPaths(scene)
         self.tables = mi.UInt32(ORDER.ravel()), self.paths.steps
         prepare_emitters(mi, scene)
         # Recorded at the first call: tracing the plugins anew would take longer than the frame itself.
@@ -79,12 +83,13 @@ class BaseRenderer:
         mi, m = self.mi, view.matrix
         axes = [mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in m[:3, i])) for i in range(4)]
         film = [dr.opaque(mi.Float, float(v)) for v in (view.fl_x, view.fl_y, view.cx, view.cy)]
-        names = (LOST, *MEANS, *CENTRES)
+        rays = dr.opaque(mi.UInt32, self.samples)  # as data: the kernel is the same for all numbers of them
+        names = (LOST, *MEANS, *CENTRES, NOISE)
         rows = max(1, min(view.height, MAX_RAYS // (view.width * self.samples)))
         bands: list[list[np.ndarray]] = []
         for first in range(0, view.height, rows):
             start, count = dr.opaque(mi.UInt32, first), min(rows, view.height - first)
-            values = self.kernel(self.scene, self.light, self.tables, axes, film, start, view.width, count)
+            values = self.kernel(self.scene, self.light, self.tables, axes, film, rays, start, view.width, count)
             dr.eval(values)
             bands.append([np.array(value) for value in values])
         shape = (view.height, view.width)
@@ -99,9 +104,9 @@ class BaseRenderer:
         return channels | {"coverage": np.minimum(channels["base.A"], 1)}
 
     def _kernel(
-        self, scene: Any, light: Any, tables: Any, axes: Any, film: Any, start: Any, width: int, height: int
+        self, scene: Any, light: Any, tables: Any, axes: Any, film: Any, rays: Any, start: Any, width: int, height: int
     ) -> list[Any]:
-        """Values [height * width] of LOST, MEANS and CENTRES. Recorded once, replayed for every view of that size.
+        """Values [height * width] of LOST, MEANS, CENTRES and NOISE. Recorded once, replayed for every view of that size.
 
         A pixel's samples lie side by side; the first goes through the pixel's centre.
 
@@ -110,12 +115,14 @@ class BaseRenderer:
             tables: places within a tile, steps of the random numbers.
             axes: the camera's axes and its place, columns of c2w.
             film: fl_x, fl_y, cx, cy in pixels.
+            rays: ``self.samples``.
+            start: the first row.
         """
         import drjit as dr
 
         mi, samples = self.mi, self.samples
         index = dr.arange(mi.UInt32, width * height * samples)
-        pixel, sample = index // samples, index % samples
+        pixel, sample = index // rays, index % rays
         x, y = pixel % width, start + pixel // width
         tile = dr.gather(mi.UInt32, tables[0], (y % TILE) * TILE + x % TILE)
         number, place = mi.Float(sample * (TILE * TILE) + tile), mi.Float(sample)
@@ -123,10 +130,13 @@ class BaseRenderer:
         down = mi.Float(y) + fraction(0.5 + place * GOLDEN[1]) - film[3]
         direction = axes[0] * (right / film[0]) - axes[1] * (down / film[1]) - axes[2]
         ray = mi.Ray3f(mi.Point3f(axes[3]), dr.normalize(direction))
-        values = self.paths.trace(scene, light, tables[1], ray, -axes[2], number)
-        if samples == 1:
-            return values
+        values = self.paths.trace(scene, light, tables[1], ray, -axes[2], number, rays)
+        bright = dr.minimum(mi.luminance(mi.Color3f(*values[1:4])), BRIGHTEST)
+        values.insert(1 + len(MEANS), bright * bright)
+        values.insert(1 + len(MEANS), bright)
         dr.eval(values)  # together: each sum alone would run it all again
-        means = [dr.block_sum(value, samples) / samples for value in values[: 1 + len(MEANS)]]
+        cut = 3 + len(MEANS)
+        *means, bright, squares = [dr.block_sum(value, samples) / samples for value in values[:cut]]
+        noise = dr.sqrt(dr.maximum(squares - bright * bright, 0) / max(samples - 1, 1))
         first = dr.arange(mi.UInt32, width * height) * samples
-        return [*means, *(dr.gather(mi.Float, value, first) for value in values[1 + len(MEANS) :])]
+        return [*means, *(dr.gather(mi.Float, value, first) for value in values[cut:]), noise]

@@ -23,7 +23,7 @@ from dnrtrain.contract import View
 
 from .auxiliary import shown_first
 from .engine import Engine
-from .lobes import lets_through
+from .lobes import lets_through, mean_of
 from .recorded import Recorded, prepare_emitters
 from .sensors import scaled_view
 from .texels import ATTRIBUTE
@@ -327,7 +327,7 @@ def seen_first(mi: Any, scene: Any) -> Any:
         def passes(hit: Any, sampler: Any, active: Any) -> Any:
             bsdf = hit.bsdf()
             null = active & hit.is_valid() & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
-            share = dr.mean(bsdf.eval_null_transmission(hit, null))
+            share = mean_of(bsdf.eval_null_transmission(hit, null))
             return null & (sampler.next_1d(active) < share)
 
         def onwards(hit: Any, direction: Any, sampler: Any, active: Any) -> tuple[Any, ...]:

@@ -172,7 +172,7 @@ class LightBaker:
 
         mi = self.mi
         place, normal, found = self.surface.points(uv, sampler.next_1d())
-        up = normal * float(side)
+        up = normal * dr.opaque(mi.Float, float(side))  # as data: the kernel is the same for both sides
         ray = mi.Ray3f(place + up * self.lift, -up)
         ray.maxt = mi.Float(3 * self.lift)
         si = self.scene.ray_intersect(ray, found)

@@ -70,6 +70,13 @@ def is_rough(mi: Any, bsdf: Any, context: Any, si: Any, active: Any) -> Any:
     return active & (middle.pdf > 0) & (middle.pdf < WIDE)
 
 
+def mean_of(colour: Any) -> Any:
+    """Mean over the colours. ``dr.mean`` writes the number of lanes into the kernel: one to compile for each size."""
+    import drjit as dr
+
+    return dr.sum(colour) / len(colour)
+
+
 def reflectance(mi: Any, bsdf: Any, context: Any, si: Any, active: Any, translucent: bool = True) -> Any:
     """rho of the notation, per colour. ``si.wi`` decides which layers above attenuate it.
 

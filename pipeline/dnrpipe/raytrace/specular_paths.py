@@ -19,6 +19,7 @@ from .lobes import (
     is_among,
     is_rough,
     lets_through,
+    mean_of,
     mirrors_and_refracts,
     reflectance,
     specular_context,
@@ -43,11 +44,9 @@ class SpecularPaths:
 
     Args:
         scene: a scene of the current variant (jit variants only).
-        samples: rays per pixel.
     """
 
-    def __init__(self, scene: Any, samples: int) -> None:
-        self.samples = samples
+    def __init__(self, scene: Any) -> None:
         self.steps = mi.Float(steps(NUMBERS * (MAX_VERTICES + 1)))
         self.hidden = [s for s in scene.shapes() if s.id().startswith((LAMP_PREFIX, UNSEEN_PREFIX))]
         self.has_emitters = bool(scene.emitters())
@@ -71,7 +70,9 @@ class SpecularPaths:
         self.refracted = context_of(mi, kinds.DeltaTransmission, kinds.GlossyTransmission)
 
     @dr.syntax
-    def trace(self, scene: Any, light: Any, steps: Any, ray: Any, forward: Any, number: Any) -> list[Any]:
+    def trace(
+        self, scene: Any, light: Any, steps: Any, ray: Any, forward: Any, number: Any, samples: Any
+    ) -> list[Any]:
         """One sample along each ray -> the values that `base_renderer` names by LOST, MEANS and CENTRES, in that order.
 
         Args:
@@ -79,9 +80,11 @@ class SpecularPaths:
             steps: of the random numbers, ``self.steps``.
             forward: where the camera looks, in world space.
             number: the samples' places in the sequence.
+            samples: rays per pixel.
         """
         origin = mi.Point3f(ray.o)
         every = number >= 0
+        order = (number + 0.5) / mi.Float(samples * (TILE * TILE))
 
         # ------------------------------ The path ------------------------------
         active = mi.Bool(every)
@@ -135,9 +138,9 @@ class SpecularPaths:
             depth = dr.select(first, dr.dot(si.p - origin, forward), depth)
 
             # ---------------------- Where the chain ends ----------------------
-            ends = met & ~straight & ~chain_ended & (dr.mean(rho) > LEAST_RHO)
+            ends = met & ~straight & ~chain_ended & (mean_of(rho) > LEAST_RHO)
             chain_uv = dr.select(ends, place, chain_uv)
-            chain_weight = dr.select(ends, dr.mean(throughput), chain_weight)
+            chain_weight = dr.select(ends, mean_of(throughput), chain_weight)
             chain_ended |= ends
 
             # ------------------ Emitters through glossy lobes -----------------
@@ -151,7 +154,7 @@ class SpecularPaths:
             lost |= ~fine
 
             # ---------------------- The mirror-like rest ----------------------
-            bsdf_sample, bsdf_weight, onwards, forked = self._sample(bsdf, si, number, u, met, onwards, unforked)
+            bsdf_sample, bsdf_weight, onwards, forked = self._sample(bsdf, si, order, u, met, onwards, unforked)
             null = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Null)
             delta = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Delta)
             throughput = dr.select(onwards, throughput * bsdf_weight, throughput)
@@ -226,7 +229,7 @@ class SpecularPaths:
         """Share of a surface's light that does not pass straight on; what the surface adds has the same weight."""
         if not self.has_holes:
             return dr.select(active, mi.Float(1), 0)
-        return dr.select(active, 1 - dr.mean(bsdf.eval_null_transmission(si, active)), 0)
+        return dr.select(active, 1 - mean_of(bsdf.eval_null_transmission(si, active)), 0)
 
     def _is_rough(self, bsdf: Any, si: Any, active: Any) -> Any:
         """Whether the lobe is so wide that S says what it sees."""
@@ -243,12 +246,12 @@ class SpecularPaths:
         return dr.select(active, throughput * value * emitted * mis, 0)
 
     def _sample(
-        self, bsdf: Any, si: Any, number: Any, u: list[Any], met: Any, active: Any, unforked: Any
+        self, bsdf: Any, si: Any, place: Any, u: list[Any], met: Any, active: Any, unforked: Any
     ) -> tuple[Any, Any, Any, Any]:
         """Where the paths go on -> (BSDF sample, its weight, which paths go on, which were split by glass).
 
         Args:
-            number: the samples' places in the sequence.
+            place: the samples' places in the sequence, in [0, 1).
             met: paths that are at a surface.
             active: those of them whose BSDF splits into lobes.
             unforked: paths that have met no glass yet.
@@ -260,7 +263,7 @@ class SpecularPaths:
             forked = active & unforked & mirrors_and_refracts(mi, bsdf.flags())
             mirrored, mirrored_weight = bsdf.sample(self.mirrored, si, u[2], direction, forked)
             refracted, refracted_weight = bsdf.sample(self.refracted, si, u[2], direction, forked)
-            mirrors = (number + 0.5) / (self.samples * TILE * TILE) >= 1 - MIRRORED
+            mirrors = place >= 1 - MIRRORED
             side = dr.select(mirrors, mirrored, refracted)
             weight = dr.select(mirrors, mirrored_weight / MIRRORED, refracted_weight / (1 - MIRRORED))
             bsdf_sample, bsdf_weight = dr.select(forked, side, bsdf_sample), dr.select(forked, weight, bsdf_weight)

@@ -15,7 +15,7 @@ from dnrtrain.atomic import atomic_path
 from .denoise import filled_map
 from .engine import BundleWorker
 from .lightmap import LightBaker
-from .lobes import diffuse_context, reflectance
+from .lobes import diffuse_context, mean_of, reflectance
 from .tasks import SurfaceAnswer, SurfaceTask
 from .texels import grouped_meshes
 
@@ -87,7 +87,7 @@ class SurfaceMapper(LightBaker):
         emission = dr.select(found, emitter.eval(si, found), 0)
         opacity = mi.Float(1.0)
         if self.passing:
-            opacity = 1 - dr.mean(bsdf.eval_null_transmission(si, found))
+            opacity = 1 - mean_of(bsdf.eval_null_transmission(si, found))
         fine = found & dr.all(dr.isfinite(rho)) & dr.all(dr.isfinite(emission)) & dr.isfinite(opacity)
         one = mi.Float(1.0)
         return [*(dr.select(fine, value, 0) for value in (*rho, *emission, opacity, one)), self._one(found & ~fine)]

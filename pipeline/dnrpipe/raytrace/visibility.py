@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .lobes import lets_through
+from .lobes import lets_through, mean_of
 
 LAMP_PREFIX = "light-"
 TINTED = "dnr_transparent"
@@ -189,6 +189,6 @@ def with_tinted_alpha(mi: Any, inner: Any, first_visible: Any) -> Any:
             seen, hit = first_visible(scene, ray, active)
             redrawn = passes(hit, active)
             total = transmittance(scene, seen, hit, redrawn)
-            return colour, dr.select(redrawn, chance >= dr.mean(total), met), aovs
+            return colour, dr.select(redrawn, chance >= mean_of(total), met), aovs
 
     return TintedAlpha(mi.Properties("tinted_alpha"))

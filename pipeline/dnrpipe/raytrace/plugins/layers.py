@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from ..lobes import mean_of
 from . import energy
 from .energy import look_up, row_of, table_of
 from .nesting import evaluated_once, parameter
@@ -159,8 +160,8 @@ def register(mi: Any) -> None:
             else:
                 coat_odds = mi.Float(0.0)
             diffuse = below * base * (1 - metal) * (1 - dr.clip(dr.max(reflected), 0, 1)) + sheen
-            glossy = dr.mean(below * (metal * base * whole + (1 - metal) * reflected))
-            odds = [dr.mean(diffuse) + 1e-4, glossy + 1e-3, coat_odds]
+            glossy = mean_of(below * (metal * base * whole + (1 - metal) * reflected))
+            odds = [mean_of(diffuse) + 1e-4, glossy + 1e-3, coat_odds]
             total = odds[0] + odds[1] + odds[2]
             return {
                 "alpha": dr.maximum(r * r, MIN_ALPHA),

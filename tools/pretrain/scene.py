@@ -1,0 +1,158 @@
+"""One training scene: built from its seed, converted, lit, and looked at. A process of its own, on one core.
+
+python -m tools.pretrain.scene SEED FOLDER [--views 4] [--side 128]
+
+FOLDER/
+  maps.npy    float16 [views, channels, side, side], radiance in units of display white (times 2^exposure)
+  scene.json  `pretraining_data.Scene`: what the channels are, the views, the display transform, what it took
+  *.npz       the display transform's table, where the scene has one
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dnrpipe.core.console import Console
+from dnrpipe.core.scene_files import read_frame, read_summary
+from dnrpipe.core.settings import resolve
+from dnrpipe.core.workspace import Source, Workspace, file_sha256
+from dnrpipe.raytrace.variants import choose_variant
+from dnrpipe.stages.prepare import scene_and_views
+from dnrpipe.stages.stage import Run
+from dnrtrain.atomic import write_json
+from dnrtrain.contract import View
+from dnrtrain.pretraining_data import BRIGHT, RAY_COUNTS, Scene, channel_names
+
+FACTORY = Path(__file__).resolve().parents[2] / "blender_scenes" / "factory" / "build.py"
+DEPTH = 12
+LIGHT_MAPS = ((256, 32), (512, 16))
+"""(texels a side, paths per texel), one of them drawn for a scene."""
+REFERENCE_SPP = 64
+MOST = 60000.0
+"""Largest radiance that is kept: half floats end at 65504."""
+Took = Callable[[str], None]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("seed", type=int)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--views", type=int, default=4)
+    parser.add_argument("--side", type=int, default=128, help="pixels")
+    options = parser.parse_args()
+    options.folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="pretrain-") as scratch:
+        make(options.seed, options.folder, Path(scratch), options.views, options.side)
+
+
+def make(seed: int, folder: Path, scratch: Path, views: int, side: int) -> None:
+    """Write ``folder``, whole or not at all."""
+    timings: dict[str, float] = {}
+    clock = time.monotonic()
+
+    def took(name: str) -> None:
+        nonlocal clock
+        timings[name], clock = round(time.monotonic() - clock, 2), time.monotonic()
+
+    blend = scratch / f"{seed}.blend"
+    built = subprocess.run([sys.executable, FACTORY, "--seed", str(seed), blend], check=True, capture_output=True)
+    family = next(word for word in reversed(built.stdout.decode().split("\n")) if word and not word.startswith("Info"))
+    took("build")
+    workspace = Workspace.create(scratch / "scene.dnr", Source(path=str(blend), sha256=file_sha256(blend)))
+    cameras = {"source": "animation", "train": views, "val": 0, "test": 0, "width": side, "height": side}
+    settings = resolve("draft", {"cameras": cameras, "passes": {"workers": 1}}, environment={})
+    _, by_split = scene_and_views(Run(workspace, settings, Console(quiet=True)))
+    path = by_split["train"]  # all frames of the animation
+    chosen = [path[(2 * i + 1) * len(path) // (2 * views)] for i in range(min(views, len(path)))]
+    took("convert")
+    rays = [int(k) for k in np.random.default_rng([seed, 7]).permutation(RAY_COUNTS)[:2]]
+    maps, noise = _look(workspace, chosen, rays, seed, took)
+    frame = read_frame(workspace)
+    bright = [name.partition("@")[0] in BRIGHT for name in channel_names(rays)]
+    maps[:, bright] *= 2.0**frame.exposure
+    temporary = folder.with_name(f".{folder.name}")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    np.save(temporary / "maps.npy", np.clip(maps, -MOST, MOST).astype(np.float16))
+    if frame.display_lut is not None:
+        shutil.copy(workspace.scene / frame.display_lut, temporary)
+    scene = Scene(
+        seed=seed,
+        family=family.strip(),
+        views=chosen,
+        rays=rays,
+        frame=frame.model_copy(update={"exposure": 0.0}),
+        triangles=read_summary(workspace.scene).triangles,
+        noise=noise,
+        seconds=timings,
+    )
+    write_json(temporary / "scene.json", scene.model_dump(mode="json"))
+    temporary.rename(folder)
+
+
+def _look(workspace: Workspace, views: list[View], rays: list[int], seed: int, took: Took) -> tuple[np.ndarray, float]:
+    """(float32 [views, channels, side, side], relative RMSE of the references), by this process, on one core."""
+    choice = choose_variant("auto")
+    os.environ.update(choice.environment)
+    from dnrpipe.raytrace.base_renderer import BaseRenderer
+    from dnrpipe.raytrace.engine import Engine
+    from dnrpipe.raytrace.frames import Frames
+    from dnrpipe.raytrace.lightmap import LightBaker
+    from dnrpipe.raytrace.noise import half_noise
+    from dnrpipe.raytrace.pictures import finished, repair
+    from dnrpipe.raytrace.sensors import scaled_view
+    from dnrpipe.raytrace.texels import grouped_meshes
+    from dnrpipe.raytrace.visibility import ROULETTE_DEPTH, integrator_settings
+
+    bundle = workspace.scene / "scene.xml"
+    engine = Engine(choice.variant, 1, [bundle])
+    scene = engine.scenes[str(bundle)]
+    took("load")
+    path = integrator_settings(engine.mi, scene, "path")
+    path |= {"max_depth": DEPTH - 1, "rr_depth": ROULETTE_DEPTH, "hide_emitters": True}
+    size, spp = LIGHT_MAPS[seed % len(LIGHT_MAPS)]
+    light = LightBaker(engine.mi, scene, engine.mi.load_dict(path), grouped_meshes(bundle)).bake(size, spp, seed)
+    took("light")
+    scaled = [scaled_view(view, engine.unit_scale) for view in views]
+    bases = [[r.frame(v) for v in scaled] for r in (BaseRenderer(engine.mi, scene, light, k) for k in rays)]
+    took("base images")
+    silhouettes = Frames(engine, bundle, "path", 2, (views[0].width, views[0].height))
+    integrator, _ = engine.integrator(bundle, "path", DEPTH)
+    pictures, noises = [], []
+    for number, view in enumerate(views):
+        sensor = engine.sensor(view)
+
+        def traced(launch: int, sensor: Any = sensor, view: View = view, number: int = number) -> np.ndarray:
+            random = 1000 * seed + 32 * number + launch
+            return engine.frame(bundle, integrator, sensor, view, REFERENCE_SPP // 2, random)[0]
+
+        halves = [traced(0), traced(1)]
+        repair(halves, lambda attempt, half: traced(2 + 2 * attempt + half))
+        image = (halves[0] + halves[1]) / 2
+        raw = half_noise(*halves)
+        target, figures = finished(engine, bundle, view, image, (halves[0], halves[1]), raw, smooth=True)
+        noises.append(figures["noise"] or 0.0)
+        first = bases[0][number]
+        channels = {**first, "depth.Z": first["depth.Z"] / engine.unit_scale}
+        channels["coverage"] = silhouettes.coverage(view, first["mask"] > 0.5)
+        channels |= {f"target.{c}": target[c] for c in "RGBA"}
+        for k, base in zip(rays, bases, strict=True):
+            channels |= {f"{name}@{k}": values for name, values in base[number].items()}
+        pictures.append(np.stack([channels[name] for name in channel_names(rays)]).astype(np.float32))
+    took("references")
+    return np.stack(pictures), float(np.mean(noises))
+
+
+if __name__ == "__main__":
+    main()
