@@ -19,7 +19,7 @@ import bpy
 import numpy as np
 from building import preview, save
 
-from factory.recipe import FAMILIES, make
+from factory.recipe import FAMILIES, family_of, make
 from factory.sheet import contact_sheet
 
 
@@ -46,6 +46,7 @@ def main() -> None:
     parser.add_argument("output", type=Path, nargs="?", help="the .blend to write")
     parser.add_argument("--seed", type=int, default=0, help="of the scene, or the first of a sheet")
     parser.add_argument("--family", choices=sorted(FAMILIES))
+    parser.add_argument("--without", nargs="*", default=(), choices=sorted(FAMILIES), help="families not to draw")
     parser.add_argument("--preview", type=Path, help="render a small Cycles picture here")
     parser.add_argument("--size", type=int, default=128)
     parser.add_argument("--samples", type=int, default=16)
@@ -55,7 +56,7 @@ def main() -> None:
     if options.sheet is None:
         if options.output is None:
             parser.error("name an output or a --sheet")
-        print(make(options.seed, options.family))
+        print(make(options.seed, options.family or family_of(options.seed, options.without)))
         save(options.output)
         if options.preview:
             preview(options.preview, options.size, options.samples)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import bpy
@@ -35,9 +36,9 @@ WEIGHTS: dict[str, float] = {
 ATTEMPTS = 6
 
 
-def family_of(seed: int) -> str:
-    """The family that a seed draws."""
-    return Dice(seed, 1).weighted(WEIGHTS)
+def family_of(seed: int, without: Collection[str] = ()) -> str:
+    """The family that a seed draws of those that are not ``without``."""
+    return Dice(seed, 1).weighted({name: weight for name, weight in WEIGHTS.items() if name not in without})
 
 
 def make(seed: int, family: str | None = None) -> str:
