@@ -88,7 +88,7 @@ def test_same_picture_as_torch(tmp_path: Path, kind: str, lut: bool) -> None:
         ).batch([0])  # fmt: skip
         with torch.no_grad():
             output = model(batch)
-        answers = session.run(None, graph_inputs(channels, -view.ray_directions(), input_names(settings)))
+        answers = session.run(None, graph_inputs(channels, view, input_names(settings)))
         shown = output.rgb.clamp(0, 1).numpy()
         assert shown.std() > 0.03
         assert np.abs(answers[0] - shown).max() < 1e-4

@@ -54,7 +54,9 @@ def make_all(folder: Path, seeds: range, minutes: float, jobs: int) -> None:
             done += 1
             spent = time.monotonic() - started
             left = min(spent / done * (len(due) - done), 60 * minutes - spent)
-            print(f"{done}/{len(due)} seed {seed}: {reason or told(folder / str(seed))}, {clock(left)} left", flush=True)
+            print(
+                f"{done}/{len(due)} seed {seed}: {reason or told(folder / str(seed))}, {clock(left)} left", flush=True
+            )
             if reason:
                 with failures.open("a") as file:
                     file.write(f"{seed} {reason}\n")

@@ -27,6 +27,7 @@ Channels of a base file (``base/<split>/<view>.exr``): a cheap image of the same
     albedo.R/G/B          diffuse reflectance, mean over the pixel, premultiplied
     noise                 standard error of the luminance of baked light and specular paths, by the spread of the
                           pixel's rays; 0 with one ray
+    rays                  rays per pixel of baked light and specular paths
     chain.U/V             atlas coordinates in [0, 1), V up, of the first rough surface that the mirror and
                           refraction path through the pixel centre meets; 0 where there is none
     chain.mask            1 where there is one, else 0
@@ -58,7 +59,7 @@ GBUFFER_CHANNELS = (
 BASE_CHANNELS = (
     *("base.R", "base.G", "base.B", "base.A"),
     *("diffuse.R", "diffuse.G", "diffuse.B"),
-    *("albedo.R", "albedo.G", "albedo.B", "noise"),
+    *("albedo.R", "albedo.G", "albedo.B", "noise", "rays"),
     *("chain.U", "chain.V", "chain.mask", "chain.weight"),
 )
 SPLITS = ("train", "val", "test")

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from .contract import ContractError
 from .dataset import Batch
-from .display import DisplayTransform
+from .display import Display
 from .settings import ModelSettings
 
 LOG_SCALE = 10.0
@@ -30,6 +30,8 @@ IDENTITY = 4.0
 """What the kernels' middle weight has ahead of the others before the softmax, so it starts with 0.87 of the sum."""
 
 
+LUMINANCE = (0.2126, 0.7152, 0.0722)
+"""Of linear Rec.709."""
 LOG_CEILING = 30.0
 """Log values above it (radiance of 2e30) count as it: the exponential would overflow, and its gradient with it."""
 
@@ -44,7 +46,7 @@ def from_log(value: Tensor) -> Tensor:
     return torch.expm1(value.clamp_max(LOG_CEILING) * math.log1p(LOG_SCALE)) / LOG_SCALE
 
 
-def require_base(batch: Batch) -> tuple[Tensor, DisplayTransform]:
+def require_base(batch: Batch) -> tuple[Tensor, Display]:
     """The base image and the display transform. Raises ContractError when the views were loaded without."""
     if batch.base is None or batch.display is None:
         raise ContractError("this model corrects a base image, but the views were loaded without; load them with it")
@@ -90,6 +92,8 @@ def filter_by(image: Tensor, weights: Tensor) -> Tensor:
 def guide_channels(settings: ModelSettings) -> int:
     """Channels of `guide_maps`."""
     shown = 0 if settings.base == "none" else 3
+    if settings.guides == "camera":
+        return shown + 13
     if not settings.guides:
         return shown
     return shown + 10 + (6 if settings.base in ("baked", "direct", "path") else 0)
@@ -100,6 +104,9 @@ def guide_maps(batch: Batch, settings: ModelSettings) -> list[Tensor]:
     also view direction, normal, reflection direction and their cosine, and, as far as the base image has them, the
     albedo and the specular part in log space (display space would clip it). [N, C, H, W] each.
 
+    Camera guides say nothing of where in the world the camera is: normal in camera space, cosine, albedo, specular part,
+    coverage, the base's standard error relative to its luminance, and log2 of the rays per pixel over 3.
+
     Raises ContractError when the model wants a base image and the views were loaded without.
     """
     maps: list[Tensor] = []
@@ -109,6 +116,15 @@ def guide_maps(batch: Batch, settings: ModelSettings) -> list[Tensor]:
     if not settings.guides:
         return maps
     cosine = (batch.normal * batch.view_dir).sum(dim=1, keepdim=True)
+    if settings.guides == "camera":
+        base, display = require_base(batch)
+        assert batch.diffuse is not None and batch.albedo is not None and batch.noise is not None
+        assert batch.rays is not None and batch.camera_normal is not None  # base files hold them all
+        luminance = (base * base.new_tensor(LUMINANCE).view(1, 3, 1, 1)).sum(dim=1, keepdim=True)
+        noise = display.scale * batch.noise / (display.scale * luminance.clamp_min(0.0) + 1.0 / LOG_SCALE)
+        specular = to_log(display.scale * (base - batch.diffuse).clamp_min(0.0))
+        rays = batch.rays.log2() / 3.0
+        return [*maps, batch.camera_normal, cosine, batch.albedo, specular, batch.coverage, noise.clamp_max(2.0), rays]
     reflection = 2.0 * cosine * batch.normal - batch.view_dir
     maps += [batch.view_dir, batch.normal, reflection * batch.mask, cosine]
     if settings.base in ("baked", "direct", "path"):

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .contract import BASE_CHANNELS, RASTER_CHANNELS, ContractError, DamagedFile, SceneFrame, View, require_channels
-from .display import ALPHA_FLOOR, DisplayTransform
+from .display import ALPHA_FLOOR, Display, DisplayTransform
 from .exr import read_exr
 
 INPUT_CHANNELS = ("depth.Z", "normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "mask", "coverage")
@@ -31,12 +31,15 @@ class Batch:
     coverage  [N, 1, H, W] fraction of the pixel's area that surfaces cover
     view_dir  [N, 3, H, W] world-space unit vector from the surface towards the camera
     target    [N, 3, H, W] display RGB over white, or None
+    camera_normal  [N, 3, H, W] ``normal`` along the camera's axes: right, up, backwards
 
     Only where a base image was loaded, else None; the base file's channels (see `dnrtrain.contract`):
 
     base          [N, 3, H, W] linear Rec.709 radiance, straight (un-premultiplied)
     diffuse       [N, 3, H, W] its diffuse part, straight
     albedo        [N, 3, H, W] diffuse reflectance, straight
+    noise         [N, 1, H, W] standard error of the luminance of ``base``, straight
+    rays          [N, 1, H, W] rays per pixel of ``base``
     chain_uv      [N, 2, H, W] atlas coordinates at the end of the specular path, as ``uv``
     chain_mask    [N, 1, H, W] 1 where the specular path ends on a surface
     chain_weight  [N, 1, H, W] its throughput in [0, 1]
@@ -50,13 +53,16 @@ class Batch:
     coverage: Tensor
     view_dir: Tensor
     target: Tensor | None = None
+    camera_normal: Tensor | None = None
     base: Tensor | None = None
     diffuse: Tensor | None = None
     albedo: Tensor | None = None
+    noise: Tensor | None = None
+    rays: Tensor | None = None
     chain_uv: Tensor | None = None
     chain_mask: Tensor | None = None
     chain_weight: Tensor | None = None
-    display: DisplayTransform | None = None
+    display: Display | None = None
 
     def to(self, device: torch.device | str) -> Batch:
         return self._map(lambda tensor: tensor.to(device))
@@ -70,15 +76,23 @@ class Batch:
 
         ``element % 4`` quarter turns, mirrored when ``element >= 4``; 0 changes nothing. UVs, normals and
         view directions are *moved*, never rotated in value: they are atlas and world coordinates, which
-        do not depend on how the picture lies on the screen. The renderer learns screen-space filters, and
-        those must not depend on it either; that is what this augmentation teaches.
+        do not depend on how the picture lies on the screen. Only the normal in camera space turns with it. The
+        renderer learns screen-space filters, and those must not depend on it; this augmentation teaches that.
         """
 
         def turn(tensor: Tensor) -> Tensor:
             turned = torch.rot90(tensor, element % 4, dims=(-2, -1))
             return (turned.flip(-1) if element >= 4 else turned).contiguous()
 
-        return self if element == 0 else self._map(turn)
+        if element == 0:
+            return self
+        turned = self._map(turn)
+        if turned.camera_normal is None:
+            return turned
+        right, up, back = turned.camera_normal.unbind(dim=1)
+        for _ in range(element % 4):  # anticlockwise on the screen
+            right, up = -up, right
+        return replace(turned, camera_normal=torch.stack([-right if element >= 4 else right, up, back], dim=1))
 
     def _map(self, function) -> Batch:  # type: ignore[no-untyped-def]
         values = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -238,9 +252,11 @@ def _input_maps(
     inputs = _stack(path, channels, INPUT_CHANNELS)
     mask = (inputs[6:7] > 0.5).float()
     depth = ((inputs[0:1] - frame.near) / (frame.far - frame.near)).clamp(0.0, 1.0)
+    normal = inputs[1:4] * mask
     maps = {
         "depth": depth * mask,
-        "normal": inputs[1:4] * mask,
+        "normal": normal,
+        "camera_normal": in_camera_space(normal, camera),
         "uv": (2.0 * inputs[4:6] - 1.0) * mask,
         "mask": mask,
         "coverage": inputs[7:8].clamp(0.0, 1.0),
@@ -252,17 +268,25 @@ def _input_maps(
     return maps
 
 
+def in_camera_space(vectors: Tensor, camera: View) -> Tensor:
+    """World-space vectors [3, H, W] along the camera's axes: right, up, backwards."""
+    rotation = torch.from_numpy(camera.matrix[:3, :3].T.astype(np.float32))
+    return torch.einsum("ij,jhw->ihw", rotation, vectors).contiguous()
+
+
 def _base_maps(path: Path, channels: dict[str, np.ndarray]) -> dict[str, Tensor]:
     """The maps of `Batch` that base files hold, [C, H, W]."""
     values = _stack(path, channels, BASE_CHANNELS)
-    alpha, mask = values[3:4], (values[12:13] > 0.5).float()
+    alpha, mask = values[3:4], (values[14:15] > 0.5).float()
     return {
         "base": _straight(values[0:3], alpha),
         "diffuse": _straight(values[4:7], alpha),
         "albedo": _straight(values[7:10], alpha),
-        "chain_uv": (2.0 * values[10:12] - 1.0) * mask,
+        "noise": _straight(values[10:11], alpha),
+        "rays": values[11:12].clamp_min(1.0),
+        "chain_uv": (2.0 * values[12:14] - 1.0) * mask,
         "chain_mask": mask,
-        "chain_weight": values[13:14].clamp(0.0, 1.0) * mask,
+        "chain_weight": values[15:16].clamp(0.0, 1.0) * mask,
     }
 
 

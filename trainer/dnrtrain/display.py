@@ -8,6 +8,7 @@ sRGB opto-electronic transfer function (IEC 61966-2-1), then Blender's extra gam
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -30,6 +31,16 @@ def srgb_oetf(linear: Tensor) -> Tensor:
     # The power's argument is kept above the linear segment: its slope at 0 is infinite.
     curve = (x.clamp_min(LINEAR_END) ** (1 / 2.4)).mul_(1.055).sub_(0.055)
     return torch.where(x <= LINEAR_END, 12.92 * x, curve)
+
+
+class Display(Protocol):
+    """Linear Rec.709 -> display RGB. scale: of its exposure, linear."""
+
+    scale: float
+
+    def __call__(self, radiance: Tensor) -> Tensor: ...
+
+    def over_white(self, premultiplied: Tensor, alpha: Tensor) -> Tensor: ...
 
 
 class DisplayTransform:

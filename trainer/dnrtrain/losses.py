@@ -102,7 +102,7 @@ class Step2Loss:
             terms["frequency"] = frequency(rgb, target)
         if weights.total_variation:
             terms["total_variation"] = total_variation(rgb)
-        if weights.regularisation:
+        if weights.regularisation and output.texture is not None:
             terms["regularisation"] = texture_regularisation(output.texture)
         total = rgb.sum() * 0.0
         for name, value in terms.items():

@@ -20,12 +20,12 @@ class Output:
     """What the model makes of a batch.
 
     rgb       [N, 3, H, W] display space over white, unbounded
-    texture   T [N, C, H, W], 0 outside the mask
+    texture   T [N, C, H, W], 0 outside the mask; None where the model has none
     radiance  [N, 3, H, W] linear Rec.709, straight, >= 0; only where the model's output is "log", else None
     """
 
     rgb: Tensor
-    texture: Tensor
+    texture: Tensor | None
     radiance: Tensor | None = None
 
 
@@ -38,7 +38,7 @@ class DNR(nn.Module):
     steps, L1): 27.6 dB with it, 26.0 dB without (inside the mask 24.3 and 23.9).
 
     With a base image the network corrects it (see `dnrtrain.correction`). Its last layer starts at zero:
-    training starts at the base image itself.
+    training starts at the base image itself. Without a neural texture it is a corrector: nothing in it is of a scene.
 
     Args:
         seed: fixes all initial weights; no global random state is read or changed.
@@ -51,12 +51,14 @@ class DNR(nn.Module):
         generator = torch.Generator().manual_seed(seed)
         # Module constructors fill weights from the global generator; they are all overwritten below.
         with torch.random.fork_rng(devices=[]):
-            self.aggregator = Aggregator(settings, generator)
-            groups = [settings.texture_channels, 1 + guide_channels(settings)]
-            groups += [settings.texture_channels] if settings.chain else []
+            groups = [1 + guide_channels(settings)]
+            if settings.aggregator != "none":
+                self.aggregator = Aggregator(settings, generator)
+                groups += [settings.texture_channels] * (2 if settings.chain else 1)
             self.renderer = build_renderer(groups, settings)
         initialise(self, generator)
-        self.aggregator.zero_residual()
+        if settings.aggregator != "none":
+            self.aggregator.zero_residual()
         if settings.base == "none":
             assert self.renderer.head.bias is not None
             nn.init.constant_(self.renderer.head.bias, 0.5)
@@ -65,9 +67,12 @@ class DNR(nn.Module):
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def forward(self, batch: Batch) -> Output:
-        texture, seen = self.aggregator(batch, bfloat16=self.use_bfloat16)
         settings = self.settings
-        groups = [seen, torch.cat([batch.mask, *guide_maps(batch, settings)], dim=1)]
+        groups = [torch.cat([batch.mask, *guide_maps(batch, settings)], dim=1)]
+        texture = None
+        if settings.aggregator != "none":
+            texture, seen = self.aggregator(batch, bfloat16=self.use_bfloat16)
+            groups.append(seen)
         if settings.chain:
             groups.append(self.aggregator.at_chain(batch))
         outputs = self.renderer(groups, bfloat16=self.use_bfloat16)

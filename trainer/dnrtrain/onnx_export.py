@@ -11,10 +11,13 @@ Inputs are the channels of the EXR files (see `contract`), float32 [1, C, H, W],
     coverage   [1, 1] fraction of the pixel that surfaces cover
     view_dir   [1, 3] unit, world space, from the surface to the camera, in every pixel
     normal     [1, 3] unit, world space, towards the camera; 0 where mask is 0
+    camera_normal  [1, 3] the same along the camera's axes: right, up, backwards
     depth      [1, 1] planar depth in scene units
     base       [1, 4] base.R/G/B/A, linear Rec.709, premultiplied
     diffuse    [1, 3] diffuse.R/G/B, premultiplied
     albedo     [1, 3] albedo.R/G/B, premultiplied
+    noise      [1, 1] noise, premultiplied
+    rays       [1, 1] rays per pixel of the base image
     chain      [1, 4] chain.U, chain.V, chain.mask, chain.weight
 
 Outputs: ``rgb`` [1, 3, H, W], display space over white, in [0, 1]; where the model works in log space also
@@ -28,7 +31,7 @@ import io
 import json
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +41,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .atomic import atomic_path
-from .contract import ContractError, SceneFrame
+from .contract import ContractError, SceneFrame, View
 from .correction import correct, guide_maps
-from .dataset import Batch
+from .dataset import Batch, in_camera_space
 from .display import ALPHA_FLOOR, DisplayTransform
 from .model import DNR, compose
 from .settings import ModelSettings
@@ -57,9 +60,13 @@ CHANNELS: dict[str, list[str]] = {
     "base": [f"base.{c}" for c in "RGBA"],
     "diffuse": [f"diffuse.{c}" for c in "RGB"],
     "albedo": [f"albedo.{c}" for c in "RGB"],
+    "noise": ["noise"],
+    "rays": ["rays"],
     "chain": ["chain.U", "chain.V", "chain.mask", "chain.weight"],
 }
-"""Of the EXR files, by input; ``view_dir`` is in none."""
+"""Of the EXR files, by input."""
+MADE = {"view_dir": 3, "camera_normal": 3}
+"""Inputs that are in no file, and how many channels they have: they follow from the camera."""
 EXAMPLE = (48, 40)
 """Height and width that the graph is traced with; the file has none."""
 MERGED_VALUES = 16 * 128**2
@@ -79,6 +86,8 @@ def input_names(settings: ModelSettings) -> list[str]:
         names.append("base")
     if settings.guides and settings.base in ("baked", "direct", "path"):
         names += ["diffuse", "albedo"]
+    if settings.guides == "camera":
+        names += ["camera_normal", "noise", "rays"]
     return [*names, "chain"] if settings.chain else names
 
 
@@ -129,14 +138,20 @@ def export_onnx(path: Path, model: DNR, frame: SceneFrame, folder: Path, extra: 
         temporary.write_bytes(proto.SerializeToString())
 
 
-def graph_inputs(channels: Mapping[str, np.ndarray], view_dir: np.ndarray, names: list[str]) -> dict[str, np.ndarray]:
-    """Channels of a view's EXR files (float32 [H, W] each) and directions to the camera [H, W, 3] -> the inputs.
+def graph_inputs(channels: Mapping[str, np.ndarray], view: View, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Channels of a view's EXR files, float32 [H, W] each -> the inputs.
 
     Raises KeyError for a channel that is not there.
     """
     found = {}
     for name in names:
-        image = view_dir.transpose(2, 0, 1) if name == "view_dir" else np.stack([channels[c] for c in CHANNELS[name]])
+        if name == "view_dir":
+            image = -view.ray_directions().transpose(2, 0, 1)
+        elif name == "camera_normal":
+            normal = torch.from_numpy(np.stack([channels[c] for c in CHANNELS["normal"]]))
+            image = in_camera_space(normal, view).numpy()
+        else:
+            image = np.stack([channels[c] for c in CHANNELS[name]])
         found[name] = np.ascontiguousarray(image[None], dtype=np.float32)
     return found
 
@@ -153,7 +168,7 @@ class Graph(nn.Module):
         self.names = input_names(model.settings)
         self.tables: dict[int, Tensor] = {}
         """Pyramids as one texture [1, C, height, width] each, whose outermost texel centres lie on the border."""
-        for part in model.aggregator.modules():
+        for part in model.modules():
             if isinstance(part, TexturePyramid) and part.mergeable and part.levels[0].numel() <= MERGED_VALUES:
                 table, width, height = part.merged()
                 self.tables[id(part)] = table.view(1, height, width, -1).permute(0, 3, 1, 2).contiguous()
@@ -161,8 +176,9 @@ class Graph(nn.Module):
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         batch = self.batch(dict(zip(self.names, inputs, strict=True)))
         settings = self.settings
-        seen = self._texture(batch)
-        groups = [seen, torch.cat([batch.mask, *guide_maps(batch, settings)], dim=1)]
+        groups = [torch.cat([batch.mask, *guide_maps(batch, settings)], dim=1)]
+        if settings.aggregator != "none":
+            groups.append(self._texture(batch))
         if settings.chain:
             assert batch.chain_uv is not None and batch.chain_weight is not None
             sampled = self._look_up(self.model.aggregator.texture_uv, batch.chain_uv)
@@ -182,7 +198,7 @@ class Graph(nn.Module):
         if "base" in maps:
             alpha = maps["base"][:, 3:].clamp(ALPHA_FLOOR, 1.0)
             parts["base"] = maps["base"][:, :3] / alpha
-            parts |= {name: maps[name] / alpha for name in ("diffuse", "albedo") if name in maps}
+            parts |= {name: maps[name] / alpha for name in ("diffuse", "albedo", "noise") if name in maps}
         if "chain" in maps:
             ends = (maps["chain"][:, 2:3] > 0.5).float()
             parts["chain_uv"] = (2.0 * maps["chain"][:, :2] - 1.0) * ends
@@ -196,6 +212,8 @@ class Graph(nn.Module):
             mask=mask,
             coverage=maps["coverage"].clamp(0.0, 1.0),
             view_dir=maps.get("view_dir", zero),
+            camera_normal=maps["camera_normal"] * mask if "camera_normal" in maps else zero,
+            rays=maps.get("rays"),
             target=None,
             display=self.display,
             **parts,
@@ -278,7 +296,7 @@ def _rows(image: Tensor, function: Any) -> Tensor:
 
 def channel_count(name: str) -> int:
     """Channels of a graph input."""
-    return 3 if name == "view_dir" else len(CHANNELS[name])
+    return MADE.get(name) or len(CHANNELS[name])
 
 
 def _example(name: str, height: int, width: int) -> Tensor:

@@ -20,9 +20,10 @@ class ModelSettings(Strict):
     spherical_harmonics: bool = Field(
         default=True, description="multiply 9 channels by bands 0-2 of the view direction"
     )
-    aggregator: Literal["concat", "residual", "early"] = Field(
+    aggregator: Literal["concat", "residual", "early", "none"] = Field(
         default="concat",
-        description="concat: the paper's; residual: fused as a residual on the UV texture; early: 9-channel input",
+        description="concat: the paper's; residual: fused as a residual on the UV texture; early: 9-channel input;"
+        " none: no neural texture",
     )
     modalities: Literal["uv", "uv+depth", "uv+normal", "uv+depth+normal"] = "uv+depth+normal"
     width: int = Field(default=64, ge=4, le=512, description="channels of the U-Net's first level")
@@ -32,8 +33,10 @@ class ModelSettings(Strict):
         description="image that the network corrects; raster: rasterised colour, baked: baked light and specular"
         " paths, path: a few path-traced samples, denoised",
     )
-    guides: bool = Field(
-        default=False, description="view and reflection direction, normal, albedo and specular part as network inputs"
+    guides: bool | Literal["camera"] = Field(
+        default=False,
+        description="view and reflection direction, normal, albedo and specular part as network inputs; camera: the"
+        " normal in camera space instead of world-space directions, coverage, rays per pixel and their noise",
     )
     chain: bool = Field(default=False, description="look the UV texture up at the end of the specular path, too")
     stride: Literal[1, 2] = Field(default=1, description="2: U-Net at half resolution between full-resolution layers")
@@ -52,10 +55,20 @@ class ModelSettings(Strict):
                 f"chain = true needs the specular path, which base = {self.base} has not;"
                 " type --set model.chain=false, or --set model.base=baked"
             )
-        if self.chain and self.aggregator == "early":
+        if self.chain and self.aggregator in ("early", "none"):
             raise ValueError(
-                "chain = true needs a neural texture, which aggregator = early has not;"
+                f"chain = true needs a neural texture, which aggregator = {self.aggregator} has not;"
                 " type --set model.chain=false, or --set model.aggregator=residual"
+            )
+        if self.guides == "camera" and self.base not in ("baked", "direct", "path"):
+            raise ValueError(
+                f"guides = camera needs the noise of a base image, which base = {self.base} has not;"
+                " type --set model.guides=true, or --set model.base=baked"
+            )
+        if self.aggregator == "none" and self.base == "none":
+            raise ValueError(
+                "aggregator = none works on a base image, and base = none gives none;"
+                " type --set model.aggregator=concat, or --set model.base=baked"
             )
         if self.base == "none" and self.output == "log":
             raise ValueError(

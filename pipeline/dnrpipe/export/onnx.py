@@ -75,7 +75,7 @@ def view_inputs(workspace: Workspace, view: View, split: str, base: str, names: 
         channels |= {name: image for name, image in more.items() if name not in channels}
     elif base == "raster":
         channels |= {f"base.{c}": channels[c] for c in "RGBA"}
-    return onnx_export.graph_inputs(channels, -view.ray_directions(), list(names))
+    return onnx_export.graph_inputs(channels, view, names)
 
 
 def _views(workspace: Workspace, base: str) -> tuple[str, list[View]]:

@@ -101,7 +101,8 @@ class BaseRenderer:
         channels, self.masked = masked_channels(channels)
         for name in GBUFFER:
             channels[name] = channels[name] * channels["mask"]
-        return channels | {"coverage": np.minimum(channels["base.A"], 1)}
+        rays = np.full(shape, self.samples, np.float32)
+        return channels | {"coverage": np.minimum(channels["base.A"], 1), "rays": rays}
 
     def _kernel(
         self, scene: Any, light: Any, tables: Any, axes: Any, film: Any, rays: Any, start: Any, width: int, height: int

@@ -70,9 +70,7 @@ class SpecularPaths:
         self.refracted = context_of(mi, kinds.DeltaTransmission, kinds.GlossyTransmission)
 
     @dr.syntax
-    def trace(
-        self, scene: Any, light: Any, steps: Any, ray: Any, forward: Any, number: Any, samples: Any
-    ) -> list[Any]:
+    def trace(self, scene: Any, light: Any, steps: Any, ray: Any, forward: Any, number: Any, samples: Any) -> list[Any]:
         """One sample along each ray -> the values that `base_renderer` names by LOST, MEANS and CENTRES, in that order.
 
         Args:

@@ -1,0 +1,162 @@
+"""Training of the shipped corrector: no scene in it, trained on many scenes, used on scenes that it never saw.
+
+Notation
+    x      base image and guides of a view, k rays per pixel
+    y      its path-traced reference, display space over white
+
+Each step draws scenes, one view and one k of each, and a square of it, then disturbs what must not matter: the symmetries
+of the square, the order of the colour channels, the level of light. The objective is step 2's, without the texture.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from . import checkpoint
+from .dataset import DIHEDRAL_ORDER, Batch
+from .losses import Step2Loss
+from .metrics import psnr
+from .model import DNR, compose
+from .perceptual import PerceptualLoss
+from .pretraining_data import SceneMaps, joined
+from .schedule import Averaged, adam, averaged_weights, guarded_step
+from .settings import LossWeights, ModelSettings, Step2Settings
+
+CORRECTOR = ModelSettings(
+    aggregator="none",
+    modalities="uv",
+    width=24,
+    depth=3,
+    base="baked",
+    guides="camera",
+    filter=3,
+    stride=2,
+    output="log",
+)
+LOSS = Step2Settings(
+    photometric="l1", perceptual_crop=32, loss=LossWeights(perceptual=0.03, total_variation=0.0, regularisation=0.0)
+)
+RATE, RATE_END = 1e-3, 2e-5
+EMA = 0.999
+PERCEPTUAL_EVERY = 4
+"""Steps from one with L_p to the next: it takes half of such a step's time."""
+STOPS = 1.0
+"""The level of light varies by so many stops up and down."""
+
+
+def pretrain(
+    training: list[SceneMaps],
+    held_out: list[SceneMaps],
+    folder: Path,
+    *,
+    model: ModelSettings = CORRECTOR,
+    seconds: float,
+    batch: int = 4,
+    side: int = 64,
+    seed: int = 0,
+    weights: Mapping[str, Mapping[str, Tensor]] | None = None,
+    every: float = 120.0,
+) -> Iterator[dict[str, Any]]:
+    """Train for so many seconds in all; yields a record every ``every`` seconds, the last one at the end.
+
+    Args:
+        folder: holds the state of an interrupted training, which goes on.
+        side: of the squares, pixels.
+        weights: from ``weights.load_weights``; None drops L_p.
+    """
+    dnr = DNR(model, seed)
+    optimiser = adam([dnr], RATE, "cpu")
+    average = Averaged(dnr, EMA)
+    spent, step = 0.0, 0
+    path = folder / "pretrain.safetensors"
+    saved = checkpoint.load(path)
+    if saved is not None:
+        tensors, info = saved
+        part = {name: {} for name in ("dnr", "adam", "average")}
+        for name, value in tensors.items():
+            kind, _, own = name.partition("/")
+            part[kind][own] = value
+        dnr.load_state_dict(part["dnr"])
+        checkpoint.restore_optimiser(optimiser, part["adam"])
+        average.restore(part["average"], info["step"])
+        spent, step = info["seconds"], info["step"]
+    plain, whole = Step2Loss(LOSS, None), Step2Loss(LOSS, PerceptualLoss(weights["vgg"]) if weights else None)
+    total = 0.0
+    count = 0
+    told = spent
+    clock = time.monotonic()
+    dnr.train()
+    while spent < seconds:
+        random = np.random.default_rng([seed, step])
+        rate = RATE * (RATE_END / RATE) ** min(1.0, spent / seconds)
+        drawn = [training[int(index)].draw(random, side) for index in random.integers(len(training), size=batch)]
+        pictures = joined([disturbed(picture, random) for picture in drawn])
+        assert pictures.target is not None
+        loss_of = plain if step % PERCEPTUAL_EVERY else whole
+        loss, _ = loss_of(dnr(pictures), pictures.target, random, bfloat16=False)
+        if guarded_step(optimiser, loss, rate):
+            average.update()
+            total, count = total + float(loss.detach()), count + 1
+        step += 1
+        spent += time.monotonic() - clock
+        clock = time.monotonic()
+        if spent - told >= every or spent >= seconds:
+            told = spent
+            tensors = {f"dnr/{k}": v for k, v in dnr.state_dict().items()}
+            tensors |= {f"adam/{k}": v for k, v in checkpoint.optimiser_tensors(optimiser).items()}
+            tensors |= {f"average/{k}": v for k, v in average.sums.items()}
+            checkpoint.save(path, tensors, {"seconds": spent, "step": step})
+            with averaged_weights(dnr, average):
+                checkpoint.save(folder / "corrector.safetensors", dnr.state_dict(), {"settings": model.model_dump()})
+                found = judge(dnr, held_out)
+            yield {"seconds": round(spent), "step": step, "loss": total / max(count, 1), **found}
+            total, count, clock = 0.0, 0, time.monotonic()
+
+
+def disturbed(batch: Batch, random: np.random.Generator) -> Batch:
+    """One of the symmetries of the square, another order of colours, another level of light."""
+    batch = batch.augment(int(random.integers(DIHEDRAL_ORDER)))
+    order = torch.as_tensor(random.permutation(3))
+    gain = float(2.0 ** random.uniform(-STOPS, STOPS))
+    linear, display = batch.target, batch.display
+    assert linear is not None and display is not None and batch.base is not None and batch.noise is not None
+    assert batch.diffuse is not None and batch.albedo is not None
+    linear = torch.cat([linear[:, order] * gain, linear[:, 3:]], dim=1)
+    return replace(
+        batch,
+        base=batch.base[:, order] * gain,
+        diffuse=batch.diffuse[:, order] * gain,
+        albedo=batch.albedo[:, order],
+        noise=batch.noise * gain,
+        target=display.over_white(linear[:, :3], linear[:, 3:]),
+    )
+
+
+@torch.no_grad()
+def judge(dnr: DNR, scenes: list[SceneMaps]) -> dict[str, Any]:
+    """Mean PSNR over white of base images and of their corrections, by rays per pixel and by scene."""
+    dnr.eval()
+    rows: list[tuple[int, int, float, float]] = []
+    for scene in scenes:
+        for view in range(len(scene.scene.views)):
+            for rays in scene.scene.rays:
+                batch = scene.batch(view, rays)
+                display, linear = batch.display, batch.target
+                assert display is not None and linear is not None and batch.base is not None
+                target = display.over_white(linear[:, :3], linear[:, 3:])
+                base = compose(display(batch.base), batch.coverage)
+                both = [float(psnr(p.clamp(0, 1), target)) for p in (base, dnr(batch).rgb)]
+                rows.append((scene.scene.seed, rays, both[0], both[1]))
+    dnr.train()
+    mean = lambda chosen: [round(float(np.mean([r[i] for r in chosen])), 3) for i in (2, 3)]  # noqa: E731
+    by_rays = {k: mean([r for r in rows if r[1] == k]) for k in sorted({r[1] for r in rows})}
+    by_scene = {s: mean([r for r in rows if r[0] == s]) for s in sorted({r[0] for r in rows})}
+    return {"psnr": mean(rows), "by_rays": by_rays, "by_scene": by_scene}
