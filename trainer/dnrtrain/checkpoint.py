@@ -167,7 +167,7 @@ def load_model(folder: Path, device: str | torch.device = "cpu") -> DNR:
     try:
         settings = ModelSettings.model_validate(record.model)
         # The model is made before its weights are put in: a few bytes of JSON must not make it take 70 GB.
-        texels = 0 if settings.aggregator == "early" else settings.texture_size**2 * settings.texture_channels
+        texels = 0 if settings.aggregator in ("early", "none") else settings.texture_size**2 * settings.texture_channels
         if texels > max((tensor.numel() for tensor in saved[0].values()), default=0):
             raise ValueError(f"textures of {settings.texture_size} texels, but no tensor of {texels} numbers")
         model = DNR(settings, seed=0)

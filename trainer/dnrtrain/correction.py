@@ -104,8 +104,8 @@ def guide_maps(batch: Batch, settings: ModelSettings) -> list[Tensor]:
     also view direction, normal, reflection direction and their cosine, and, as far as the base image has them, the
     albedo and the specular part in log space (display space would clip it). [N, C, H, W] each.
 
-    Camera guides say nothing of where in the world the camera is: normal in camera space, cosine, albedo, specular part,
-    coverage, the base's standard error relative to its luminance, and log2 of the rays per pixel over 3.
+    Camera guides say nothing of where in the world the camera is: normal in camera space, cosine, albedo, specular
+    part, coverage, the base's standard error relative to its luminance, and log2 of the rays per pixel over 3.
 
     Raises ContractError when the model wants a base image and the views were loaded without.
     """

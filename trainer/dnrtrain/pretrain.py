@@ -4,8 +4,9 @@ Notation
     x      base image and guides of a view, k rays per pixel
     y      its path-traced reference, display space over white
 
-Each step draws scenes, one view and one k of each, and a square of it, then disturbs what must not matter: the symmetries
-of the square, the order of the colour channels, the level of light. The objective is step 2's, without the texture.
+Each step draws scenes, one view and one k of each, and a square of it, then disturbs what must not matter: the
+symmetries of the square, the order of the colour channels, the level of light. The objective is step 2's, without the
+texture.
 """
 
 from __future__ import annotations

@@ -138,8 +138,10 @@ class Step2Settings(Strict):
     learning_rate_end: float = Field(default=1e-4, gt=0)
     texture_rate_scale: float = Field(default=1.0, gt=0, description="learning rate of texels over the networks'")
     photometric: Literal["l1", "mse"] = "mse"
-    start: Literal["coarse", "fresh"] = Field(
-        default="coarse", description="coarse: the weights of step 1, as far as they fit; fresh: new ones"
+    start: Literal["coarse", "fresh", "pretrained"] = Field(
+        default="coarse",
+        description="coarse: the weights of step 1, as far as they fit; fresh: new ones; pretrained: the shipped"
+        " corrector's, and a neural texture that starts at zero",
     )
     ema: float = Field(
         default=0.0, ge=0, lt=1, description="decay per step of the averaged weights that become the model; 0 = off"

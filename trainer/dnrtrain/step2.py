@@ -21,6 +21,7 @@ from .precision import decide_bfloat16
 from .preview import Preview
 from .schedule import STEP2, Averaged, EpochBook, guarded_step, require_target, run_fingerprint, step_random
 from .settings import ModelSettings, Step2Settings
+from .shipped import with_corrector
 from .training_run import TrainingRun
 
 
@@ -43,7 +44,7 @@ def run_step2(
     Args:
         views: the M selected views, targets = ray-traced images.
         val: views with held-out targets, or None.
-        coarse: folder of the finished step 1; with ``start = fresh`` it is not read.
+        coarse: folder of the finished step 1; read only with ``start = coarse``.
         seed: of new weights, of the order of steps, of patches and flips.
         checkpoints: this step's own folder; see `run_step1` on resuming.
         weights: from ``weights.load_weights``; None drops L_p with a note, and the record says
@@ -55,15 +56,18 @@ def run_step2(
     """
     require_target(views, "step 2")
     notes: list[str] = []
-    fresh = settings.start == "fresh"
-    dnr = DNR(model, seed).to(device) if fresh else _from_coarse(coarse, model, seed, device, notes)
-    if settings.precision != "auto" or fresh:  # else as step 1 decided
+    from_coarse = settings.start == "coarse"
+    if from_coarse:
+        dnr = _from_coarse(coarse, model, seed, device, notes)
+    else:
+        dnr = (DNR if settings.start == "fresh" else with_corrector)(model, seed).to(device)
+    if settings.precision != "auto" or not from_coarse:  # else as step 1 decided
         dnr.use_bfloat16 = decide_bfloat16(settings.precision, device)
     wants_perceptual = settings.loss.perceptual > 0
     perceptual = None
     if weights is not None and wants_perceptual:
         perceptual = PerceptualLoss(weights["vgg"]).to(device)
-    record = None if fresh else checkpoint.read_record(coarse)
+    record = checkpoint.read_record(coarse) if from_coarse else None
     parts = [
         model.model_dump(), settings.model_dump(), seed, device, perceptual is not None,
         None if record is None else record.run,

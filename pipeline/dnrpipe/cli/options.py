@@ -61,7 +61,7 @@ SCENE_OPTIONS = [
 ]
 """Options of commands that may start from a scene file; `scene_overrides` reads them."""
 SELECT_OPTIONS = [
-    click.option("--budget", type=int, metavar="M", help="Views to ray-trace (default 25)."),
+    click.option("--budget", type=int, metavar="M", help="Views to ray-trace (default 25); 0: none, no training."),
     click.option(
         "--policy",
         type=click.Choice(NAMES),
@@ -123,8 +123,8 @@ def scene_overrides(options: dict[str, Any]) -> dict[str, Any]:
 def select_overrides(options: dict[str, Any]) -> dict[str, Any]:
     chosen = {key: options.pop(key) for key in ("budget", "policy")}
     given = {key: value for key, value in chosen.items() if value is not None}
-    if given.get("budget", 1) < 1:
-        raise UserError(f"--budget {given['budget']}: must be at least 1 view")
+    if given.get("budget", 0) < 0:
+        raise UserError(f"--budget {given['budget']}: must be 0 (no traced view, no training) or more")
     return {"select": given} if given else {}
 
 

@@ -134,7 +134,9 @@ class EffectSettings(Strict):
 class SelectSettings(Strict):
     """Which of the candidates are ray-traced."""
 
-    budget: int = Field(default=25, ge=1, description="views to ray-trace")
+    budget: int = Field(
+        default=25, ge=0, description="views to ray-trace; 0: none, and no training: the shipped corrector as it is"
+    )
     policy: PolicyName = Field(default="auto", description="how they are chosen (docs/method.md)")
     seed: int = Field(default=0, ge=0)
     step1: Step1Settings = Step1Settings()
@@ -171,6 +173,10 @@ class Settings(Strict):
     @property
     def trains_step1(self) -> bool:
         """Whether the coarse model is wanted: by the policy, or as the start of step 2."""
+        return self.select.budget > 0 and self._wants_coarse
+
+    @property
+    def _wants_coarse(self) -> bool:
         return self.select.policy in TRAINED_NAMES or self.starts_coarse
 
     @property

@@ -105,7 +105,16 @@ class BaseRenderer:
         return channels | {"coverage": np.minimum(channels["base.A"], 1), "rays": rays}
 
     def _kernel(
-        self, scene: Any, light: Any, tables: Any, axes: Any, film: Any, rays: Any, start: Any, width: int, height: int
+        self,
+        scene: Any,
+        light: Any,
+        tables: Any,
+        axes: Any,
+        film: Any,
+        rays: Any,
+        start: Any,
+        width: int,
+        height: int,
     ) -> list[Any]:
         """Values [height * width] of LOST, MEANS, CENTRES and NOISE. Recorded once, replayed for every view of that size.
 

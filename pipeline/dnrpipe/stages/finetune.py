@@ -48,6 +48,8 @@ def finetune(run: Run) -> Outcome:
     workspace, settings = run.workspace, run.settings
     by_name = {view.name: view for view in split_views(workspace)["train"]}
     names = read_selection(workspace).views
+    if not names:
+        return _without_training(run)
     dataset = load(workspace, [by_name[name] for name in names], "train", raytraced=True, base=settings.model.base)
     folder = workspace.checkpoints("step2")
     weights = perceptual_weights(run.console)
@@ -69,6 +71,19 @@ def finetune(run: Run) -> Outcome:
         if isinstance(event, Previewed):
             picture.show(event)
     return Outcome(file_sha256(folder / "model.safetensors"), {"perceptual": weights is not None, "views": len(names)})
+
+
+def _without_training(run: Run) -> Outcome:
+    """The shipped corrector as it is becomes the workspace's model.
+
+    Raises ContractError: the settings are of another network.
+    """
+    from dnrtrain.shipped import save_untrained
+
+    settings = run.settings
+    folder = run.workspace.checkpoints("step2")
+    save_untrained(folder, settings.model, settings.finetune.step2, run.fingerprint)
+    return Outcome(file_sha256(folder / "model.safetensors"), {"views": 0})
 
 
 def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:

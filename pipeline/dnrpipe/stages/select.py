@@ -30,9 +30,14 @@ def select_views(run: Run) -> Outcome:
     workspace, settings = run.workspace, run.settings
     views = split_views(workspace)["train"]
     check_budget(settings.select.budget, len(views))
-    if settings.trains_step1:
+    if settings.select.budget == 0:
+        _require_pretrained(settings)
+        run.console.say("select: no views (--budget 0); the shipped corrector renders as it is")
+        chosen = Selection(policy=settings.select.policy, budget=0, seed=settings.select.seed, views=[])
+        made: list[object] = [[]]
+    elif settings.trains_step1:
         chosen = _train_and_choose(run, views)
-        made: list[object] = [chosen.views, file_sha256(workspace.checkpoints("step1") / "model.safetensors")]
+        made = [chosen.views, file_sha256(workspace.checkpoints("step1") / "model.safetensors")]
     else:
         chosen = _choose(run, views)
         made = [chosen.views]
@@ -46,6 +51,15 @@ def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
     if not settings.trains_step1:
         return int(there), 1
     return epochs_done(workspace.checkpoints("step1"), settings.select.step1.epochs, there)
+
+
+def _require_pretrained(settings: Settings) -> None:
+    """Raises UserError: without traced views only the shipped corrector can render."""
+    if settings.finetune.step2.start != "pretrained":
+        raise UserError(
+            "--budget 0 renders with the shipped corrector, which finetune.step2.start ="
+            f" {settings.finetune.step2.start} leaves out; type --set finetune.step2.start=pretrained"
+        )
 
 
 def check_budget(budget: int, candidates: int) -> None:

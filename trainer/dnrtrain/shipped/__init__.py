@@ -1,0 +1,79 @@
+"""The corrector that comes with the package: trained on many scenes, for scenes that it never saw (model-card.md)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from .. import checkpoint
+from ..contract import ContractError
+from ..model import DNR
+from ..records import ModelRecord
+from ..settings import ModelSettings, Step2Settings
+from ..textures import TexturePyramid
+
+WEIGHTS = Path(__file__).with_name("corrector.safetensors")
+"""float16; the settings are in its header. `tools.pretrain.train` makes it."""
+
+
+def corrector() -> DNR:
+    """The shipped corrector, float32, on the CPU, ready for inference.
+
+    Raises DamagedFile: its file is.
+    """
+    saved = checkpoint.load(WEIGHTS)
+    if saved is None:
+        raise ContractError(f"{WEIGHTS}: is missing; install dnrpipe again")
+    tensors, info = saved
+    model = DNR(ModelSettings.model_validate(info["settings"]), seed=0)
+    model.load_state_dict({name: value.float() for name, value in tensors.items()})
+    return model.eval()
+
+
+def save_untrained(folder: Path, settings: ModelSettings, step2: Step2Settings, fingerprint: str) -> None:
+    """Write the shipped corrector as the model of step 2, as if it had been trained on no view.
+
+    Raises ContractError: ``settings`` are of another network.
+    """
+    model = corrector()
+    _require_alike(settings, model.settings)
+    record = ModelRecord(
+        model=model.settings.model_dump(mode="json"),
+        fingerprint=fingerprint,
+        run=fingerprint,
+        stage="step2",
+        settings=step2.model_dump(mode="json"),
+        seed=0,
+        bfloat16=False,
+        history=[],
+        views=[],
+    )
+    checkpoint.save_model(folder, model, record)
+
+
+def _require_alike(settings: ModelSettings, shipped: ModelSettings) -> None:
+    for name in ("base", "guides", "output", "filter", "network", "stride", "width", "depth"):
+        own, wanted = getattr(settings, name), getattr(shipped, name)
+        if own != wanted:
+            raise ContractError(
+                f"the shipped corrector has {name} = {wanted}, model.{name} is {own};"
+                f" type --set model.{name}={wanted}, or --set finetune.step2.start=fresh"
+            )
+
+
+def with_corrector(settings: ModelSettings, seed: int) -> DNR:
+    """A model of these settings that begins as the shipped corrector: what it has besides starts at zero.
+
+    Raises ContractError: the settings are of another network, which the message names.
+    """
+    shipped = corrector()
+    _require_alike(settings, shipped.settings)
+    model = DNR(settings, seed)
+    model.load_state_dict(shipped.state_dict(), strict=False)
+    with torch.no_grad():
+        for part in model.modules():
+            if isinstance(part, TexturePyramid):
+                for level in part.levels:
+                    level.zero_()
+    return model
