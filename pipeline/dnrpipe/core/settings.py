@@ -173,11 +173,7 @@ class Settings(Strict):
     @property
     def trains_step1(self) -> bool:
         """Whether the coarse model is wanted: by the policy, or as the start of step 2."""
-        return self.select.budget > 0 and self._wants_coarse
-
-    @property
-    def _wants_coarse(self) -> bool:
-        return self.select.policy in TRAINED_NAMES or self.starts_coarse
+        return self.select.budget > 0 and (self.select.policy in TRAINED_NAMES or self.starts_coarse)
 
     @property
     def starts_coarse(self) -> bool:

@@ -116,8 +116,9 @@ class BaseRenderer:
         width: int,
         height: int,
     ) -> list[Any]:
-        """Values [height * width] of LOST, MEANS, CENTRES and NOISE. Recorded once, replayed for every view of that size.
+        """Values [height * width] of LOST, MEANS, CENTRES and NOISE.
 
+        Recorded once, replayed for every view of that size.
         A pixel's samples lie side by side; the first goes through the pixel's centre.
 
         Args:

@@ -74,15 +74,12 @@ def finetune(run: Run) -> Outcome:
 
 
 def _without_training(run: Run) -> Outcome:
-    """The shipped corrector as it is becomes the workspace's model.
-
-    Raises ContractError: the settings are of another network.
-    """
+    """The shipped corrector as it is becomes the workspace's model, whatever network the settings name."""
     from dnrtrain.shipped import save_untrained
 
     settings = run.settings
     folder = run.workspace.checkpoints("step2")
-    save_untrained(folder, settings.model, settings.finetune.step2, run.fingerprint)
+    save_untrained(folder, settings.finetune.step2, run.fingerprint)
     return Outcome(file_sha256(folder / "model.safetensors"), {"views": 0})
 
 

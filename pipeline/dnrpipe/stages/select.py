@@ -31,7 +31,7 @@ def select_views(run: Run) -> Outcome:
     views = split_views(workspace)["train"]
     check_budget(settings.select.budget, len(views))
     if settings.select.budget == 0:
-        _require_pretrained(settings)
+        _require_baked(settings)
         run.console.say("select: no views (--budget 0); the shipped corrector renders as it is")
         chosen = Selection(policy=settings.select.policy, budget=0, seed=settings.select.seed, views=[])
         made: list[object] = [[]]
@@ -53,12 +53,12 @@ def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
     return epochs_done(workspace.checkpoints("step1"), settings.select.step1.epochs, there)
 
 
-def _require_pretrained(settings: Settings) -> None:
-    """Raises UserError: without traced views only the shipped corrector can render."""
-    if settings.finetune.step2.start != "pretrained":
+def _require_baked(settings: Settings) -> None:
+    """Raises UserError: without traced views only the shipped corrector can render, and it corrects baked light."""
+    if settings.model.base != "baked":
         raise UserError(
-            "--budget 0 renders with the shipped corrector, which finetune.step2.start ="
-            f" {settings.finetune.step2.start} leaves out; type --set finetune.step2.start=pretrained"
+            f"--budget 0 renders with the shipped corrector, which corrects baked light, and model.base ="
+            f" {settings.model.base}; type --set model.base=baked"
         )
 
 

@@ -31,13 +31,9 @@ def corrector() -> DNR:
     return model.eval()
 
 
-def save_untrained(folder: Path, settings: ModelSettings, step2: Step2Settings, fingerprint: str) -> None:
-    """Write the shipped corrector as the model of step 2, as if it had been trained on no view.
-
-    Raises ContractError: ``settings`` are of another network.
-    """
+def save_untrained(folder: Path, step2: Step2Settings, fingerprint: str) -> None:
+    """Write the shipped corrector as the model of step 2, as if it had been trained on no view."""
     model = corrector()
-    _require_alike(settings, model.settings)
     record = ModelRecord(
         model=model.settings.model_dump(mode="json"),
         fingerprint=fingerprint,
@@ -52,23 +48,19 @@ def save_untrained(folder: Path, settings: ModelSettings, step2: Step2Settings, 
     checkpoint.save_model(folder, model, record)
 
 
-def _require_alike(settings: ModelSettings, shipped: ModelSettings) -> None:
-    for name in ("base", "guides", "output", "filter", "network", "stride", "width", "depth"):
-        own, wanted = getattr(settings, name), getattr(shipped, name)
-        if own != wanted:
-            raise ContractError(
-                f"the shipped corrector has {name} = {wanted}, model.{name} is {own};"
-                f" type --set model.{name}={wanted}, or --set finetune.step2.start=fresh"
-            )
-
-
 def with_corrector(settings: ModelSettings, seed: int) -> DNR:
     """A model of these settings that begins as the shipped corrector: what it has besides starts at zero.
 
     Raises ContractError: the settings are of another network, which the message names.
     """
     shipped = corrector()
-    _require_alike(settings, shipped.settings)
+    for name in ("base", "guides", "output", "filter", "network", "stride", "width", "depth"):
+        own, wanted = getattr(settings, name), getattr(shipped.settings, name)
+        if own != wanted:
+            raise ContractError(
+                f"the shipped corrector has {name} = {wanted}, model.{name} is {own};"
+                f" type --set model.{name}={wanted}, or --set finetune.step2.start=fresh"
+            )
     model = DNR(settings, seed)
     model.load_state_dict(shipped.state_dict(), strict=False)
     with torch.no_grad():
