@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from dnrpipe.blender.bundle.ply import weld, write_ply
-from dnrpipe.raytrace.base_renderer import CENTRES, MEANS, BaseRenderer
+from dnrpipe.raytrace.base_renderer import CENTRES, MEANS, NOISE, BaseRenderer
 from dnrpipe.raytrace.base_worker import Worker
 from dnrpipe.raytrace.engine import Engine
 from dnrpipe.raytrace.lightmap import LightBaker
@@ -380,7 +380,7 @@ def test_frames_repeat_bit_for_bit_and_views_share_one_kernel(tmp_path: Path) ->
     recorded = renderer.kernel.n_recordings
     again = renderer.frame(camera(0.3))
     renderer.frame(camera(0.7))
-    assert {*BASE_CHANNELS, "coverage"} <= set(first) == {*MEANS, *CENTRES, "coverage"}
+    assert {*BASE_CHANNELS, "coverage"} <= set(first) == {*MEANS, *CENTRES, NOISE, "coverage", "rays"}
     assert all(np.isfinite(values).all() for values in first.values())
     assert all(np.array_equal(first[name], again[name]) for name in first)
     assert not np.array_equal(first["base.R"], other["base.R"])

@@ -28,6 +28,8 @@ def test_layers_win_in_order(tmp_path: Path) -> None:
         ({"base": "none"}, ["output = log", "base = none", "--set model.output=display", "--set model.base=baked"]),
         ({"base": "none", "output": "display"}, ["filter = 3", "base = none", "--set model.filter=0"]),
         ({"base": "raster", "chain": True}, ["chain = true", "base = raster", "--set model.chain=false"]),
+        ({"base": "raster", "guides": "camera"}, ["guides = camera", "--set model.guides=true"]),
+        ({"aggregator": "none", "base": "none", "output": "display", "filter": 0}, ["aggregator = none"]),
         ({"chain": True, "aggregator": "early"}, ["chain = true", "aggregator = early", "--set model.aggregator="]),
     ],
 )
@@ -71,7 +73,7 @@ def test_every_preset_validates(preset: str) -> None:
     [
         ({"camera": {}}, ["unknown setting 'camera'", "cameras"]),
         ({"cameras": {"trian": 3}}, ["cameras.trian", "cameras.train"]),
-        ({"select": {"budget": 0}}, ["select.budget", "0"]),
+        ({"select": {"budget": -1}}, ["select.budget", "-1"]),
         ({"cameras": {"train": "many"}}, ["cameras.train", "many"]),
         ({"cameras": 3}, ["cameras"]),
         ({"device": "tpu"}, ["device"]),

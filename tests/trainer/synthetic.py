@@ -149,6 +149,7 @@ def base(view: View) -> dict[str, np.ndarray]:
     shiny = 1.0 + hit.sphere
     values = {f"base.{c}": colour[c] * shiny for c in "RGB"} | {"base.A": colour["A"]}
     values |= {f"diffuse.{c}": colour[c] for c in "RGB"} | {f"albedo.{c}": 0.5 * colour["A"] for c in "RGB"}
+    values |= {"noise": 0.1 * colour["A"], "rays": np.full_like(colour["A"], 4)}
     ends = {"U": end.uv[..., 0], "V": end.uv[..., 1], "mask": np.ones_like(shiny), "weight": np.full_like(shiny, 0.7)}
     return values | {f"chain.{name}": np.where(found, value, 0) for name, value in ends.items()}
 

@@ -91,13 +91,27 @@ def test_the_raster_colour_as_base(scene: Scene) -> None:
     assert scene.traced.tensors.base is None and scene.traced.tensors.display is None
 
 
+def test_the_normal_in_camera_space_turns_with_the_picture(baked: ViewSet) -> None:
+    batch = baked.batch([2])
+    assert batch.camera_normal is not None
+    axes = torch.from_numpy(baked.c2w[2, :3, :3].astype(np.float32))
+    assert torch.allclose(torch.einsum("ij,jhw->ihw", axes, batch.camera_normal[0]), batch.normal[0], atol=1e-6)
+    right, up = (float(batch.camera_normal[0, i].sum()) for i in range(2))
+    assert abs(right - up) > 1 and abs(right) > 1
+    for element, expected in {1: (-up, right), 2: (-right, -up), 3: (up, -right), 4: (-right, up)}.items():
+        turned = batch.augment(element).camera_normal
+        assert turned is not None
+        assert [float(turned[0, i].sum()) for i in range(2)] == pytest.approx(expected, rel=1e-4)
+
+
 def test_augment_crop_and_subset_move_the_new_maps_alike(baked: ViewSet) -> None:
     batch = baked.batch([2])
 
     def rows(part: Batch) -> torch.Tensor:
         maps = [part.uv, part.base, part.diffuse, part.albedo, part.chain_uv, part.chain_mask, part.chain_weight]
+        maps += [part.noise, part.rays]
         stack = torch.cat([m for m in maps if m is not None], dim=1)
-        assert stack.shape[1] == 15
+        assert stack.shape[1] == 17
         return stack[0].flatten(1).t()
 
     for element in range(DIHEDRAL_ORDER):

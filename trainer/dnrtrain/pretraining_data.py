@@ -16,7 +16,7 @@ from torch import Tensor
 
 from .contract import SceneFrame, View
 from .dataset import Batch, in_camera_space
-from .display import ALPHA_FLOOR, DisplayTransform
+from .display import ALPHA_FLOOR, Display, DisplayTransform
 
 SHARED = ("depth.Z", "normal.X", "normal.Y", "normal.Z", "mask", "coverage")
 TARGET = ("target.R", "target.G", "target.B", "target.A")
@@ -59,7 +59,7 @@ class Displays:
 
     scale = 1.0
 
-    def __init__(self, displays: Sequence[DisplayTransform]) -> None:
+    def __init__(self, displays: Sequence[Display]) -> None:
         self.displays = displays
 
     def __call__(self, radiance: Tensor) -> Tensor:
