@@ -13,7 +13,7 @@ PYTEST  := $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 RESULTS := $(addprefix docs/,ablation.md bench-select.md cost.md frames.md noise.md)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system browser demo test lint types imports docs docs-check audit robustness bench bench-effects bench-frames fidelity scenes clean
+.PHONY: help setup system browser demo test lint types imports docs docs-check audit robustness bench bench-effects bench-frames pretrain fidelity scenes clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -83,6 +83,11 @@ bench: setup  ## time the parts that the README speaks of
 FRAMES := $(DEMO)/demo.dnr
 bench-frames: setup  ## our frames against path tracing + denoiser at equal time; FRAMES=... names workspaces
 	$(BIN)/python -m tools.bench_frames $(FRAMES)
+
+PRETRAIN := .cache/pretrain
+pretrain: setup  ## the shipped corrector: data (an hour and more on two cores; goes on where it stopped), training, weights
+	$(BIN)/python -m tools.pretrain.data $(PRETRAIN)/data --scenes 90
+	$(BIN)/python -m tools.pretrain.train $(PRETRAIN)/data $(PRETRAIN)/run --minutes 20 --ship
 
 fidelity: setup  ## Cycles against our conversion, one feature a scene: docs/fidelity.md
 	$(BIN)/python -m tools.fidelity --docs docs --jobs $$(nproc)

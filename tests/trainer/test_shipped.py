@@ -41,7 +41,7 @@ def test_a_scenes_model_begins_as_the_corrector(baked: ViewSet, chain: bool) -> 
 
 
 def test_another_network_is_refused_by_name() -> None:
-    with pytest.raises(ContractError, match="model.width is 8.*finetune.step2.start=fresh"):
+    with pytest.raises(ContractError, match=r"model.width is 8.*finetune.step2.start=fresh"):
         with_corrector(CORRECTOR.model_copy(update={"width": 8}), seed=0)
 
 
