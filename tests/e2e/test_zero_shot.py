@@ -19,7 +19,7 @@ def test_no_view_is_traced_and_frames_come_out(tiny: Path, tmp_path: Path) -> No
     shutil.copytree(tiny, workspace)
     for folder in ("raytraced/train", "base", "checkpoints", "renders"):
         shutil.rmtree(workspace / folder, ignore_errors=True)
-    refused = run("select", "--budget", "0", "--set", "model.base=raster", folder=tmp_path, check=False)
+    refused = run("select", "--budget", "0", "--set", "model.base=path", folder=tmp_path, check=False)
     assert refused.returncode == 2 and "--set model.base=baked" in refused.stderr
     for stage in ("select", "raytrace-selected", "finetune", "evaluate"):
         run(stage, *(["--budget", "0", "--set", "model.base=baked"] if stage == "select" else []), folder=tmp_path)
