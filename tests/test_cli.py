@@ -50,7 +50,7 @@ def test_no_such_scene_and_folders(tmp_path: Path) -> None:
 
 def test_bad_numbers(tmp_path: Path) -> None:
     for budget in ("-1", "-3"):
-        _refused(_run("select", "--budget", budget, folder=tmp_path), "--budget", "at least 1")
+        _refused(_run("select", "--budget", budget, folder=tmp_path), "--budget", "at least 0")
     _refused(_run("select", "--budget", "many", folder=tmp_path), "--budget", "--help")
     _refused(_run("prepare", "--set", "cameras.trian=3", folder=tmp_path), "no workspace")
 

@@ -124,7 +124,7 @@ def select_overrides(options: dict[str, Any]) -> dict[str, Any]:
     chosen = {key: options.pop(key) for key in ("budget", "policy")}
     given = {key: value for key, value in chosen.items() if value is not None}
     if given.get("budget", 0) < 0:
-        raise UserError(f"--budget {given['budget']}: must be 0 (no traced view, no training) or more")
+        raise UserError(f"--budget {given['budget']}: must be at least 0 views")
     return {"select": given} if given else {}
 
 
