@@ -29,7 +29,7 @@ def test_no_view_is_traced_and_frames_come_out(tiny: Path, tmp_path: Path) -> No
     assert record is not None and record.views == record.history == []
     assert load_model(workspace / "checkpoints" / "step2").settings.aggregator == "none"
     frames = sorted((workspace / "renders").rglob("frame_*.png"))
-    assert len(frames) == 2 and all(0.05 < image(path).std() for path in frames)
+    assert len(frames) == 2 and all(image(path).std() > 0.05 for path in frames)
     metrics = json.loads((workspace / "evaluation" / "metrics.json").read_text())
     assert metrics["mean"]["psnr"] > 20
     status = json.loads(run("status", "--json", folder=tmp_path).stdout)
