@@ -26,11 +26,9 @@ from dnrpipe.stages.raytrace import trace_views
 from dnrpipe.stages.stage import Run
 from dnrpipe.stages.trainer import load
 from dnrpipe.studies.cells.measure import base_pictures
-from dnrtrain import checkpoint
 from dnrtrain.metrics import psnr
 from dnrtrain.model import DNR, render_views
-from dnrtrain.settings import ModelSettings
-from dnrtrain.shipped import WEIGHTS
+from dnrtrain.shipped import WEIGHTS, corrector
 
 SCENES = Path(__file__).resolve().parents[2] / "blender_scenes"
 
@@ -43,11 +41,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=6)
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
-    saved = checkpoint.load(options.weights)
-    assert saved is not None, f"{options.weights}: no weights"
-    model = DNR(ModelSettings.model_validate(saved[1]["settings"]), seed=0)
-    model.load_state_dict({name: value.float() for name, value in saved[0].items()})
-    model.eval()
+    model = corrector(options.weights)
     rows = [
         judged(path, options.folder / f"{path.stem}.dnr", model, options.views)
         for path in options.scenes or sorted(SCENES.glob("*.blend"))

@@ -111,21 +111,20 @@ def _look(workspace: Workspace, views: list[View], rays: list[int], seed: int, t
     from dnrpipe.raytrace.base_renderer import BaseRenderer
     from dnrpipe.raytrace.engine import Engine
     from dnrpipe.raytrace.frames import Frames
+    from dnrpipe.raytrace.light_worker import indirect_integrator
     from dnrpipe.raytrace.lightmap import LightBaker
     from dnrpipe.raytrace.noise import half_noise
     from dnrpipe.raytrace.pictures import finished, repair
     from dnrpipe.raytrace.sensors import scaled_view
     from dnrpipe.raytrace.texels import grouped_meshes
-    from dnrpipe.raytrace.visibility import ROULETTE_DEPTH, integrator_settings
 
     bundle = workspace.scene / "scene.xml"
     engine = Engine(choice.variant, 1, [bundle])
     scene = engine.scenes[str(bundle)]
     took("load")
-    path = integrator_settings(engine.mi, scene, "path")
-    path |= {"max_depth": DEPTH - 1, "rr_depth": ROULETTE_DEPTH, "hide_emitters": True}
+    indirect = indirect_integrator(engine.mi, scene, "path", DEPTH)
     size, spp = LIGHT_MAPS[seed % len(LIGHT_MAPS)]
-    light = LightBaker(engine.mi, scene, engine.mi.load_dict(path), grouped_meshes(bundle)).bake(size, spp, seed)
+    light = LightBaker(engine.mi, scene, indirect, grouped_meshes(bundle)).bake(size, spp, seed)
     took("light")
     scaled = [scaled_view(view, engine.unit_scale) for view in views]
     bases = [[r.frame(v) for v in scaled] for r in (BaseRenderer(engine.mi, scene, light, k) for k in rays)]

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from .aggregator import Aggregator
-from .correction import correct, guide_channels, guide_maps
+from .correction import correct, guide_channels, guide_maps, require_base
 from .dataset import Batch, ViewSet
 from .renderer import SLOPE, build_renderer
 from .settings import ModelSettings
@@ -85,6 +85,15 @@ class DNR(nn.Module):
 def compose(rgb: Tensor, coverage: Tensor) -> Tensor:
     """Composite display RGB [N, 3, H, W] over white by the geometric coverage [N, 1, H, W]."""
     return torch.lerp(torch.ones_like(coverage), rgb, coverage)
+
+
+def base_picture(batch: Batch) -> Tensor:
+    """The base image itself as display RGB over white, [N, 3, H, W], composed as the network's output is.
+
+    Raises ContractError when the views were loaded without.
+    """
+    base, display = require_base(batch)
+    return compose(display(base), batch.coverage)
 
 
 def initialise(module: nn.Module, generator: torch.Generator) -> None:

@@ -25,9 +25,10 @@ from . import checkpoint
 from .dataset import DIHEDRAL_ORDER, Batch
 from .losses import Step2Loss
 from .metrics import psnr
-from .model import DNR, compose
+from .model import DNR, base_picture
 from .perceptual import PerceptualLoss
 from .pretraining_data import SceneMaps, joined
+from .records import Epoch, Progress
 from .schedule import Averaged, adam, averaged_weights, guarded_step
 from .settings import LossWeights, ModelSettings, Step2Settings
 
@@ -77,18 +78,13 @@ def pretrain(
     optimiser = adam([dnr], RATE, "cpu")
     average = Averaged(dnr, EMA)
     spent, step = 0.0, 0
-    path = folder / "pretrain.safetensors"
-    saved = checkpoint.load(path)
+    run = f"pretrain {model.model_dump_json()} {seed}"
+    saved = checkpoint.load_state(folder, run)
     if saved is not None:
-        tensors, info = saved
-        part = {name: {} for name in ("dnr", "adam", "average")}
-        for name, value in tensors.items():
-            kind, _, own = name.partition("/")
-            part[kind][own] = value
-        dnr.load_state_dict(part["dnr"])
-        checkpoint.restore_optimiser(optimiser, part["adam"])
-        average.restore(part["average"], info["step"])
-        spent, step = info["seconds"], info["step"]
+        dnr.load_state_dict(saved.parts["dnr"])
+        checkpoint.restore_optimiser(optimiser, saved.parts["adam"])
+        average.restore(saved.parts["average"], saved.progress.average_steps)
+        step, spent = saved.progress.epoch, saved.progress.history[-1].seconds
     plain, whole = Step2Loss(LOSS, None), Step2Loss(LOSS, PerceptualLoss(weights["vgg"]) if weights else None)
     total = 0.0
     count = 0
@@ -111,10 +107,11 @@ def pretrain(
         clock = time.monotonic()
         if spent - told >= every or spent >= seconds:
             told = spent
-            tensors = {f"dnr/{k}": v for k, v in dnr.state_dict().items()}
-            tensors |= {f"adam/{k}": v for k, v in checkpoint.optimiser_tensors(optimiser).items()}
-            tensors |= {f"average/{k}": v for k, v in average.sums.items()}
-            checkpoint.save(path, tensors, {"seconds": spent, "step": step})
+            moments = checkpoint.optimiser_tensors(optimiser)
+            parts: checkpoint.Parts = {"dnr": dnr.state_dict(), "adam": moments, "average": average.sums}
+            done = [Epoch(epoch=step, seconds=spent)]
+            progress = Progress(run=run, epoch=step, bfloat16=False, history=done, average_steps=average.steps)
+            checkpoint.save_state(folder, parts, progress)
             with averaged_weights(dnr, average):
                 checkpoint.save(folder / "corrector.safetensors", dnr.state_dict(), {"settings": model.model_dump()})
                 found = judge(dnr, held_out)
@@ -151,10 +148,9 @@ def judge(dnr: DNR, scenes: list[SceneMaps]) -> dict[str, Any]:
             for rays in scene.scene.rays:
                 batch = scene.batch(view, rays)
                 display, linear = batch.display, batch.target
-                assert display is not None and linear is not None and batch.base is not None
+                assert display is not None and linear is not None
                 target = display.over_white(linear[:, :3], linear[:, 3:])
-                base = compose(display(batch.base), batch.coverage)
-                both = [float(psnr(p.clamp(0, 1), target)) for p in (base, dnr(batch).rgb)]
+                both = [float(psnr(p.clamp(0, 1), target)) for p in (base_picture(batch), dnr(batch).rgb)]
                 rows.append((scene.scene.seed, rays, both[0], both[1]))
     dnr.train()
     mean = lambda chosen: [round(float(np.mean([r[i] for r in chosen])), 3) for i in (2, 3)]  # noqa: E731

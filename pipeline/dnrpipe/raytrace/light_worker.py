@@ -32,7 +32,8 @@ class Worker(BundleWorker):
         task = LightTask.model_validate(asked)
         started, cpu = time.monotonic(), time.process_time()
         scene, groups = self.engine.scenes[str(self.bundle)], grouped_meshes(self.bundle)
-        baker = LightBaker(self.engine.mi, scene, self._indirect(task), groups)
+        indirect = indirect_integrator(self.engine.mi, scene, task.integrator, task.max_depth)
+        baker = LightBaker(self.engine.mi, scene, indirect, groups)
         light = baker.bake(task.size, task.spp, task.seed)
         with atomic_path(task.output) as temporary, temporary.open("wb") as file:
             np.savez(file, light=light, fingerprint=np.array(task.fingerprint))
@@ -43,16 +44,16 @@ class Worker(BundleWorker):
             "lost": baker.lost,
         }
 
-    def _indirect(self, task: LightTask) -> Any:
-        """The integrator that follows paths from their first diffuse bounce on; None: direct light is all."""
-        kind, depth = task.integrator, task.max_depth - 1
-        if kind == "direct" or depth < 2:
-            return None
-        settings = integrator_settings(self.engine.mi, self.engine.scenes[str(self.bundle)], kind)
-        if kind == "path-without-caustics":
-            settings["after_diffuse"] = True
-        settings |= {"max_depth": depth, "rr_depth": ROULETTE_DEPTH, "hide_emitters": True}
-        return self.engine.mi.load_dict(settings)
+
+def indirect_integrator(mi: Any, scene: Any, kind: str, max_depth: int) -> Any:
+    """The integrator that follows paths from their first diffuse bounce on; None: direct light is all."""
+    depth = max_depth - 1
+    if kind == "direct" or depth < 2:
+        return None
+    settings = integrator_settings(mi, scene, kind)
+    if kind == "path-without-caustics":
+        settings["after_diffuse"] = True
+    return mi.load_dict(settings | {"max_depth": depth, "rr_depth": ROULETTE_DEPTH, "hide_emitters": True})
 
 
 def read_light(path: Path) -> np.ndarray:

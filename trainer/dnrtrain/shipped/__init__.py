@@ -17,14 +17,14 @@ WEIGHTS = Path(__file__).with_name("corrector.safetensors")
 """float16; the settings are in its header. `tools.pretrain.train` makes it."""
 
 
-def corrector() -> DNR:
-    """The shipped corrector, float32, on the CPU, ready for inference.
+def corrector(path: Path = WEIGHTS) -> DNR:
+    """The shipped corrector, or another that was trained as it was, float32, on the CPU, ready for inference.
 
     Raises DamagedFile: its file is.
     """
-    saved = checkpoint.load(WEIGHTS)
+    saved = checkpoint.load(path)
     if saved is None:
-        raise ContractError(f"{WEIGHTS}: is missing; install dnrpipe again")
+        raise ContractError(f"{path}: is missing; install dnrpipe again")
     tensors, info = saved
     model = DNR(ModelSettings.model_validate(info["settings"]), seed=0)
     model.load_state_dict({name: value.float() for name, value in tensors.items()})

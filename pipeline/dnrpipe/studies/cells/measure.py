@@ -51,11 +51,9 @@ def network_pictures(folder: Path, views: ViewSet, device: str) -> tuple[Tensor,
 
 def base_pictures(views: ViewSet) -> Tensor:
     """The base images themselves as display RGB over white in [0, 1], [N, 3, H, W], composed as the network's are."""
-    from dnrtrain.model import compose
+    from dnrtrain.model import base_picture
 
-    tensors = views.tensors
-    assert tensors.base is not None and tensors.display is not None  # loaded with a base
-    return compose(tensors.display(tensors.base), tensors.coverage).clamp(0.0, 1.0)
+    return base_picture(views.tensors).clamp(0.0, 1.0)
 
 
 def rendered_ms(files: list[Path]) -> float | None:
