@@ -1,6 +1,6 @@
 """One training scene: built from its seed, converted, lit, and looked at. A process of its own, on one core.
 
-python -m tools.pretrain.scene SEED FOLDER [--views 4] [--side 128]
+python -m tools.pretrain.scene SEED FOLDER
 
 FOLDER/
   maps.npy    float16 [views, channels, side, side], radiance in units of display white (times 2^exposure)
@@ -38,6 +38,8 @@ FACTORY = Path(__file__).resolve().parents[2] / "blender_scenes" / "factory" / "
 LEFT_OUT = ("remix",)
 """Families that are made of the example scenes: what is measured on those must come from weights that saw none."""
 DEPTH = 12
+SIZES = ((96, 7), (128, 4), (192, 2))
+"""(pixels a side, views), one of them drawn for a scene."""
 LIGHT_MAPS = ((256, 32), (512, 16))
 """(texels a side, paths per texel), one of them drawn for a scene."""
 REFERENCE_SPP = 64
@@ -50,15 +52,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("seed", type=int)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--views", type=int, default=4)
-    parser.add_argument("--side", type=int, default=128, help="pixels")
     options = parser.parse_args()
     options.folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="pretrain-") as scratch:
-        make(options.seed, options.folder, Path(scratch), options.views, options.side)
+        make(options.seed, options.folder, Path(scratch))
 
 
-def make(seed: int, folder: Path, scratch: Path, views: int, side: int) -> None:
+def make(seed: int, folder: Path, scratch: Path) -> None:
     """Write ``folder``, whole or not at all."""
     timings: dict[str, float] = {}
     clock = time.monotonic()
@@ -73,13 +73,15 @@ def make(seed: int, folder: Path, scratch: Path, views: int, side: int) -> None:
     family = next(word for word in reversed(built.stdout.decode().split("\n")) if word and not word.startswith("Info"))
     took("build")
     workspace = Workspace.create(scratch / "scene.dnr", Source(path=str(blend), sha256=file_sha256(blend)))
+    random = np.random.default_rng([seed, 7])
+    rays = [int(k) for k in random.permutation(RAY_COUNTS)[:2]]
+    side, views = SIZES[int(random.integers(len(SIZES)))]
     cameras = {"source": "animation", "train": views, "val": 0, "test": 0, "width": side, "height": side}
     settings = resolve("draft", {"cameras": cameras, "passes": {"workers": 1}}, environment={})
     _, by_split = scene_and_views(Run(workspace, settings, Console(quiet=True)))
     path = by_split["train"]  # all frames of the animation
     chosen = [path[(2 * i + 1) * len(path) // (2 * views)] for i in range(min(views, len(path)))]
     took("convert")
-    rays = [int(k) for k in np.random.default_rng([seed, 7]).permutation(RAY_COUNTS)[:2]]
     maps, noise = _look(workspace, chosen, rays, seed, took)
     frame = read_frame(workspace)
     bright = [name.partition("@")[0] in BRIGHT for name in channel_names(rays)]

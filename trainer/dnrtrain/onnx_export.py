@@ -75,12 +75,13 @@ MERGED_VALUES = 16 * 128**2
 
 def input_names(settings: ModelSettings) -> list[str]:
     """Inputs of the graph, in order."""
-    names = ["uv", "mask", "coverage"]
+    textures = settings.modalities.split("+") if settings.aggregator != "none" else []
+    names = [*(["uv"] if "uv" in textures else []), "mask", "coverage"]
     if settings.guides or settings.spherical_harmonics:
         names.append("view_dir")
-    if settings.guides or "normal" in settings.modalities:
+    if settings.guides or "normal" in textures:
         names.append("normal")
-    if "depth" in settings.modalities:
+    if "depth" in textures:
         names.append("depth")
     if settings.base != "none":
         names.append("base")

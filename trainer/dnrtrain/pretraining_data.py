@@ -89,7 +89,7 @@ class SceneMaps:
 
     def __init__(self, folder: Path) -> None:
         self.scene = Scene.model_validate_json((folder / "scene.json").read_bytes())
-        self.maps = np.load(folder / "maps.npy", mmap_mode="r")
+        self.maps = np.load(folder / "maps.npy", mmap_mode="r", allow_pickle=False)
         self.display = DisplayTransform(self.scene.frame, folder)
         self.places = {name: index for index, name in enumerate(channel_names(self.scene.rays))}
         self.view_dirs = [torch.from_numpy(-view.ray_directions()).permute(2, 0, 1) for view in self.scene.views]
