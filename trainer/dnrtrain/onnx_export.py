@@ -207,7 +207,7 @@ class Graph(nn.Module):
             parts["chain_weight"] = maps["chain"][:, 3:].clamp(0.0, 1.0) * ends
         depth = ((maps["depth"] - self.near) / self.range).clamp(0.0, 1.0) * mask if "depth" in maps else zero
         return Batch(
-            uv=(2.0 * maps["uv"] - 1.0) * mask,
+            uv=(2.0 * maps["uv"] - 1.0) * mask if "uv" in maps else zero,
             depth=depth,
             normal=maps["normal"] * mask if "normal" in maps else zero,
             mask=mask,
