@@ -214,7 +214,7 @@ class Graph(nn.Module):
             coverage=maps["coverage"].clamp(0.0, 1.0),
             view_dir=maps.get("view_dir", zero),
             camera_normal=maps["camera_normal"] * mask if "camera_normal" in maps else zero,
-            rays=maps.get("rays"),
+            rays=maps["rays"].clamp_min(1.0) if "rays" in maps else None,
             target=None,
             display=self.display,
             **parts,
