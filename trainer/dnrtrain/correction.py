@@ -4,8 +4,9 @@ Notation
     f        log space (see `to_log`) or display space
     K        per-pixel kernels, k×k weights each, that sum to 1; they start close to the identity
     a, m     added and multiplied correction, 3 channels each; they start at 0
+    t        share of the correction that is applied (``settings.trust``)
 
-    f(picture) = K * f(base) · (1 + m) + a
+    f(picture) = (1 - t) · f(base) + t · (K * f(base) · (1 + m) + a)
 
 A base image has few fixed directions per pixel: it is grainy on rough metal and jagged at edges. Kernels smooth that
 and keep what is sharp (kernel prediction; Bako et al. 2017); in log space a single bright pixel does not win.
@@ -60,10 +61,11 @@ def correct(batch: Batch, outputs: Tensor, settings: ModelSettings) -> tuple[Ten
     """
     base, display = require_base(batch)
     added, scaled = outputs[:, :6].chunk(2, dim=1)
-    value = to_log(display.scale * base) if settings.output == "log" else display(base)
-    if settings.filter:
-        value = filter_by(value, outputs[:, 6:])
+    start = to_log(display.scale * base) if settings.output == "log" else display(base)
+    value = filter_by(start, outputs[:, 6:]) if settings.filter else start
     value = torch.addcmul(value + added, value, scaled)
+    if settings.trust < 1:
+        value = torch.lerp(start, value, settings.trust)
     if settings.output == "display":
         return value, None
     radiance = from_log(value).clamp_min(0.0) / display.scale

@@ -47,6 +47,9 @@ class ModelSettings(Strict):
     output: Literal["display", "log"] = Field(
         default="display", description="space in which the network corrects the base; log keeps highlights"
     )
+    trust: float = Field(
+        default=1.0, ge=0, le=1, description="share of the correction that is applied; 0 leaves the base image"
+    )
 
     @model_validator(mode="after")
     def _fits(self) -> ModelSettings:
@@ -75,6 +78,11 @@ class ModelSettings(Strict):
                 "output = log works on a base image, and base = none gives none;"
                 " type --set model.output=display, or --set model.base=baked"
             )
+        if self.base == "none" and self.trust != 1:
+            raise ValueError(
+                f"trust = {self.trust:g} mixes with a base image, and base = none gives none;"
+                " type --set model.trust=1, or --set model.base=baked"
+            )
         if self.base == "none" and self.filter:
             raise ValueError(
                 f"filter = {self.filter} works on a base image, and base = none gives none;"
@@ -85,7 +93,7 @@ class ModelSettings(Strict):
     def coarse(self) -> ModelSettings:
         """The model of step 1. It sees rasterised images only, so it has no base image and no part that needs one."""
         fresh = ModelSettings()
-        parts = ("base", "guides", "chain", "filter", "output")
+        parts = ("base", "guides", "chain", "filter", "output", "trust")
         return self.model_copy(update={name: getattr(fresh, name) for name in parts})
 
 

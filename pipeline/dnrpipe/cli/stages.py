@@ -121,6 +121,7 @@ def evaluate(**options: Any) -> None:
       dnrpipe evaluate --json | jq .evaluate.mean.psnr
     """
     with open_session("evaluate", options) as session:
+        session.renderer()
         session.stages("evaluate")
 
 
@@ -164,6 +165,8 @@ def render(
 ) -> None:
     """Render novel views with the neural renderer: frames and a movie in renders/.
 
+    Where no view was ever selected, the shipped corrector renders: no view is traced, and nothing is trained.
+
     \b
     Examples:
       dnrpipe render --orbit 60
@@ -176,11 +179,10 @@ def render(
 
     from ..core.cameras import orbit_views
     from ..core.scene_files import read_summary
-    from ..stages.pipeline import STAGES, require_inputs
     from ..stages.render import render_novel
 
     with open_session("render", options) as session:
-        require_inputs(STAGES["evaluate"], session.workspace, session.settings)
+        session.renderer()
         cameras = session.settings.cameras
         if camera_file is not None:
             views = parse_transforms(camera_file, (cameras.width, cameras.height))

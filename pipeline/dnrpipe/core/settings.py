@@ -184,7 +184,7 @@ class Settings(Strict):
 # The default model, "dnr": it corrects an image of baked light (docs/method.md; figures in docs/experiments.md).
 DNR: dict[str, Any] = {
     "base": "baked",
-    "guides": True,
+    "guides": "camera",
     "filter": 3,
     "stride": 2,
     "output": "log",
@@ -192,7 +192,7 @@ DNR: dict[str, Any] = {
     "modalities": "uv",
 }
 DNR_STEP2: dict[str, Any] = {
-    "start": "fresh",
+    "start": "pretrained",
     "ema": 0.99,
     "photometric": "l1",
     "texture_rate_scale": 3.0,
@@ -211,7 +211,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "standard": {
         "cameras": {"train": 100, "val": 10, "test": 50, "width": 384, "height": 384},
         "raytrace": {"spp": 256, "evaluation_spp": 512, "denoise": True, "evaluation_denoise": True},
-        "model": {**DNR, "texture_size": 256, "width": 32, "depth": 4},
+        "model": {**DNR, "texture_size": 256, "width": 24, "depth": 3},
         "select": {"step1": {"epochs": 30, "texture_rate_scale": 10.0}},
         "finetune": {"step2": {**DNR_STEP2, "epochs": 60, "patch": 192, "perceptual_crop": 64}},
     },

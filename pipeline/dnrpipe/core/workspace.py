@@ -58,11 +58,15 @@ class StageRecord(BaseModel, extra="forbid"):
 
 
 class PrepareDetail(BaseModel, strict=True):
-    """What stage `prepare` tells of itself."""
+    """What stage `prepare` tells of itself.
+
+    raster_engine: "" where no rasterised colour was wanted. views: by split. passes: how many of them have some.
+    """
 
     raster_engine: str = ""
     raster_reason: str = ""
     views: dict[str, int]
+    passes: int = 0
     triangles: int = 0
 
 

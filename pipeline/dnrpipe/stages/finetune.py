@@ -29,6 +29,7 @@ from .raytrace import reference_is_made
 from .records import PREVIEW, PreviewState
 from .stage import Outcome, Run
 from .trainer import epochs_done, follow, load, perceptual_weights, torch_device
+from .trust import measure_trust
 
 if TYPE_CHECKING:
     import numpy as np
@@ -74,13 +75,16 @@ def finetune(run: Run) -> Outcome:
 
 
 def _without_training(run: Run) -> Outcome:
-    """The shipped corrector as it is becomes the workspace's model, whatever network the settings name."""
-    from dnrtrain.shipped import save_untrained
+    """The shipped corrector becomes the workspace's model, whatever network the settings name, as far as it helps."""
+    from dnrtrain.shipped import corrector, save_untrained
 
-    settings = run.settings
     folder = run.workspace.checkpoints("step2")
-    save_untrained(folder, settings.finetune.step2, run.fingerprint)
-    return Outcome(file_sha256(folder / "model.safetensors"), {"views": 0})
+    model = corrector()
+    trust = measure_trust(run, model)
+    run.console.say(trust.told)
+    save_untrained(folder, model, run.settings.finetune.step2, run.fingerprint)
+    made = file_sha256(folder / "model.safetensors")
+    return Outcome(digest([made, trust.share]), {"views": 0, "trust": trust.model_dump()})
 
 
 def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:

@@ -115,7 +115,7 @@ STAGES: dict[str, Stage] = {
             does="step 2: six losses on the selected ray-traced views",
             needs=("select", "raytrace"),
             reads=("passes", "raytraced/train", "base/train", "checkpoints/step1"),
-            writes=("checkpoints/step2", "preview"),
+            writes=("checkpoints/step2", "preview", "raytraced/trust", "base/trust"),
             settings=lambda s: [s.model.model_dump(), s.finetune.model_dump(exclude={"preview_seconds"}), _neural(s)],
             make=finetune.finetune,
             progress=finetune.progress,

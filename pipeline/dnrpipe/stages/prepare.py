@@ -34,6 +34,7 @@ from ..core.scene_files import (
     read_raster_choice,
     read_summary,
     scene_fingerprint,
+    split_views,
 )
 from ..core.scene_records import Conversion, RasterChoice, SceneSummary
 from ..core.settings import Settings
@@ -41,6 +42,7 @@ from ..core.workspace import Workspace, digest, file_sha256
 from ..effects.store import keep_plan
 from ..workers.processes import Retry, run_tasks
 from ..workers.view_tasks import warn_of_repairs, warn_of_retries, worker_count
+from .base_images import RENDERED
 from .stage import Outcome, Run
 
 Answer = TypeVar("Answer", PrepareAnswer, InspectAnswer)
@@ -49,37 +51,60 @@ MAX_BAKE_ROUNDS = 4
 BAKES = "bakes"
 """Of a workspace: baked values by content hash. They outlive ``--force`` and changes elsewhere in the file."""
 PASSES_VERSION = 1
-# Evaluation needs G-buffers of test views only; their rasterised colour would never be read.
-RASTERISED = ("train", "val")
+GEOMETRY_ENGINE = "cycles-direct"
+"""Draws passes that have no rasterised colour."""
 
 
 def prepare(run: Run) -> Outcome:
     """Do what is missing: convert the scene, place the cameras, render the passes."""
-    workspace = run.workspace
     summary, views = scene_and_views(run)
     _plan_effects(run)
-    chosen = _raster_engine(run)
-    raster = run.settings.model.base == "raster"  # then test views need it, too
-    wanted = [(split, view) for split in SPLITS for view in views[split]]
+    drawn = draw_needed(run)
+    chosen = read_raster_choice(run.workspace)
+    placed = {split: [view.model_dump(mode="json") for view in views[split]] for split in SPLITS}
+    passes = run.settings.passes.model_dump(exclude={"workers"})
+    return Outcome(
+        digest([PASSES_VERSION, run.scene_fingerprint, placed, passes]),
+        {
+            "raster_engine": chosen.engine if chosen else "",
+            "raster_reason": chosen.reason if chosen else "",
+            "views": {split: len(views[split]) for split in SPLITS},
+            "passes": drawn,
+            "triangles": summary.triangles,
+        },
+    )
+
+
+def draw_needed(run: Run, *, complete: bool = False) -> int:
+    """Draw the passes that later stages read under the settings, where they are missing -> how many views have some.
+
+    complete: those of every view, whatever the settings.
+
+    G-buffers of candidates say what they see. Base images that are rendered bring G-buffers of their own. Rasterised
+    colour is what step 1 trains on, and one kind of base image.
+    """
+    settings = run.settings
+    raster = settings.model.base == "raster"
+    coarse = settings.trains_step1 or complete
+    colour = {"train": coarse or raster, "val": coarse, "test": raster}
+    needed = {
+        "train": complete or settings.select.budget > 0,
+        "val": coarse,
+        "test": complete or settings.model.base not in RENDERED,
+    }
+    splits = {split: views for split, views in split_views(run.workspace).items() if needed[split]}
+    wanted = [(split, view) for split, views in splits.items() for view in views]
+    engine = _raster_engine(run).engine if any(colour[split] for split, _ in wanted) else GEOMETRY_ENGINE
     tasks = draw_passes(
         run,
         "passes",
         [view for _, view in wanted],
-        [workspace.passes(split, view.name) for split, view in wanted],
-        chosen.engine,
-        raster=[split in RASTERISED or raster for split, _ in wanted],
+        [run.workspace.passes(split, view.name) for split, view in wanted],
+        engine,
+        raster=[colour[split] for split, _ in wanted],
     )
     warn_of_repairs(tasks, run.console)
-    return Outcome(
-        # Views, scene and engine are all in the tasks' fingerprints.
-        digest([[Path(task["output"]).parent.name, task["fingerprint"]] for task in tasks]),
-        {
-            "raster_engine": chosen.engine,
-            "raster_reason": chosen.reason,
-            "views": {split: len(views[split]) for split in SPLITS},
-            "triangles": summary.triangles,
-        },
-    )
+    return len(wanted)
 
 
 def _plan_effects(run: Run) -> None:
@@ -100,9 +125,8 @@ def scene_and_views(run: Run) -> tuple[SceneSummary, dict[str, list[View]]]:
 
 def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
     """(passes on disk, passes wanted)."""
-    wanted = settings.cameras.train + settings.cameras.val + settings.cameras.test
-    if "prepare" in workspace.manifest.stages:
-        wanted = sum(workspace.manifest.stages["prepare"].detail["views"].values())
+    prepared = workspace.manifest.prepared
+    wanted = prepared.passes if prepared else settings.cameras.train
     present = sum(1 for split in SPLITS for _ in (workspace.root / "passes" / split).glob("[!.]*.exr"))
     return min(present, wanted), wanted
 

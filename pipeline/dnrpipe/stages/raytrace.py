@@ -137,7 +137,8 @@ def _tasks(
 def goal_of(settings: Settings, split: str) -> Goal | None:
     """The noise or time that views of the split are traced to; None: the samples per pixel are set."""
     raytrace = settings.raytrace
-    noise, seconds = (raytrace.evaluation_noise, None) if split == "test" else (raytrace.noise, raytrace.time)
+    targets = {"test": (raytrace.evaluation_noise, None), "train": (raytrace.noise, raytrace.time)}
+    noise, seconds = targets.get(split, (None, None))
     return None if noise is None and seconds is None else Goal(noise, seconds, raytrace.max_spp)
 
 

@@ -20,7 +20,7 @@ from ..core.scene_files import read_frame
 from ..core.workspace import digest
 from .base_images import RENDERED, base_views
 from .pipeline import STAGES, require_inputs
-from .prepare import draw_passes
+from .prepare import GEOMETRY_ENGINE, draw_passes
 from .stage import Run
 from .trainer import torch_device
 
@@ -162,6 +162,6 @@ def _inputs(run: Run, views: Sequence[View], frames: Path) -> list[Path]:
         raster = run.settings.model.base == "raster"
         prepared = run.workspace.manifest.prepared
         assert prepared is not None  # the model is of its views
-        engine = prepared.raster_engine if raster else "cycles-direct"
+        engine = prepared.raster_engine if raster else GEOMETRY_ENGINE
         draw_passes(run, "G-buffers", views, paths, engine, raster=[raster] * len(views))
     return paths

@@ -17,6 +17,7 @@ from ..core.errors import UserError
 from ..core.scene_files import split_views
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest, file_sha256
+from .prepare import draw_needed
 from .stage import Outcome, Run
 from .trainer import epochs_done, follow, load, torch_device
 
@@ -36,9 +37,11 @@ def select_views(run: Run) -> Outcome:
         chosen = Selection(policy=settings.select.policy, budget=0, seed=settings.select.seed, views=[])
         made: list[object] = [[]]
     elif settings.trains_step1:
+        draw_needed(run)
         chosen = _train_and_choose(run, views)
         made = [chosen.views, file_sha256(workspace.checkpoints("step1") / "model.safetensors")]
     else:
+        draw_needed(run)
         chosen = _choose(run, views)
         made = [chosen.views]
     write(workspace.selection, chosen)

@@ -17,9 +17,12 @@ from ..core.scene_files import split_views
 from ..core.settings import Settings, merge, parse_assignment, resolve
 from ..core.workspace import DamagedManifest, Manifest, Source, Workspace, file_sha256, find_workspace, locked
 from .inspect_scene import require_file
-from .pipeline import STAGES, require_inputs, run_stage
+from .pipeline import STAGES, require_inputs, run_stage, state
 from .select import check_budget
 from .stage import Run
+
+UNTRAINED: tuple[StageName, ...] = ("select", "raytrace", "finetune")
+"""Stages between `prepare` and frames; without views they take seconds."""
 
 
 class Session:
@@ -111,6 +114,21 @@ class Session:
         if self.command not in ("run", "plan", "frontier"):  # these have an answer of their own
             self.console.result({"workspace": str(self.workspace.root), **self.answers})
 
+    def renderer(self) -> None:
+        """See to it that there is a renderer: the fine-tuned one, else the shipped corrector, as with ``--budget 0``.
+
+        The latter where no view was ever selected. Raises UserError: views were, and a stage on the way has not run.
+        """
+        if selects_nothing(self.workspace, self.settings):
+            select = self.settings.select.model_copy(update={"budget": 0})
+            self.settings = self.settings.model_copy(update={"select": select})
+            if any(state(STAGES[name], self.workspace, self.settings) != "done" for name in UNTRAINED):
+                self.console.say("no views are selected: the shipped corrector renders")
+            for name in UNTRAINED:
+                if state(STAGES[name], self.workspace, self.settings) != "done":
+                    run_stage(name, self.run)
+        require_inputs(STAGES["evaluate"], self.workspace, self.settings)  # what it needs is what frames need
+
     def adopt(self, overrides: dict[str, Any]) -> None:
         """Settings found by the command itself, remembered as flags are."""
         manifest = self.workspace.manifest
@@ -134,6 +152,12 @@ class Session:
             check_budget(settings.select.budget, settings.cameras.train)
         elif self.command == "select" and prepared is not None:
             check_budget(settings.select.budget, prepared.views["train"])
+
+
+def selects_nothing(workspace: Workspace, settings: Settings) -> bool:
+    """Whether the shipped corrector is what renders: no view was ever selected, and it corrects such base images."""
+    record = workspace.manifest.stages.get("select")
+    return settings.model.base == "baked" and (record is None or not record.detail["views"])
 
 
 def _stored(root: Path, source: Source, *, named: bool) -> Workspace | None:

@@ -33,20 +33,24 @@ def load(
 ) -> ViewSet:
     """G-buffers of the views, with rasterised (train, val) or ray-traced targets, or none (test).
 
+    Base images that are rendered bring G-buffers of their own, which are those that novel views have.
+
     Args:
         base_files: where rendered ones lie, instead of ``base/<split>``.
     """
     from dnrtrain.dataset import load_views
 
+    if base in RENDERED:
+        base_files = base_files or [base_path(workspace, split, view.name) for view in views]
     return load_views(
-        [workspace.passes(split, view.name) for view in views],
+        base_files or [workspace.passes(split, view.name) for view in views],
         [workspace.raytraced(split, view.name) for view in views] if raytraced else None,
         read_frame(workspace),
         cameras=views,
         folder=workspace.scene,
         target=split != "test" or raytraced,
         base=base,
-        base_files=(base_files or [base_path(workspace, split, v.name) for v in views]) if base in RENDERED else None,
+        base_files=base_files,
     )
 
 

@@ -31,9 +31,8 @@ def corrector(path: Path = WEIGHTS) -> DNR:
     return model.eval()
 
 
-def save_untrained(folder: Path, step2: Step2Settings, fingerprint: str) -> None:
-    """Write the shipped corrector as the model of step 2, as if it had been trained on no view."""
-    model = corrector()
+def save_untrained(folder: Path, model: DNR, step2: Step2Settings, fingerprint: str) -> None:
+    """Write the shipped corrector ``model`` as the model of step 2, as if it had been trained on no view."""
     record = ModelRecord(
         model=model.settings.model_dump(mode="json"),
         fingerprint=fingerprint,

@@ -176,17 +176,18 @@ def load_cell_views(
     workspace = Workspace.open(root)
     views = {view.name: view for view in split_views(workspace)[split]}
     chosen = [views[name] for name in names or views]
+    bases = base_files(workspace, base, split, [view.name for view in chosen])
     passes = [workspace.passes(split, view.name) for view in chosen]
     if base == "raster" and split == "test":
         passes = [raster_file(workspace, view.name) for view in chosen]
     return load_views(
-        passes,
+        bases or passes,
         [workspace.raytraced(targets or split, view.name) for view in chosen] if raytraced else None,
         read_frame(workspace),
         cameras=chosen,
         folder=workspace.scene,
         base=base,
-        base_files=base_files(workspace, base, split, [view.name for view in chosen]) or None,
+        base_files=bases or None,
     )
 
 

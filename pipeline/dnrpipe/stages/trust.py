@@ -1,0 +1,73 @@
+"""How far the shipped corrector is to be trusted on a scene: it is measured on a few small traced views.
+
+It never saw the scene, and where its base image is unlike those that it was trained on it can do harm. The share of
+its correction that is applied (`ModelSettings.trust`) is the one that does best here; 0 leaves the base image.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pydantic import BaseModel
+
+from ..core.cameras import scaled_to
+from ..core.scene_files import split_views
+from .base_images import base_views
+from .raytrace import trace_views
+from .stage import Run
+from .trainer import load
+
+if TYPE_CHECKING:
+    from dnrtrain.model import DNR
+
+SPLIT = "trust"
+"""Of the views' files."""
+VIEWS, SIDE, SPP = 4, 128, 32
+"""Views, pixels of their longer side, samples per pixel: seconds, and half a decibel is seen."""
+SHARES = tuple(i / 10 for i in range(11))
+
+
+class Trust(BaseModel, frozen=True):
+    """share: of the correction. psnr: of the base image, and with that share, dB, mean of the views."""
+
+    share: float
+    psnr: tuple[float, float]
+
+    @property
+    def told(self) -> str:
+        """One line for the user."""
+        base, ours = self.psnr
+        if self.share == 0:
+            return f"the shipped corrector does no good here: frames are base images ({base:.1f} dB on small views)"
+        return f"shipped corrector, {self.share:.0%} of it: {base:.1f} -> {ours:.1f} dB on {VIEWS} small traced views"
+
+
+def measure_trust(run: Run, model: DNR) -> Trust:
+    """Trace the views and their base images, where that is not done, and find the best share.
+
+    ``model`` is left with that share.
+    """
+    import torch
+
+    from dnrtrain.metrics import psnr
+    from dnrtrain.model import render_views
+
+    candidates = split_views(run.workspace)["train"]
+    count = min(VIEWS, len(candidates))
+    views = [scaled_to(candidates[(2 * i + 1) * len(candidates) // (2 * count)], SIDE) for i in range(count)]
+    trace_views(run, views, SPLIT, spp=SPP)
+    base_views(run, views, SPLIT)
+    data = load(run.workspace, views, SPLIT, raytraced=True, base=run.settings.model.base)
+    target = data.tensors.target
+    assert target is not None  # loaded with raytraced=True
+
+    def quality(share: float) -> float:
+        model.settings = model.settings.model_copy(update={"trust": share})
+        pictures = zip(render_views(model, data), target, strict=True)
+        return sum(float(psnr(picture[None], truth[None])) for picture, truth in pictures) / count
+
+    with torch.inference_mode():
+        found = {share: quality(share) for share in SHARES}
+    share = max(found, key=lambda share: found[share])
+    model.settings = model.settings.model_copy(update={"trust": share})
+    return Trust(share=share, psnr=(found[0.0], found[share]))
