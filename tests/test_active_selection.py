@@ -204,7 +204,8 @@ def test_the_worker_writes_a_selection(tmp_path: Path) -> None:
     workspace.scene.mkdir(parents=True, exist_ok=True)
     (workspace.scene / "frame.json").write_text(synthetic.FRAME.model_dump_json())
     small = {"texture_size": 16, "width": 4, "depth": 1}
-    settings = resolve(None, {"model": small, "select": {"budget": 3}}, environment={})
+    changes = {"model": small, "select": {"budget": 3}, "finetune": {"step2": {"start": "fresh"}}}
+    settings = resolve(None, changes, environment={})
     task = {
         "fingerprint": "k", "workspace": str(workspace.root), "settings": settings.model_dump(mode="json"), "seed": 0,
         "policy": "variance", "folder": str(tmp_path / "models"), "output": str(tmp_path / "k.json"), "label": "k",

@@ -341,6 +341,7 @@ SMALL: dict[str, Any] = {
     "raytrace": {"evaluation_spp": 16, "max_depth": 4},
     "base": {"light_size": 32, "light_spp": 8, "samples": 1},
     "model": {"texture_size": 32, "width": 8, "depth": 2},
+    "finetune.step2": {"start": "fresh"},
 }
 
 

@@ -82,10 +82,10 @@ def test_what_makes_a_choice_stale(workspace: Workspace, capsys: pytest.CaptureF
     def stamp(**changes: Any) -> str | None:
         return fingerprint(STAGES["select"], workspace, told(**changes))
 
-    assert stamp() == stamp(model={"width": 8}) == workspace.manifest.stages["select"].fingerprint
-    assert stamp() != stamp(**COARSE) != stamp(model={"width": 8}, **COARSE)
+    assert stamp() == stamp(model={"texture_size": 64}) == workspace.manifest.stages["select"].fingerprint
+    assert stamp() != stamp(**COARSE) != stamp(model={"texture_size": 64}, **COARSE)
     assert stamp() != stamp(policy="coverage")
-    assert stamp(policy="rl-paper") != stamp(policy="rl-paper", model={"width": 8})
+    assert stamp(policy="rl-paper") != stamp(policy="rl-paper", model={"texture_size": 64})
 
 
 def test_when_step_1_trains() -> None:
@@ -103,7 +103,7 @@ def test_a_selection_without_reasons_is_read(workspace: Workspace) -> None:
     assert found is not None and [view.name for view in found.views] == old["views"]
 
 
-NO_BASE: dict[str, Any] = {"base": "none", "output": "display", "filter": 0, "chain": False}
+NO_BASE: dict[str, Any] = {"base": "none", "guides": True, "output": "display", "filter": 0, "chain": False}
 
 
 def test_a_choice_beside_a_coarse_model_is_made_once(

@@ -29,7 +29,11 @@ def test_layers_win_in_order(tmp_path: Path) -> None:
         ({"base": "none", "output": "display"}, ["filter = 3", "base = none", "--set model.filter=0"]),
         ({"base": "raster", "chain": True}, ["chain = true", "base = raster", "--set model.chain=false"]),
         ({"base": "raster", "guides": "camera"}, ["guides = camera", "--set model.guides=true"]),
-        ({"aggregator": "none", "base": "none", "output": "display", "filter": 0}, ["aggregator = none"]),
+        (
+            {"aggregator": "none", "base": "none", "output": "display", "filter": 0, "guides": True},
+            ["aggregator = none"],
+        ),
+        ({"width": 32}, ["start = pretrained", "width = 24", "--set model.width=24", "start=fresh"]),
         ({"chain": True, "aggregator": "early"}, ["chain = true", "aggregator = early", "--set model.aggregator="]),
     ],
 )
@@ -37,7 +41,7 @@ def test_a_conflict_names_both_settings_and_what_to_type(model: dict[str, object
     with pytest.raises(UserError) as raised:
         resolve("draft", {"model": model}, environment={})
     message = str(raised.value)
-    assert message.startswith("setting model: ") and "{" not in message and "\n" not in message
+    assert message.startswith("setting ") and "{" not in message and "\n" not in message
     for words in advice:
         assert words in message
 

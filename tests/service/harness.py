@@ -28,6 +28,7 @@ TINY: dict[str, bool | int | float | str] = {
     "passes.raster": "cycles-direct",
     "model.texture_size": 32,
     "model.width": 8,
+    "finetune.step2.start": "fresh",
     "raytrace.max_depth": 3,
     "raytrace.denoise": False,
     "raytrace.evaluation_denoise": False,

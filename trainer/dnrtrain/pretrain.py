@@ -30,19 +30,8 @@ from .perceptual import PerceptualLoss
 from .pretraining_data import SceneMaps, joined
 from .records import Epoch, Progress
 from .schedule import Averaged, adam, averaged_weights, guarded_step
-from .settings import LossWeights, ModelSettings, Step2Settings
+from .settings import CORRECTOR, LossWeights, ModelSettings, Step2Settings
 
-CORRECTOR = ModelSettings(
-    aggregator="none",
-    modalities="uv",
-    width=24,
-    depth=3,
-    base="baked",
-    guides="camera",
-    filter=3,
-    stride=2,
-    output="log",
-)
 LOSS = Step2Settings(
     photometric="l1", perceptual_crop=32, loss=LossWeights(perceptual=0.03, total_variation=0.0, regularisation=0.0)
 )

@@ -63,11 +63,6 @@ class ModelSettings(Strict):
                 f"chain = true needs a neural texture, which aggregator = {self.aggregator} has not;"
                 " type --set model.chain=false, or --set model.aggregator=residual"
             )
-        if self.guides == "camera" and self.base not in ("baked", "direct", "path"):
-            raise ValueError(
-                f"guides = camera needs the noise of a base image, which base = {self.base} has not;"
-                " type --set model.guides=true, or --set model.base=baked"
-            )
         if self.aggregator == "none" and self.base == "none":
             raise ValueError(
                 "aggregator = none works on a base image, and base = none gives none;"
@@ -88,6 +83,11 @@ class ModelSettings(Strict):
                 f"filter = {self.filter} works on a base image, and base = none gives none;"
                 " type --set model.filter=0, or --set model.base=baked"
             )
+        if self.guides == "camera" and self.base not in ("baked", "direct", "path"):
+            raise ValueError(
+                f"guides = camera needs the noise of a base image, which base = {self.base} has not;"
+                " type --set model.guides=true, or --set model.base=baked"
+            )
         return self
 
     def coarse(self) -> ModelSettings:
@@ -95,6 +95,31 @@ class ModelSettings(Strict):
         fresh = ModelSettings()
         parts = ("base", "guides", "chain", "filter", "output", "trust")
         return self.model_copy(update={name: getattr(fresh, name) for name in parts})
+
+    def unlike_corrector(self) -> str:
+        """ "" or how a network of these settings differs from the shipped corrector, and what to type."""
+        for name in ("base", "guides", "output", "filter", "network", "stride", "width", "depth"):
+            own, wanted = getattr(self, name), getattr(CORRECTOR, name)
+            if own != wanted:
+                return (
+                    f"the shipped corrector has {name} = {wanted}, model.{name} is {own};"
+                    f" type --set model.{name}={wanted}, or --set finetune.step2.start=fresh"
+                )
+        return ""
+
+
+CORRECTOR = ModelSettings(
+    aggregator="none",
+    modalities="uv",
+    width=24,
+    depth=3,
+    base="baked",
+    guides="camera",
+    filter=3,
+    stride=2,
+    output="log",
+)
+"""The network of the shipped corrector (`dnrtrain.shipped`)."""
 
 
 class Step1Settings(Strict):

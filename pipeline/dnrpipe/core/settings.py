@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from dnrtrain.selector.names import TRAINED_NAMES, PolicyName
 from dnrtrain.settings import LossWeights, ModelSettings, Step1Settings, Step2Settings, Strict
@@ -170,6 +170,18 @@ class Settings(Strict):
     finetune: FinetuneSettings = FinetuneSettings()
     device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="torch device")
 
+    @model_validator(mode="after")
+    def _fits(self) -> Settings:
+        start = self.finetune.step2.start
+        if start == "pretrained" and self.select.budget > 0 and (conflict := self.model.unlike_corrector()):
+            raise ValueError(f"finetune.step2.start = pretrained, but {conflict}")
+        if start == "coarse" and self.model.aggregator == "none":
+            raise ValueError(
+                "finetune.step2.start = coarse begins with step 1's neural texture, and aggregator = none has none;"
+                " type --set finetune.step2.start=pretrained, or --set model.aggregator=residual"
+            )
+        return self
+
     @property
     def trains_step1(self) -> bool:
         """Whether the coarse model is wanted: by the policy, or as the start of step 2."""
@@ -271,7 +283,7 @@ def resolve(
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
         if first["type"] == "value_error" and isinstance(first["input"], Mapping):  # settings that exclude each other
-            raise UserError(f"setting {where}: {first.get('ctx', {}).get('error')}") from None
+            raise UserError(f"setting {where or 'values'}: {first.get('ctx', {}).get('error')}") from None
         raise UserError(f"setting {where}: {first['msg'].lower()}, got {first['input']!r}") from None
 
 

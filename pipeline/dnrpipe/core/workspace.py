@@ -60,13 +60,14 @@ class StageRecord(BaseModel, extra="forbid"):
 class PrepareDetail(BaseModel, strict=True):
     """What stage `prepare` tells of itself.
 
-    raster_engine: "" where no rasterised colour was wanted. views: by split. passes: how many of them have some.
+    raster_engine: "" where no rasterised colour was wanted. views: how many, by split. drawn: splits that have passes
+    -> whether with rasterised colour.
     """
 
     raster_engine: str = ""
     raster_reason: str = ""
     views: dict[str, int]
-    passes: int = 0
+    drawn: dict[str, bool] = Field(default_factory=lambda: {"train": True, "val": True, "test": False})
     triangles: int = 0
 
 

@@ -59,7 +59,8 @@ def prepare(run: Run) -> Outcome:
     """Do what is missing: convert the scene, place the cameras, render the passes."""
     summary, views = scene_and_views(run)
     _plan_effects(run)
-    drawn = draw_needed(run)
+    drawn = needed_passes(run.settings)
+    draw_splits(run, drawn)
     chosen = read_raster_choice(run.workspace)
     placed = {split: [view.model_dump(mode="json") for view in views[split]] for split in SPLITS}
     passes = run.settings.passes.model_dump(exclude={"workers"})
@@ -69,42 +70,53 @@ def prepare(run: Run) -> Outcome:
             "raster_engine": chosen.engine if chosen else "",
             "raster_reason": chosen.reason if chosen else "",
             "views": {split: len(views[split]) for split in SPLITS},
-            "passes": drawn,
+            "drawn": drawn,
             "triangles": summary.triangles,
         },
     )
 
 
-def draw_needed(run: Run, *, complete: bool = False) -> int:
-    """Draw the passes that later stages read under the settings, where they are missing -> how many views have some.
-
-    complete: those of every view, whatever the settings.
+def needed_passes(settings: Settings) -> dict[str, bool]:
+    """Splits whose passes later stages read under the settings -> whether with rasterised colour.
 
     G-buffers of candidates say what they see. Base images that are rendered bring G-buffers of their own. Rasterised
     colour is what step 1 trains on, and one kind of base image.
     """
-    settings = run.settings
     raster = settings.model.base == "raster"
-    coarse = settings.trains_step1 or complete
-    colour = {"train": coarse or raster, "val": coarse, "test": raster}
-    needed = {
-        "train": complete or settings.select.budget > 0,
-        "val": coarse,
-        "test": complete or settings.model.base not in RENDERED,
-    }
-    splits = {split: views for split, views in split_views(run.workspace).items() if needed[split]}
-    wanted = [(split, view) for split, views in splits.items() for view in views]
-    engine = _raster_engine(run).engine if any(colour[split] for split, _ in wanted) else GEOMETRY_ENGINE
+    needed: dict[str, bool] = {}
+    if settings.select.budget > 0:
+        needed["train"] = settings.trains_step1 or raster
+    if settings.trains_step1:
+        needed["val"] = True
+    if settings.model.base not in RENDERED:
+        needed["test"] = raster
+    return needed
+
+
+def draw_splits(run: Run, splits: dict[str, bool]) -> None:
+    """Draw the passes of the splits, those that are missing or out of date. splits: as of `needed_passes`."""
+    views = split_views(run.workspace)
+    wanted = [(split, view) for split in splits for view in views.get(split, [])]
     tasks = draw_passes(
         run,
         "passes",
         [view for _, view in wanted],
         [run.workspace.passes(split, view.name) for split, view in wanted],
-        engine,
-        raster=[colour[split] for split, _ in wanted],
+        _raster_engine(run).engine if any(splits.values()) else GEOMETRY_ENGINE,
+        raster=[splits[split] for split, _ in wanted],
     )
     warn_of_repairs(tasks, run.console)
-    return len(wanted)
+
+
+def draw_missing(run: Run, needed: dict[str, bool]) -> None:
+    """Draw what `prepare` did not, under the settings that it ran with, and book it as drawn."""
+    prepared = run.workspace.manifest.prepared
+    assert prepared is not None  # stages that read passes need it
+    due = {split: colour for split, colour in needed.items() if colour > prepared.drawn.get(split, -1)}
+    if due:
+        draw_splits(run, due)
+        run.workspace.manifest.stages["prepare"].detail["drawn"] = prepared.drawn | due
+        run.workspace.save()
 
 
 def _plan_effects(run: Run) -> None:
@@ -126,7 +138,7 @@ def scene_and_views(run: Run) -> tuple[SceneSummary, dict[str, list[View]]]:
 def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
     """(passes on disk, passes wanted)."""
     prepared = workspace.manifest.prepared
-    wanted = prepared.passes if prepared else settings.cameras.train
+    wanted = sum(prepared.views.get(split, 0) for split in prepared.drawn) if prepared else settings.cameras.train
     present = sum(1 for split in SPLITS for _ in (workspace.root / "passes" / split).glob("[!.]*.exr"))
     return min(present, wanted), wanted
 

@@ -17,7 +17,7 @@ from ..core.errors import UserError
 from ..core.scene_files import split_views
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest, file_sha256
-from .prepare import draw_needed
+from .prepare import draw_missing, needed_passes
 from .stage import Outcome, Run
 from .trainer import epochs_done, follow, load, torch_device
 
@@ -31,17 +31,16 @@ def select_views(run: Run) -> Outcome:
     workspace, settings = run.workspace, run.settings
     views = split_views(workspace)["train"]
     check_budget(settings.select.budget, len(views))
+    draw_missing(run, needed_passes(settings))
     if settings.select.budget == 0:
         _require_baked(settings)
         run.console.say("select: no views (--budget 0); the shipped corrector renders as it is")
         chosen = Selection(policy=settings.select.policy, budget=0, seed=settings.select.seed, views=[])
         made: list[object] = [[]]
     elif settings.trains_step1:
-        draw_needed(run)
         chosen = _train_and_choose(run, views)
         made = [chosen.views, file_sha256(workspace.checkpoints("step1") / "model.safetensors")]
     else:
-        draw_needed(run)
         chosen = _choose(run, views)
         made = [chosen.views]
     write(workspace.selection, chosen)
@@ -76,7 +75,7 @@ def check_budget(budget: int, candidates: int) -> None:
 
 def _choose(run: Run, views: list[View]) -> Selection:
     workspace, policy = run.workspace, run.settings.select.policy
-    run.console.say(f"select: no training; policy {policy} needs none, and step 2 starts fresh")
+    run.console.say(f"select: no training; policy {policy} needs none")
     rule = untrained(policy)
     assert rule is not None  # settings.trains_step1 is False
     choice = _choose_by(rule, run, views)

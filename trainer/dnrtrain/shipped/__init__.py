@@ -52,16 +52,10 @@ def with_corrector(settings: ModelSettings, seed: int) -> DNR:
 
     Raises ContractError: the settings are of another network, which the message names.
     """
-    shipped = corrector()
-    for name in ("base", "guides", "output", "filter", "network", "stride", "width", "depth"):
-        own, wanted = getattr(settings, name), getattr(shipped.settings, name)
-        if own != wanted:
-            raise ContractError(
-                f"the shipped corrector has {name} = {wanted}, model.{name} is {own};"
-                f" type --set model.{name}={wanted}, or --set finetune.step2.start=fresh"
-            )
+    if conflict := settings.unlike_corrector():
+        raise ContractError(conflict)
     model = DNR(settings, seed)
-    model.load_state_dict(shipped.state_dict(), strict=False)
+    model.load_state_dict(corrector().state_dict(), strict=False)
     with torch.no_grad():
         for part in model.modules():
             if isinstance(part, TexturePyramid):

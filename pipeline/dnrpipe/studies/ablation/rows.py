@@ -79,7 +79,14 @@ _VANILLA = merge(
     _step2(start="fresh", augment=False, loss=PHOTOMETRIC_ONLY),
 )
 
-_NO_BASE = _model(base="none", chain=False, filter=0, output="display")
+_NO_BASE: dict[str, Any] = {"base": "none", "guides": True, "chain": False, "filter": 0, "output": "display"}
+_FRESH = _step2(start="fresh")
+
+
+def _other_network(name: str, what: str, **changes: Any) -> Row:
+    """A row whose network is not the shipped corrector's: it starts fresh, and so does what it is compared with."""
+    return Row(name, what, "dnr", merge(_FRESH, _model(**changes)), against="dnr-start-fresh")
+
 
 _ROWS = (
     Row("vanilla", "DNR (Thies et al. 2019): UV texture, harmonics, U-Net, L1, from scratch", "classic", _VANILLA),
@@ -93,15 +100,15 @@ _ROWS = (
     Row("paper-uv-normal", "UV + normal textures", "classic", _model(modalities="uv+normal"), against="paper"),
     Row("paper-early", "9 channels concatenated, no textures", "classic", _model(aggregator="early"), against="paper"),
     Row("dnr", "the default model", "dnr"),
-    Row("dnr-base-none", "no base image", "dnr", _NO_BASE, against="dnr"),
-    Row("dnr-base-raster", "base image: rasterised", "dnr", _model(base="raster", chain=False), against="dnr"),
+    _other_network("dnr-base-none", "no base image", **_NO_BASE),
+    _other_network("dnr-base-raster", "base image: rasterised", base="raster", guides=True, chain=False),
     Row("dnr-base-baked", "base image: baked light", "dnr", _model(base="baked"), against="dnr"),
-    Row("dnr-base-direct", "base image: direct light, denoised", "dnr", _model(base="direct"), against="dnr"),
-    Row("dnr-base-path", "base image: few path-traced samples, denoised", "dnr", _model(base="path"), against="dnr"),
+    _other_network("dnr-base-direct", "base image: direct light, denoised", base="direct"),
+    _other_network("dnr-base-path", "base image: few path-traced samples, denoised", base="path"),
     Row("dnr-no-chain", "texture not looked up at the specular chain's end", "dnr", _model(chain=False), against="dnr"),
-    Row("dnr-no-filter", "base image not smoothed by predicted kernels", "dnr", _model(filter=0), against="dnr"),
+    _other_network("dnr-no-filter", "base image not smoothed by predicted kernels", filter=0),
     Row("dnr-chain", "texture looked up at the specular chain's end, too", "dnr", _model(chain=True), against="dnr"),
-    Row("dnr-no-guides", "no directions, normals, albedo as inputs", "dnr", _model(guides=False), against="dnr"),
+    _other_network("dnr-no-guides", "no directions, normals, albedo as inputs", guides=False),
     Row("dnr-uv", "UV texture only (no aggregator)", "dnr", _model(modalities="uv"), against="dnr"),
     Row("dnr-all-maps", "UV + depth + normal", "dnr", _model(modalities="uv+depth+normal"), against="dnr"),
     Row("dnr-no-ema", "weights of the last step, no average", "dnr", _step2(ema=0.0), against="dnr"),
@@ -109,11 +116,12 @@ _ROWS = (
     Row("dnr-perceptual", "with the paper's perceptual loss", "dnr", _step2(loss={"perceptual": 0.1}), against="dnr"),
     Row("dnr-augmentation", "with flips and rotations", "dnr", _step2(augment=True), against="dnr"),
     Row("dnr-no-augmentation", "without flips and rotations", "dnr", _step2(augment=False), against="dnr"),
-    Row("dnr-full-resolution", "network at full resolution", "dnr", _model(stride=1), against="dnr"),
-    Row("dnr-mlp", "a per-pixel MLP instead of the U-Net", "dnr", _model(network="mlp"), against="dnr"),
-    Row("dnr-display", "residual in display space", "dnr", _model(output="display"), against="dnr"),
+    _other_network("dnr-full-resolution", "network at full resolution", stride=1),
+    _other_network("dnr-mlp", "a per-pixel MLP instead of the U-Net", network="mlp"),
+    _other_network("dnr-display", "residual in display space", output="display"),
     Row("dnr-log", "residual in log space", "dnr", _model(output="log"), against="dnr"),
-    Row("dnr-start-fresh", "step 2 from scratch", "dnr", _step2(start="fresh"), against="dnr"),
+    Row("dnr-start-fresh", "step 2 from scratch", "dnr", _FRESH, against="dnr"),
+    _other_network("dnr-world-guides", "directions and normals in world space, no noise", guides=True),
     Row("dnr-start-coarse", "step 2 from step 1's weights", "dnr", _step2(start="coarse"), against="dnr"),
     Row("all-views", "the default model trained on all candidates", "dnr", views="all", against="dnr"),
     Row("base", "the base image alone, no network", "dnr", network=False, against="dnr"),

@@ -18,7 +18,7 @@ from ...core.workspace import Source, Workspace, file_sha256
 from ...effects.store import plan_of
 from ...stages.base_images import RENDERED, base_path, base_views
 from ...stages.pipeline import run_stage
-from ...stages.prepare import draw_needed, draw_passes
+from ...stages.prepare import draw_missing, draw_passes
 from ...stages.raytrace import trace_views
 from ...stages.stage import Run
 
@@ -99,7 +99,7 @@ def prepared(name: str, run: Run, command: str) -> Scene:
     workspace, settings = run.workspace, run.settings
     silent = replace(run, console=Console(json_mode=run.console.json_mode, quiet=True))
     run_stage("prepare", silent)
-    draw_needed(silent.for_stage("prepare"), complete=True)
+    draw_missing(silent.for_stage("prepare"), {"train": True, "val": True, "test": False})
     views = split_views(workspace)
     if not views.get("test"):
         raise UserError(f"{name}: has no test views to measure on; set cameras.test > 0")
