@@ -120,7 +120,7 @@ def test_bad_requests_do_no_harm(server: Server, trained: str) -> None:
 def test_untrained_workspace_says_so(server: Server) -> None:
     empty_workspace(server.root, "untrained")
     with connect(server.url.replace("http", "ws") + "/workspaces/untrained/live") as socket:
-        assert "no trained renderer" in json.loads(socket.recv(timeout=60))["detail"]
+        assert "no renderer" in json.loads(socket.recv(timeout=60))["detail"]
 
 
 def test_frame_process_is_replaced_when_it_dies(server: Server, trained: str) -> None:

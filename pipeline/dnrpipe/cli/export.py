@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,11 +11,12 @@ import click
 
 from ..core.console import Console
 from ..core.errors import UserError
-from .options import OUTPUT_OPTIONS
+from .options import OUTPUT_OPTIONS, open_session
 from .options import options as with_options
 
 if TYPE_CHECKING:
     from ..core.workspace import Workspace
+    from ..stages.session import Session
 
 
 _common = with_options(
@@ -28,9 +31,23 @@ _common = with_options(
 def _opened(workspace: str | None, named: str | None, as_json: bool, quiet: bool) -> tuple[Workspace, Console]:
     from ..core.workspace import Workspace, find_workspace
 
+    root = find_workspace(_root(workspace, named))
+    return Workspace.open(root), Console(json_mode=as_json, quiet=quiet)
+
+
+@contextmanager
+def _untrained(command: str, workspace: str | None, named: str | None, **output: bool) -> Iterator[Session]:
+    """The workspace's session; where no view was ever selected, the shipped corrector is its renderer."""
+    options = {"workspace": _root(workspace, named), "preset": None, "assignments": (), "force": False, **output}
+    with open_session(command, options) as session:
+        session.untrained()
+        yield session
+
+
+def _root(workspace: str | None, named: str | None) -> str | None:
     if workspace and named and workspace != named:
         raise UserError(f"two workspaces are named, {workspace} and {named}; name one")
-    return Workspace.open(find_workspace(workspace or named)), Console(json_mode=as_json, quiet=quiet)
+    return workspace or named
 
 
 @click.command("export-nerf")
@@ -74,8 +91,9 @@ def export_onnx(out: Path | None, **options: Any) -> None:
     """
     from ..export.onnx import export_onnx as export
 
-    workspace, console = _opened(**options)
-    answer = export(workspace, out or Path(f"{workspace.root.stem}.onnx"), console)
+    with _untrained("export-onnx", **options) as session:
+        workspace, console = session.workspace, session.console
+        answer = export(workspace, out or Path(f"{workspace.root.stem}.onnx"), console)
     console.say(
         f"{answer['file']}: {answer['bytes'] / 1e6:.1f} MB, opset {answer['opset']}, inputs"
         f" {', '.join(answer['inputs'])}; largest difference from torch {answer['largest_difference']:.1e}"
@@ -100,6 +118,9 @@ def export_gltf(out: Path | None, light: bool, **options: Any) -> None:
     """
     from ..export.gltf import export_gltf as export
 
+    if light:
+        with _untrained("export-gltf", **options):
+            pass  # its light is baked now
     workspace, console = _opened(**options)
     answer = export(workspace, out or Path(f"{workspace.root.stem}.glb"), console, light=light)
     console.say(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from ..core.scene_files import read_frame, split_views
 from ..core.workspace import Workspace
 from ..stages.base_images import RENDERED, base_path
 from ..stages.trainer import load
+from ..stages.trust import SPLIT, trust_views
 
 TOLERANCE = 1e-3
 """Largest difference from torch that passes: a quarter of an 8-bit step. Display space."""
@@ -69,25 +71,19 @@ def export_onnx(workspace: Workspace, out: Path, console: Console) -> dict[str, 
 
 def view_inputs(workspace: Workspace, view: View, split: str, base: str, names: Sequence[str]) -> dict[str, np.ndarray]:
     """A view's files as the graph's inputs."""
-    channels, _ = read_exr(workspace.passes(split, view.name))
-    if base in RENDERED:
-        more, _ = read_exr(base_path(workspace, split, view.name))
-        channels |= {name: image for name, image in more.items() if name not in channels}
-    elif base == "raster":
+    file = base_path(workspace, split, view.name) if base in RENDERED else workspace.passes(split, view.name)
+    channels, _ = read_exr(file)
+    if base == "raster":
         channels |= {f"base.{c}": channels[c] for c in "RGBA"}
     return onnx_export.graph_inputs(channels, view, names)
 
 
 def _views(workspace: Workspace, base: str) -> tuple[str, list[View]]:
     """Some views that have all files, held-out ones first."""
-    cameras = split_views(workspace)
-    for split in ("test", "train"):
-        found = [
-            view
-            for view in cameras.get(split, [])
-            if workspace.passes(split, view.name).is_file()
-            and (base not in RENDERED or base_path(workspace, split, view.name).is_file())
-        ]
+    cameras = split_views(workspace) | {SPLIT: trust_views(workspace)}
+    file = partial(base_path, workspace) if base in RENDERED else workspace.passes
+    for split in ("test", "train", SPLIT):
+        found = [view for view in cameras.get(split, []) if file(split, view.name).is_file()]
         if found:
             return split, found[:CHECKED]
     raise UserError(f"{workspace.root}: no view has its files; run `dnrpipe evaluate` first")

@@ -86,7 +86,7 @@ def open_scene(root: Path) -> LiveScene:
     workspace = Workspace.open(root)
     record = workspace.manifest.stages.get("finetune")
     if record is None:
-        raise UserError(f"{root.name}: has no trained renderer yet; submit a job run or finetune")
+        raise UserError(f"{root.name}: has no renderer yet; submit a job run, finetune or render")
     settings = resolve_settings(workspace, {}, None)
     kind = settings.model.base
     if kind == "raster":

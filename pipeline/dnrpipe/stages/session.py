@@ -115,19 +115,22 @@ class Session:
             self.console.result({"workspace": str(self.workspace.root), **self.answers})
 
     def renderer(self) -> None:
-        """See to it that there is a renderer: the fine-tuned one, else the shipped corrector, as with ``--budget 0``.
+        """See to it that frames can be rendered: by the fine-tuned renderer, else as `untrained` says.
 
-        The latter where no view was ever selected. Raises UserError: views were, and a stage on the way has not run.
+        Raises UserError: views were selected, and a stage on the way to a renderer has not run.
         """
-        if selects_nothing(self.workspace, self.settings):
-            select = self.settings.select.model_copy(update={"budget": 0})
-            self.settings = self.settings.model_copy(update={"select": select})
-            if any(state(STAGES[name], self.workspace, self.settings) != "done" for name in UNTRAINED):
-                self.console.say("no views are selected: the shipped corrector renders")
-            for name in UNTRAINED:
-                if state(STAGES[name], self.workspace, self.settings) != "done":
-                    run_stage(name, self.run)
+        self.untrained()
         require_inputs(STAGES["evaluate"], self.workspace, self.settings)  # what it needs is what frames need
+
+    def untrained(self) -> None:
+        """Where no view was ever selected, the shipped corrector becomes the renderer, as with ``--budget 0``."""
+        if not selects_nothing(self.workspace, self.settings):
+            return
+        select = self.settings.select.model_copy(update={"budget": 0})
+        self.settings = self.settings.model_copy(update={"select": select})
+        for name in UNTRAINED:
+            if state(STAGES[name], self.workspace, self.settings) != "done":
+                run_stage(name, self.run)
 
     def adopt(self, overrides: dict[str, Any]) -> None:
         """Settings found by the command itself, remembered as flags are."""

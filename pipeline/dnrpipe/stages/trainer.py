@@ -48,7 +48,7 @@ def load(
         read_frame(workspace),
         cameras=views,
         folder=workspace.scene,
-        target=split != "test" or raytraced,
+        target=raytraced or split in ("train", "val"),
         base=base,
         base_files=base_files,
     )

@@ -10,8 +10,11 @@ from typing import TYPE_CHECKING
 
 from pydantic import BaseModel
 
+from dnrtrain.contract import View
+
 from ..core.cameras import scaled_to
 from ..core.scene_files import split_views
+from ..core.workspace import Workspace
 from .base_images import base_views
 from .raytrace import trace_views
 from .stage import Run
@@ -42,6 +45,13 @@ class Trust(BaseModel, frozen=True):
         return f"shipped corrector, {self.share:.0%} of it: {base:.1f} -> {ours:.1f} dB on {VIEWS} small traced views"
 
 
+def trust_views(workspace: Workspace) -> list[View]:
+    """Candidates spread over all, as small pictures."""
+    candidates = split_views(workspace)["train"]
+    count = min(VIEWS, len(candidates))
+    return [scaled_to(candidates[(2 * i + 1) * len(candidates) // (2 * count)], SIDE) for i in range(count)]
+
+
 def measure_trust(run: Run, model: DNR) -> Trust:
     """Trace the views and their base images, where that is not done, and find the best share.
 
@@ -52,9 +62,7 @@ def measure_trust(run: Run, model: DNR) -> Trust:
     from dnrtrain.metrics import psnr
     from dnrtrain.model import render_views
 
-    candidates = split_views(run.workspace)["train"]
-    count = min(VIEWS, len(candidates))
-    views = [scaled_to(candidates[(2 * i + 1) * len(candidates) // (2 * count)], SIDE) for i in range(count)]
+    views = trust_views(run.workspace)
     trace_views(run, views, SPLIT, spp=SPP)
     base_views(run, views, SPLIT)
     data = load(run.workspace, views, SPLIT, raytraced=True, base=run.settings.model.base)
@@ -64,7 +72,7 @@ def measure_trust(run: Run, model: DNR) -> Trust:
     def quality(share: float) -> float:
         model.settings = model.settings.model_copy(update={"trust": share})
         pictures = zip(render_views(model, data), target, strict=True)
-        return sum(float(psnr(picture[None], truth[None])) for picture, truth in pictures) / count
+        return sum(float(psnr(picture[None], truth[None])) for picture, truth in pictures) / len(views)
 
     with torch.inference_mode():
         found = {share: quality(share) for share in SHARES}
