@@ -21,7 +21,7 @@ from dnrpipe.raytrace.lobes import diffuse_context
 from dnrpipe.raytrace.second_targets import second_targets
 from dnrpipe.raytrace.sensors import sensor_dict
 from dnrpipe.raytrace.surface_maps import SurfaceMapper
-from dnrpipe.raytrace.texels import grouped_meshes
+from dnrpipe.raytrace.texels import grouped_meshes, seen_sides
 from dnrtrain.contract import BASE_CHANNELS, View
 from dnrtrain.exr import read_exr
 
@@ -250,6 +250,61 @@ def test_nothing_is_lost_on_the_benchmark_scenes(scene: str, tmp_path: Path) -> 
     assert light["detail"]["lost"] == 0
     traced = [record for record in records if record["unit"] == "view" and record["stage"] == "raytrace"]
     assert len(traced) == 4 and not any(r["detail"]["repaired"] or r["detail"]["masked"] for r in traced)
+
+
+MIDDLE, HALF = np.array([0.0, 0.2, 0.45]), 0.4
+
+
+def box(path: Path, *, inside_out: bool, sides: int = 6) -> np.ndarray:
+    """Triangles [T, 3, 3] of a box, written with an atlas in [0.05, 0.45] x [0.55, 0.95]. sides: the first few."""
+    order = [0, 1, 2, 0, 2, 3]
+    unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+    parts, triangles = [], []
+    for side in range(sides):
+        axis, sign = side // 2, 1 if side % 2 else -1
+        u, v = np.roll(np.eye(3), axis, axis=0)[1:]
+        outwards = sign * np.roll(np.eye(3), axis, axis=0)[0]
+        corners = np.array([outwards + a * u + b * v for a, b in 2 * unit - 1]) * HALF + MIDDLE
+        if (np.dot(np.cross(u, v), outwards) < 0) != inside_out:
+            corners = corners[::-1]
+        normals = np.tile(outwards * (-1 if inside_out else 1), (6, 1)).astype(np.float32)
+        place = np.array([0.05 + 0.14 * (side % 3), 0.55 + 0.2 * (side // 3)])
+        atlas = np.concatenate([unit * 0.1 + place, np.zeros((4, 1))], axis=1).astype(np.float32)
+        corners = corners.astype(np.float32)[order]
+        parts.append(weld(corners, normals, unit[order], [("atlas", atlas[order])]))
+        triangles.append(corners.reshape(2, 3, 3))
+    write_ply(path, parts)
+    return np.concatenate(triangles)
+
+
+def test_a_closed_mesh_has_one_side_and_an_open_one_two(tmp_path: Path) -> None:
+    found = {
+        (inside_out, sides): seen_sides(mi, box(tmp_path / "b.ply", inside_out=inside_out, sides=sides)).tolist()
+        for inside_out in (False, True)
+        for sides in (5, 6)
+    }
+    assert found[False, 6] == [True, False] and found[True, 6] == [False, True]
+    assert found[False, 5] == found[True, 5] == [True, True]
+
+
+@pytest.mark.parametrize("material", [{"type": "diffuse"}, {"type": "dnr_principled", "metallic": 1.0}])
+def test_an_inside_out_mesh_looks_like_any_other(tmp_path: Path, material: dict[str, Any]) -> None:
+    colour_of, grey = ("base_color" if "metallic" in material else "reflectance"), rgb(0.7, 0.7, 0.7)
+    solid = {"type": "twosided", "b": {**material, colour_of: grey}}
+    if "metallic" in material:
+        solid["b"]["roughness"] = 0.8
+    light = {"type": "point", "position": [-0.9, -0.6, 2.0], "intensity": rgb(6, 6, 6)}
+    plain = {"type": "twosided", "b": {"type": "diffuse", "reflectance": rgb(0.8, 0.5, 0.3)}}
+    means = []
+    for inside_out in (False, True):
+        box(tmp_path / "b.ply", inside_out=inside_out)
+        shape = {"type": "ply", "filename": str(tmp_path / "b.ply"), "bsdf": solid}
+        scene = corner_room(tmp_path, plain, plain, light, box=shape)
+        channels = rendered(scene, LightBaker(mi, scene, onwards()).bake(128, 64, 0), camera(), 8)
+        on_box = (channels["uv.V"] > 0.5) & (channels["mask"] > 0.5)
+        assert on_box.sum() > 150
+        means.append(colour(channels)[on_box, :3].mean())
+    assert means[1] == pytest.approx(means[0], rel=0.05) and means[0] > 0.02
 
 
 @pytest.mark.parametrize("kind", ["diffuse", "dnr_principled"])

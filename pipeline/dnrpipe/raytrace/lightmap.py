@@ -36,11 +36,9 @@ from .lobes import (
     specular_context,
 )
 from .paths import transmittance
-from .texels import AtlasSurface
+from .texels import LIFT, AtlasSurface
 
 MAX_SAMPLES = 4_000_000
-LIFT = 2e-4
-"""Of the scene's size: how far above a surface the ray starts that finds it again."""
 LEAST_RHO = 1e-3
 """Texels that reflect less hold no light worth knowing."""
 
@@ -72,18 +70,18 @@ class LightBaker:
         """E and S of the front and of the back, float32 [2, 2, size, size, 3], row 0 at V = 0; no noise, no gaps.
 
         The denoiser is shown where in space each texel lies and where it faces, so that charts that are neighbours in
-        the atlas alone stay apart. The back is traced where it can be seen: of surfaces with a rim.
+        the atlas alone stay apart. Of closed meshes one side is traced: the other cannot be seen.
         """
         whole, self.lost = np.zeros((2, 2, size, size, 3), np.float32), 0
         if not self.surface.count:
             return whole
-        texels, position, normal, thin = self.occupied(size)
+        texels, position, normal, sides = self.occupied(size)
         if not len(texels):
             return whole
         low, high = position.min(axis=0), position.max(axis=0)
         place = (position - low) / np.maximum(high - low, 1e-12)
         for number, side in enumerate((1, -1)):
-            wanted = np.ones(len(texels), bool) if side > 0 else thin
+            wanted = sides[:, number]
             if not wanted.any():
                 continue
             guides = place[wanted], normal[wanted] * side
@@ -131,7 +129,8 @@ class LightBaker:
         return np.concatenate(parts)
 
     def occupied(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Texels that a chart touches, on a grid three times as fine: (numbers, positions, normals, have two sides)."""
+        """Texels that a chart touches, on a grid three times as fine: (numbers, positions, normals, whether front and
+        back can be seen, bool [T, 2])."""
         import drjit as dr
 
         mi, fine = self.mi, 3 * size
@@ -150,7 +149,8 @@ class LightBaker:
         row = (texels // size) * 3 + pick // 3
         place = mi.Point2f(mi.Float((column + 0.5).astype(np.float32)), mi.Float((row + 0.5).astype(np.float32))) / fine
         position, normal, _ = self.surface.points(place)
-        return texels, np.array(position).T, np.array(normal).T, np.array(self.surface.thin(place))
+        sides = np.stack([np.array(side) for side in self.surface.sides(place)], axis=1)
+        return texels, np.array(position).T, np.array(normal).T, sides
 
     def _part(self, sample: Any, texels: np.ndarray, size: int, spp: int, seed: int, side: int) -> np.ndarray:
         """As `_traced`, of texels that fit in memory."""

@@ -15,8 +15,14 @@ from typing import Any
 import numpy as np
 
 ATTRIBUTE = "vertex_atlas"
-OPEN_MESH = 1e-3
-"""A surface whose area vectors sum to more than this share of its area has a rim."""
+LIFT = 2e-4
+"""Of a size: how far above a surface a ray starts."""
+PROBES = 256
+"""Rays per side of a mesh that find out whether it can be seen."""
+SEEN = 0.02
+"""A side can be seen where more of its rays than this share end elsewhere than at the mesh itself."""
+SHELL = 0.9
+"""Of the scene's extent along each axis: a mesh that has so much of it may be a room, seen from within."""
 
 
 class AtlasSurface:
@@ -29,7 +35,9 @@ class AtlasSurface:
         """groups: the meshes that instances repeat, each with the matrix of its place (`grouped_meshes`)."""
         meshes = [(shape, np.eye(4)) for shape in scene.shapes() if shape.is_mesh()]
         meshes += [(mi.load_dict({"type": "ply", "filename": str(path)}), matrix) for path, matrix in groups]
-        corners, places, open_ = [], [], []
+        corners, places, sides = [], [], []
+        box = scene.bbox()
+        extent = np.array(box.max).ravel() - np.array(box.min).ravel()
         for shape, matrix in meshes:
             if not shape.has_attribute(ATTRIBUTE):
                 continue
@@ -38,7 +46,11 @@ class AtlasSurface:
             atlas = np.array(shape.attribute_buffer(ATTRIBUTE)).reshape(-1, 3)
             corners.append(vertices[faces])
             places.append(atlas[faces])
-            open_.append(np.full(len(faces), _has_rim(vertices[faces])))
+            bsdf = shape.bsdf()
+            holes = bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
+            shell = bool((np.ptp(vertices, axis=0) >= SHELL * extent).all())
+            seen = np.ones(2, bool) if holes or shell else seen_sides(mi, vertices[faces])
+            sides.append(np.tile(seen, (len(faces), 1)))
         self.mi = mi
         self.count = sum(map(len, corners))
         if not self.count:
@@ -52,7 +64,7 @@ class AtlasSurface:
         parameters.update()
         self.flat = mi.load_dict({"type": "scene", "atlas": mesh})
         self.first, self.copies, self.order = map(mi.UInt32, _copies(np.concatenate(places)))
-        self.open = mi.Float(np.concatenate(open_).astype(np.float32))
+        self.seen = [mi.Float(side) for side in np.concatenate(sides).T.astype(np.float32)]
         self.corners = mi.Float(np.concatenate(corners).astype(np.float32).ravel())
 
     def points(self, uv: Any, choice: Any = None) -> tuple[Any, Any, Any]:
@@ -80,13 +92,14 @@ class AtlasSurface:
         found &= length > 0
         return place, mi.Normal3f(normal / dr.maximum(length, 1e-30)), found
 
-    def thin(self, uv: Any) -> Any:
-        """Whether the surface at (U, V) has a rim, so that its back can be seen."""
+    def sides(self, uv: Any) -> list[Any]:
+        """Whether the front (the side that the normal points to) and the back of the surface at (U, V) can be seen."""
         import drjit as dr
 
         mi = self.mi
         hit = self.flat.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(uv.x, uv.y, 1), mi.Vector3f(0, 0, -1)))
-        return hit.is_valid() & (dr.gather(mi.Float, self.open, hit.prim_index, hit.is_valid()) > 0.5)
+        found = hit.is_valid()
+        return [found & (dr.gather(mi.Float, seen, hit.prim_index, found) > 0.5) for seen in self.seen]
 
 
 def _copies(places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -118,7 +131,35 @@ def grouped_meshes(bundle: Path) -> list[tuple[Path, np.ndarray]]:
     return found
 
 
-def _has_rim(triangles: np.ndarray) -> bool:
-    """Of a closed surface [T, 3, 3] the area vectors sum to nothing (divergence theorem)."""
+def seen_sides(mi: Any, triangles: np.ndarray) -> np.ndarray:
+    """Whether rays leave the front and the back of a mesh [T, 3, 3] without meeting it again -> bool [2].
+
+    The inside of a closed mesh keeps them. Which side that is, its normals do not tell: Blender shows both alike, and
+    many a mesh is inside out.
+    """
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]).astype(np.float64)
-    return bool(np.linalg.norm(cross.sum(axis=0)) > OPEN_MESH * max(np.linalg.norm(cross, axis=1).sum(), 1e-20))
+    area = np.linalg.norm(cross, axis=1)
+    if not area.sum() > 0:
+        return np.ones(2, bool)
+    random = np.random.default_rng(0)
+    chosen = random.choice(len(area), PROBES, p=area / area.sum())
+    u, v = np.sort(random.random((2, PROBES)), axis=0)
+    weights = np.stack([u, v - u, 1 - v], axis=1)
+    origin = (weights[:, :, None] * triangles[chosen]).sum(axis=1)
+    normal = cross[chosen] / area[chosen, None]
+    around = random.normal(size=(PROBES, 3))
+    around /= np.linalg.norm(around, axis=1, keepdims=True)
+    lift = LIFT * np.linalg.norm(np.ptp(triangles.reshape(-1, 3), axis=0))
+    mesh = mi.Mesh("alone", 3 * len(triangles), len(triangles))
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = mi.Float(triangles.astype(np.float32).ravel())
+    parameters["faces"] = mi.UInt32(np.arange(3 * len(triangles), dtype=np.uint32))
+    parameters.update()
+    alone = mi.load_dict({"type": "scene", "mesh": mesh})
+    shares = []
+    for side in (1, -1):
+        up = normal * side
+        start, direction = (origin + lift * up).T, (up + 0.999 * around).T  # cosine-weighted
+        ray = mi.Ray3f(mi.Point3f(start.astype(np.float32)), mi.Vector3f(direction.astype(np.float32)))
+        shares.append(1 - np.array(alone.ray_test(ray)).mean())
+    return np.array(shares) > SEEN
