@@ -109,7 +109,7 @@ class BaseSettings(Strict):
         default="auto", description="texels of the baked light's side; auto: about one a pixel"
     )
     light_spp: Annotated[int, Field(ge=1, le=1_000_000)] | Literal["auto"] = Field(
-        default="auto", description="paths per texel of the baked light; auto: 128 up to 512 texels a side, then fewer"
+        default="auto", description="paths per texel of the baked light; auto: 64 up to 512 texels a side, then fewer"
     )
     samples: int = Field(default=8, ge=1, le=64, description="rays per pixel of a base image")
     denoise: bool = Field(

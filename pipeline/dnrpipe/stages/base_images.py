@@ -33,7 +33,7 @@ RENDERED = ("baked", "direct", "path")
 AUTOMATIC_TEXELS = 4
 """Light map texels per pixel of an image's side: about one texel a pixel where the atlas shows a part of itself."""
 SIZES = (256, 4096)
-SPP = (32, 128)
+SPP = (16, 64)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from ..effects.store import lenses, plan_of, trace_config, variant_for
 from ..raytrace.sample_schedule import Goal
 from ..workers.view_tasks import is_made, task_name, warn_of_repairs, worker_count
 from .adaptive_sampling import sample_adaptively
-from .base_images import RENDERED, base_path, base_views
+from .base_images import RENDERED, base_path, base_renderer, base_views
 from .effect_plan import resolve_plan
 from .stage import Outcome, Run
 
@@ -33,6 +33,8 @@ def raytrace_selected(run: Run) -> Outcome:
     tasks = trace_views(run, selected, "train")
     bases = base_views(run, selected, "train")
     made: list[Any] = [task["fingerprint"] for task in [*tasks, *bases]]
+    if not selected:  # then base images are all that frames are made of
+        made.append(base_renderer(workspace, settings, resolve_plan(run)).fingerprint)
     spp = [(read_metadata(Path(task["output"])) or {}).get("spp") for task in tasks]
     if goal_of(settings, "train") is not None:
         made.append(spp)  # with a time, how many samples were taken is not known before
