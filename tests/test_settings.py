@@ -155,11 +155,11 @@ def test_paths_per_texel_of_the_baked_light() -> None:
         settings = resolve("draft", {"cameras": {"width": side, "height": side}, "base": base}, environment={})
         return light_size(settings), light_spp(settings)
 
-    assert of(64) == (256, 128)  # never more than at 512
-    assert of(128) == (512, 128)
-    assert of(256) == (1024, 32)
-    assert of(800)[1] == 32
-    assert of(256, light_size=512) == (512, 128)
+    assert of(64) == (256, 64)  # never more than at 512
+    assert of(128) == (512, 64)
+    assert of(256) == (1024, 16)
+    assert of(800)[1] == 16
+    assert of(256, light_size=512) == (512, 64)
     assert of(256, light_spp=7) == (1024, 7)
 
 
