@@ -1,6 +1,6 @@
 """Train the corrector on the data of `tools.pretrain.data`, and write it where the package keeps it.
 
-python -m tools.pretrain.train DATA FOLDER [--minutes 20] [--ship]
+python -m tools.pretrain.train DATA FOLDER [--minutes 20] [--from WEIGHTS] [--ship]
 
 FOLDER keeps the state: an interrupted training goes on. Every eighth scene is held out and measured. ``--ship`` writes
 the weights, as float16, and their figures into the package.
@@ -16,7 +16,7 @@ from dnrtrain import checkpoint
 from dnrtrain.atomic import write_json
 from dnrtrain.pretrain import pretrain
 from dnrtrain.pretraining_data import SceneMaps
-from dnrtrain.shipped import WEIGHTS
+from dnrtrain.shipped import WEIGHTS, corrector
 from dnrtrain.weights import load_weights
 
 HELD_OUT = 8
@@ -29,6 +29,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--minutes", type=float, default=20)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--from", dest="begin", type=Path, help="weights to go on from, e.g. the shipped ones")
     parser.add_argument("--ship", action="store_true")
     options = parser.parse_args()
     found = [SceneMaps(path.parent) for path in sorted(options.data.glob("[0-9]*/scene.json"))]
@@ -38,7 +39,8 @@ def main() -> None:
     options.folder.mkdir(parents=True, exist_ok=True)
     history = options.folder / "history.jsonl"
     seconds = 60 * options.minutes
-    settings = {"seconds": seconds, "seed": options.seed, "weights": load_weights()}
+    begin = corrector(options.begin) if options.begin else None
+    settings = {"seconds": seconds, "seed": options.seed, "weights": load_weights(), "begin": begin}
     for record in pretrain(training, held_out, options.folder, **settings):
         base, ours = record["psnr"]
         print(f"{record['seconds']} s, step {record['step']}: held-out {base:.2f} -> {ours:.2f} dB", flush=True)

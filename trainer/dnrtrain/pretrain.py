@@ -36,6 +36,8 @@ LOSS = Step2Settings(
     photometric="l1", perceptual_crop=32, loss=LossWeights(perceptual=0.03, total_variation=0.0, regularisation=0.0)
 )
 RATE, RATE_END = 1e-3, 2e-5
+RATE_ONWARDS = 4e-4
+"""The first rate where training goes on from weights."""
 EMA = 0.999
 PERCEPTUAL_EVERY = 4
 """Steps from one with L_p to the next: it takes half of such a step's time."""
@@ -54,6 +56,7 @@ def pretrain(
     side: int = 64,
     seed: int = 0,
     weights: Mapping[str, Mapping[str, Tensor]] | None = None,
+    begin: DNR | None = None,
     every: float = 120.0,
 ) -> Iterator[dict[str, Any]]:
     """Train for so many seconds in all; yields a record every ``every`` seconds, the last one at the end.
@@ -62,8 +65,11 @@ def pretrain(
         folder: holds the state of an interrupted training, which goes on.
         side: of the squares, pixels.
         weights: from ``weights.load_weights``; None drops L_p.
+        begin: a corrector to go on from; None: fresh.
     """
-    dnr = DNR(model, seed)
+    dnr, first_rate = DNR(model, seed), RATE if begin is None else RATE_ONWARDS
+    if begin is not None:
+        dnr.load_state_dict(begin.state_dict())
     optimiser = adam([dnr], RATE, "cpu")
     average = Averaged(dnr, EMA)
     spent, step = 0.0, 0
@@ -82,7 +88,7 @@ def pretrain(
     dnr.train()
     while spent < seconds:
         random = np.random.default_rng([seed, step])
-        rate = RATE * (RATE_END / RATE) ** min(1.0, spent / seconds)
+        rate = first_rate * (RATE_END / first_rate) ** min(1.0, spent / seconds)
         drawn = [training[int(index)].draw(random, side) for index in random.integers(len(training), size=batch)]
         pictures = joined([disturbed(picture, random) for picture in drawn])
         assert pictures.target is not None
