@@ -30,7 +30,9 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[render,train,serve,export,dev]'
 	@touch $@
 
-demo: setup  ## the demo scene from .blend to report; prints the report's path
+demo: setup  ## the demo scene from .blend to report, untrained and trained; prints the report's path
+	@$(BIN)/dnrpipe prepare blender_scenes/demo.blend -w $(DEMO)/demo.dnr
+	@$(BIN)/dnrpipe render -w $(DEMO)/demo.dnr --orbit 60 --untrained
 	@$(BIN)/dnrpipe run blender_scenes/demo.blend --budget 25 -w $(DEMO)/demo.dnr
 	@$(BIN)/dnrpipe render -w $(DEMO)/demo.dnr --orbit 60
 	@$(BIN)/dnrpipe report -w $(DEMO)/demo.dnr

@@ -153,6 +153,7 @@ def run(scene: Path | None, **options: Any) -> None:
 @click.option(
     "--resolution", type=click.IntRange(8, 16384), metavar="PIXELS", help="Square size of the orbit's frames."
 )
+@click.option("--untrained", is_flag=True, help="By the shipped corrector, also where a renderer was trained.")
 @common
 def render(
     orbit: int | None,
@@ -161,15 +162,18 @@ def render(
     frames: str,
     movie: str,
     resolution: int | None,
+    untrained: bool,
     **options: Any,
 ) -> None:
     """Render novel views with the neural renderer: frames and a movie in renders/.
 
-    Where no view was ever selected, the shipped corrector renders: no view is traced, and nothing is trained.
+    Where no view was ever selected, the shipped corrector renders: nothing is trained. With --untrained it does so in
+    any case, into a folder of its own.
 
     \b
     Examples:
       dnrpipe render --orbit 60
+      dnrpipe render --orbit 60 --untrained
       dnrpipe render --orbit 120 --movie webp --frames both
       dnrpipe render --cameras transforms_path.json
     """
@@ -182,7 +186,8 @@ def render(
     from ..stages.render import render_novel
 
     with open_session("render", options) as session:
-        session.renderer()
+        if not untrained:
+            session.renderer()
         cameras = session.settings.cameras
         if camera_file is not None:
             views = parse_transforms(camera_file, (cameras.width, cameras.height))
@@ -192,7 +197,8 @@ def render(
                 cameras = cameras.model_copy(update={"width": resolution, "height": resolution})
             views = orbit_views(read_summary(session.workspace.scene), cameras, orbit or 60, elevation)
             name = f"orbit-{orbit or 60}"
-        answer = render_novel(session.run.for_stage("render"), views, name=name, frames=frames, movie=movie)
+        run = session.run.for_stage("render")
+        answer = render_novel(run, views, name=name, frames=frames, movie=movie, untrained=untrained)
         session.console.say(f"{answer['frames']} frames, {answer['neural_ms']:.1f} ms each for the network")
         session.console.say(answer["movie"] or answer["folder"])
         session.console.result(answer)

@@ -32,6 +32,7 @@ class TestView(ViewMetrics):
 
     noise_share: share of the measured squared error that is the reference's own noise, in [0, 1]
     (10^((psnr − ceiling) / 10)); None where the ceiling was not measured.
+    base, shipped: the base image, and the shipped corrector without training; None where there is none.
     """
 
     __test__ = False  # not a pytest class
@@ -40,6 +41,8 @@ class TestView(ViewMetrics):
     truth: Picture | None
     prediction: Picture | None
     flip_map: Picture | None
+    base: Picture | None = None
+    shipped: Picture | None = None
 
 
 class MetricRow(_Frozen):

@@ -16,6 +16,8 @@ from .pictures import FEATURED_SIDE, THUMBNAIL_SIDE, load_png
 # The first fields of a `MetricRow`.
 METRICS: tuple[tuple[str, str, str, int, bool], ...] = (
     ("psnr", "PSNR over white", "dB", 2, True),
+    ("psnr_shipped", "… of the shipped corrector, untrained", "dB", 2, True),
+    ("psnr_base", "… of the base image", "dB", 2, True),
     ("psnr_mask", "PSNR inside the mask", "dB", 2, True),
     ("ssim", "SSIM over white", "", 4, True),
     ("ssim_mask", "SSIM inside the mask", "", 4, True),
@@ -91,6 +93,8 @@ def _view(root: Path, view: ViewMetrics, side: int) -> TestView:
         truth=load_png(root, f"{stem}.truth.png", side=side),
         prediction=load_png(root, f"{stem}.prediction.png", side=side),
         flip_map=load_png(root, f"{stem}.flip.png", side=side, heat=True),
+        base=load_png(root, f"{stem}.base.png", side=side),
+        shipped=load_png(root, f"{stem}.shipped.png", side=side),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from dnrtrain.records import write
 
 from ..core.errors import UserError
 from ..core.images import flip_error, picture_of, write_png
-from ..core.scene_files import split_views
+from ..core.scene_files import read_selection, split_views
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest
 from .base_images import RENDERED, base_path, base_views
@@ -22,6 +22,10 @@ from .raytrace import trace_views
 from .records import METRICS, Metrics, ViewMetrics
 from .stage import Outcome, Run
 from .trainer import load, perceptual_weights, torch_device
+from .trust import VIEWS, apply_share, best_share
+
+if TYPE_CHECKING:
+    from dnrtrain.model import DNR
 
 NEURAL_REPEATS = 5
 
@@ -31,7 +35,7 @@ def evaluate(run: Run) -> Outcome:
     import torch
 
     from dnrtrain.checkpoint import load_model
-    from dnrtrain.metrics import image_metrics
+    from dnrtrain.metrics import image_metrics, psnr
     from dnrtrain.model import render_views
     from dnrtrain.perceptual import build_lpips
 
@@ -46,6 +50,7 @@ def evaluate(run: Run) -> Outcome:
     perceptual = perceptual_weights(console)
     lpips = build_lpips(perceptual) if perceptual else None
     rendered = settings.model.base in RENDERED
+    untrained = {name: other.to(device) for name, other in _untrained(run).items()}
     rows: list[ViewMetrics] = []
     neural_seconds: list[float] = []
     with console.bar("test views", len(views)) as bar:
@@ -53,6 +58,8 @@ def evaluate(run: Run) -> Outcome:
             data = load(workspace, [view], "test", raytraced=True, base=settings.model.base).to(device)
             seconds, prediction = _timed_render(lambda data=data: render_views(model, data), device)
             assert data.tensors.target is not None  # loaded with raytraced=True
+            others = {name: render_views(other, data) for name, other in untrained.items()}
+            target = data.tensors.target.cpu()
             measured = image_metrics(prediction, data.tensors.target.cpu(), data.tensors.mask.cpu(), lpips)
             truth, predicted = picture_of(data.tensors.target[0]), picture_of(prediction[0])
             flip, heat = flip_error(truth, predicted)
@@ -70,11 +77,13 @@ def evaluate(run: Run) -> Outcome:
                 seconds_neural=seconds,
                 seconds_base=base.get("seconds"),
                 spp=traced.get("spp"),
+                **{f"psnr_{name}": _finite(float(psnr(picture, target))) for name, picture in others.items()},
             )
             rows.append(row)
             neural_seconds.append(seconds)
             files = {}
-            for kind, picture in (("truth", truth), ("prediction", predicted), ("flip", heat)):
+            shown = {"truth": truth, "prediction": predicted, "flip": heat}
+            for kind, picture in (shown | {name: picture_of(other[0]) for name, other in others.items()}).items():
                 write_png(workspace.evaluation / f"{view.name}.{kind}.png", picture)
                 files[kind] = f"evaluation/{view.name}.{kind}.png"
             console.events.send("picture", split="test", view=view.name, files=files, psnr=row.psnr)
@@ -102,9 +111,30 @@ def evaluate(run: Run) -> Outcome:
         f"held-out over {len(rows)} views: PSNR {_figure(mean['psnr'], '.2f', ' dB')}{ceiling}, "
         f"SSIM {_figure(mean['ssim'], '.4f')}, FLIP {_figure(mean['flip'], '.4f')}"
         + (f", LPIPS {mean['lpips_alex']:.4f} (alex)" if mean["lpips_alex"] is not None else ", no LPIPS weights")
+        + (f"; base image {mean['psnr_base']:.2f} dB" if mean["psnr_base"] is not None else "")
+        + (f", shipped corrector {mean['psnr_shipped']:.2f} dB" if mean["psnr_shipped"] is not None else "")
     )
     stable = [{k: v for k, v in row.data().items() if not k.startswith("seconds")} for row in rows]
     return Outcome(digest(stable), {"mean": mean, "views": len(rows), "perceptual": perceptual is not None})
+
+
+def _untrained(run: Run) -> dict[str, DNR]:
+    """What the trained renderer is shown beside: the base image, and the shipped corrector as far as traced training
+    views trust it. Empty where it corrects no baked light; without the second where that is the renderer."""
+    if run.settings.model.base != "baked":
+        return {}
+    from dnrtrain.shipped import corrector
+
+    base = corrector()
+    apply_share(base, 0.0)
+    names = read_selection(run.workspace).views[:VIEWS]
+    if not names:
+        return {"base": base}
+    shipped, candidates = corrector(), {view.name: view for view in split_views(run.workspace)["train"]}
+    best_share(
+        shipped, load(run.workspace, [candidates[name] for name in names], "train", raytraced=True, base="baked")
+    )
+    return {"base": base, "shipped": shipped}
 
 
 def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
@@ -144,6 +174,10 @@ def _mean(rows: list[ViewMetrics]) -> dict[str, float | None]:
             values = [value for row in rows if (value := getattr(row, name)) is not None]
             result[name] = float(np.mean(values)) if values else None
     return result
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
 
 
 def _figure(value: float | None, form: str, unit: str = "") -> str:

@@ -119,6 +119,7 @@ STAGES: dict[str, Stage] = {
             settings=lambda s: [s.model.model_dump(), s.finetune.model_dump(exclude={"preview_seconds"}), _neural(s)],
             make=finetune.finetune,
             progress=finetune.progress,
+            version=2,
         ),
         Stage(
             name="evaluate",
@@ -130,6 +131,7 @@ STAGES: dict[str, Stage] = {
             settings=lambda s: [_tracing(s, test=True), _light(s), _base(s)],
             make=evaluate.evaluate,
             progress=evaluate.progress,
+            version=2,
         ),
     )
 }

@@ -43,6 +43,8 @@ class ViewMetrics(Record, allow_inf_nan=False):
     seconds_neural: float | None = None
     seconds_base: float | None = None
     spp: int | None = None
+    psnr_base: float | None = None
+    psnr_shipped: float | None = None
 
 
 class Metrics(Record, allow_inf_nan=False):

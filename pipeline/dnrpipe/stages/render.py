@@ -6,7 +6,7 @@ import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,17 +17,24 @@ from dnrtrain.contract import View, write_cameras
 from ..core.errors import UserError
 from ..core.images import picture_of, write_png
 from ..core.scene_files import read_frame
-from ..core.workspace import digest
+from ..core.workspace import digest, file_sha256
 from .base_images import RENDERED, base_views
 from .pipeline import STAGES, require_inputs
 from .prepare import GEOMETRY_ENGINE, draw_passes
+from .select import require_baked
 from .stage import Run
 from .trainer import torch_device
+from .trust import measure_trust
+
+if TYPE_CHECKING:
+    from dnrtrain.model import DNR
 
 FPS = 24
 
 
-def render_novel(run: Run, views: Sequence[View], *, name: str, frames: str, movie: str) -> dict[str, Any]:
+def render_novel(
+    run: Run, views: Sequence[View], *, name: str, frames: str, movie: str, untrained: bool = False
+) -> dict[str, Any]:
     """Render the views into ``renders/<name>/``.
 
     G-buffers and frames that are there are kept when the cameras and the model are the same; a changed model redoes
@@ -36,19 +43,22 @@ def render_novel(run: Run, views: Sequence[View], *, name: str, frames: str, mov
     Args:
         run: of stage render.
         frames: png, exr or both. movie: mp4, webp or none.
+        untrained: by the shipped corrector, into ``renders/<name>-untrained/``.
 
     Raises UserError: no fine-tuned model, or cameras that no movie can hold.
     """
-    from dnrtrain.checkpoint import load_model
     from dnrtrain.dataset import load_views
     from dnrtrain.model import render_radiance, render_views
 
     workspace, settings = run.workspace, run.settings
-    require_inputs(STAGES["evaluate"], workspace, settings)  # what evaluate needs is what this needs
+    # What evaluate needs is what this needs; the shipped corrector needs the scene alone.
+    require_inputs(STAGES["select" if untrained else "evaluate"], workspace, settings)
     if movie != "none" and len({(view.width, view.height) for view in views}) > 1:
         raise UserError("render: the cameras have several image sizes, which no movie can hold; use --movie none")
+    name = f"{name}-untrained" if untrained else name
     folder = workspace.root / "renders" / name
-    model_fingerprint = workspace.manifest.stages["finetune"].output
+    device = torch_device(settings)
+    model, model_fingerprint = _renderer(run, device, untrained)
     fingerprint = digest([model_fingerprint, run.scene_fingerprint, [v.model_dump(mode="json") for v in views]])
     record = folder / "frames.json"
     if folder.exists() and (not record.exists() or record.read_text().strip() != f'"{fingerprint}"'):
@@ -58,8 +68,6 @@ def render_novel(run: Run, views: Sequence[View], *, name: str, frames: str, mov
     write_cameras(folder / "cameras.json", views, name)
     paths = _inputs(run, views, folder)
     kind = settings.model.base
-    device = torch_device(settings)
-    model = load_model(workspace.checkpoints("step2"), device)
     frame = read_frame(workspace)
     pictures: list[np.ndarray] = []
     seconds: list[float] = []
@@ -97,6 +105,20 @@ def render_novel(run: Run, views: Sequence[View], *, name: str, frames: str, mov
         "neural_ms": 1000 * float(np.median(seconds)),
         "movie": target and str(target),
     }
+
+
+def _renderer(run: Run, device: str, untrained: bool) -> tuple[DNR, str]:
+    """(the model, a hash of it)."""
+    from dnrtrain.checkpoint import load_model
+    from dnrtrain.shipped import WEIGHTS, corrector
+
+    if not untrained:
+        return load_model(run.workspace.checkpoints("step2"), device), run.workspace.manifest.stages["finetune"].output
+    require_baked(run.settings, "--untrained")
+    model = corrector()
+    trust = measure_trust(run, model)
+    run.console.say(trust.told)
+    return model.to(device), digest([file_sha256(WEIGHTS), trust.share])
 
 
 def write_frame_exr(path: Path, picture: np.ndarray, radiance: Any, data: Any, view: View) -> None:

@@ -33,7 +33,7 @@ def select_views(run: Run) -> Outcome:
     check_budget(settings.select.budget, len(views))
     draw_missing(run, needed_passes(settings))
     if settings.select.budget == 0:
-        _require_baked(settings)
+        require_baked(settings, "--budget 0")
         run.console.say("select: no views (--budget 0); the shipped corrector renders as it is")
         chosen = Selection(policy=settings.select.policy, budget=0, seed=settings.select.seed, views=[])
         made: list[object] = [[]]
@@ -55,11 +55,11 @@ def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
     return epochs_done(workspace.checkpoints("step1"), settings.select.step1.epochs, there)
 
 
-def _require_baked(settings: Settings) -> None:
-    """Raises UserError: without traced views only the shipped corrector can render, and it corrects baked light."""
+def require_baked(settings: Settings, option: str) -> None:
+    """Raises UserError: the shipped corrector corrects baked light. option: what asked for it."""
     if settings.model.base != "baked":
         raise UserError(
-            f"--budget 0 renders with the shipped corrector, which corrects baked light, and model.base ="
+            f"{option} renders with the shipped corrector, which corrects baked light, and model.base ="
             f" {settings.model.base}; type --set model.base=baked"
         )
 

@@ -21,6 +21,7 @@ from .stage import Run
 from .trainer import load
 
 if TYPE_CHECKING:
+    from dnrtrain.dataset import ViewSet
     from dnrtrain.model import DNR
 
 SPLIT = "trust"
@@ -57,25 +58,34 @@ def measure_trust(run: Run, model: DNR) -> Trust:
 
     ``model`` is left with that share.
     """
+    views = trust_views(run.workspace)
+    trace_views(run, views, SPLIT, spp=SPP)
+    base_views(run, views, SPLIT)
+    return best_share(model, load(run.workspace, views, SPLIT, raytraced=True, base=run.settings.model.base))
+
+
+def best_share(model: DNR, views: ViewSet) -> Trust:
+    """The share of the model's correction that is best on views with their references. ``model`` is left with it."""
     import torch
 
     from dnrtrain.metrics import psnr
     from dnrtrain.model import render_views
 
-    views = trust_views(run.workspace)
-    trace_views(run, views, SPLIT, spp=SPP)
-    base_views(run, views, SPLIT)
-    data = load(run.workspace, views, SPLIT, raytraced=True, base=run.settings.model.base)
-    target = data.tensors.target
+    target = views.tensors.target
     assert target is not None  # loaded with raytraced=True
 
     def quality(share: float) -> float:
-        model.settings = model.settings.model_copy(update={"trust": share})
-        pictures = zip(render_views(model, data), target, strict=True)
+        apply_share(model, share)
+        pictures = zip(render_views(model, views), target, strict=True)
         return sum(float(psnr(picture[None], truth[None])) for picture, truth in pictures) / len(views)
 
     with torch.inference_mode():
         found = {share: quality(share) for share in SHARES}
     share = max(found, key=lambda share: found[share])
-    model.settings = model.settings.model_copy(update={"trust": share})
+    apply_share(model, share)
     return Trust(share=share, psnr=(found[0.0], found[share]))
+
+
+def apply_share(model: DNR, share: float) -> None:
+    """Let the model apply so much of its correction."""
+    model.settings = model.settings.model_copy(update={"trust": share})
