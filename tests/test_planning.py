@@ -40,11 +40,12 @@ from dnrpipe.studies.planning.records import (
     Pilot,
     Plan,
     Prediction,
+    Route,
     Traced,
     TracePart,
     TrainingPart,
 )
-from dnrpipe.studies.planning.routes import as_reported, baseline_front, break_even, routes, seconds_for
+from dnrpipe.studies.planning.routes import UNTRAINED, as_reported, baseline_front, break_even, routes, seconds_for
 from dnrpipe.studies.planning.seconds import Costs, Work, noise_at, view_line
 
 PRIOR = load_prior()
@@ -310,16 +311,16 @@ def test_few_frames_are_not_worth_training_and_many_are() -> None:
     at = 30.0
     neural = cheapest_reaching(grid, at)
     assert one.pilot.frames is not None
-    few = routes(one.pilot.frames, neural, one.wall.light(), 1.0, at, 5)
+    few = routes(one.pilot.frames, neural, one.wall.light(), one.wall.untrained(), 1.0, at, 5)
     assert few[0].name == "path tracing + denoiser"
     dear = 33.0  # the rival needs 0.2 s a frame there
     at_dear = cheapest_reaching(grid, one.quality.base + 0.7 * one.quality.gain.most)
-    many = routes(one.pilot.frames, at_dear, one.wall.light(), 1.0, dear, 1_000_000)
+    many = routes(one.pilot.frames, at_dear, one.wall.light(), one.wall.untrained(), 1.0, dear, 1_000_000)
     assert many[0].name == "neural renderer"
     even = break_even(many)
     assert even is not None
     before, after = (
-        {r.name: r.total for r in routes(one.pilot.frames, at_dear, one.wall.light(), 1.0, dear, n)}
+        {r.name: r.total for r in routes(one.pilot.frames, at_dear, one.wall.light(), 0.0, 1.0, dear, n)}
         for n in (even - 1, even)
     )
     assert after["neural renderer"] <= after["path tracing + denoiser"]
@@ -331,8 +332,26 @@ def test_the_base_image_alone_is_enough_where_it_is_enough() -> None:
     assert one.pilot.frames is not None
     slow = [rung.model_copy(update={"ms": 10 * rung.ms}) for rung in one.pilot.frames.rival]
     part = one.pilot.frames.model_copy(update={"rival": slow})
-    found = routes(part, cheapest_reaching(grid_of_forty(), 27.0), 0.0, 1.0, 27.0, 10_000)
+    found = routes(part, cheapest_reaching(grid_of_forty(), 27.0), 0.0, 1.0, 1.0, 27.0, 10_000)
     assert found[0].name == "base image alone"
+
+
+def test_the_shipped_corrector_is_a_route_where_it_was_judged() -> None:
+    one = predictor()
+    assert one.pilot.frames is not None
+    shipped = FramePoint(name="shipped", ms=55, psnr=29.5)
+    part = one.pilot.frames.model_copy(update={"shipped": shipped})
+    neural = cheapest_reaching(grid_of_forty(), 29.0)
+    assert neural is not None
+
+    def found(frames: int) -> list[Route]:
+        return routes(part, neural, one.wall.light(), one.wall.untrained(), 1.0, 29.0, frames)
+
+    assert one.wall.light() < one.wall.untrained() < neural.seconds.total.expected
+    assert [r.psnr for r in found(1) if r.name == UNTRAINED] == [29.5]
+    even = break_even(found(1))
+    without = break_even(routes(one.pilot.frames, neural, one.wall.light(), 0.0, 1.0, 29.0, 1))
+    assert even is None or without is None or even <= without
 
 
 SMALL: dict[str, Any] = {
@@ -377,7 +396,7 @@ def test_a_scene_is_planned_and_the_plan_carried_out(
     assert record["chosen"] is None
     assert not (root / "plan" / "pilot").exists()
     names = {route["name"] for route in record["routes"]}
-    assert names == {"path tracing + denoiser", "base image alone", "neural renderer"}
+    assert names == {"path tracing + denoiser", "base image alone", UNTRAINED, "neural renderer"}
     stages = {json.loads(line)["stage"] for line in (root / "costs.jsonl").read_text().splitlines()}
     assert "plan" in stages
     stamp = (root / "plan" / "pilot.json").stat().st_mtime_ns

@@ -120,7 +120,7 @@ def whether_to_train(
     width, height = predictor.pilot.size
     scale = predictor.wall.work.pixels / (width * height)
     part = as_reported(predictor.pilot.frames, predictor.quality.reference)
-    found = routes(part, neural, predictor.wall.light(), scale, at, wanted.frames)
+    found = routes(part, neural, predictor.wall.light(), predictor.wall.untrained(), scale, at, wanted.frames)
     return found, at
 
 

@@ -45,7 +45,7 @@ from .pilot_worker import FramesTask, PilotCommon, TrainTask
 from .records import FOLDER, BasePart, FramePart, LightPart, LightPoint, Pilot, Traced, TracePart, TrainingPart
 from .seconds import trained_pixels
 
-VERSION = 6
+VERSION = 7
 RESOLUTION = 128
 VIEWS, SPP = 6, 16
 HELD_OUT, REFERENCE_SPP = 6, 64
@@ -213,8 +213,13 @@ class Piloting:
         )
 
     def training(self) -> TrainingPart:
-        view, per_epoch = self.train[0], math.ceil(len(self.train) / self.settings.finetune.step2.batch)
-        task = TrainTask(
+        result = self._ask("pilot: training", self._train_task(), {})
+        pixels = trained_pixels(self.settings, self.train[0].width, self.train[0].height)
+        return TrainingPart(views=len(self.train), spp=SPP, pixels=pixels, **result)
+
+    def _train_task(self) -> TrainTask:
+        per_epoch = math.ceil(len(self.train) / self.settings.finetune.step2.batch)
+        return TrainTask(
             views=self.train,
             base_files=[self._base_file("train", view) for view in self.train],
             images=[self._image(f"train-{view.name}") for view in self.train],
@@ -222,13 +227,11 @@ class Piloting:
             epochs=[max(2, round(steps / per_epoch)) for steps in STEPS],
             fingerprint=self.run.id,
         )
-        result = self._ask("pilot: training", task, {})
-        pixels = trained_pixels(self.settings, view.width, view.height)
-        return TrainingPart(views=len(self.train), spp=SPP, pixels=pixels, **result)
 
     def frames(self) -> FramePart:
         task = FramesTask(
             views=self.held_out,
+            train=self._train_task(),
             folders=self._models(),
             light=self._light(),
             samples=list(SAMPLE_COUNTS),

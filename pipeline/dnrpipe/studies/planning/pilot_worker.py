@@ -21,10 +21,14 @@ from ...core.scene_files import read_frame
 from ...core.settings import Settings
 from ...core.workspace import Workspace
 from ...stages.trainer import perceptual_weights, torch_device
+from ...stages.trust import best_share
 from ..cells.cell import finished_record
 from .records import Record
 
 if TYPE_CHECKING:
+    from dnrtrain.dataset import ViewSet
+    from dnrtrain.model import DNR
+
     from ..frames.scene import BenchScene
 
 WARM = 2
@@ -64,12 +68,13 @@ class FramesTask(Record):
 
     The answer holds fields of `records.FramePart`, and "unknown": pixels that no reference knows.
 
-    folders: of the models. light: file of the baked light, None where there is none. samples, methods: of the
-    baselines.
+    train: views with references, which say how far the shipped corrector is trusted. folders: of the models. light:
+    file of the baked light, None where there is none. samples, methods: of the baselines.
     """
 
     kind: Literal["frames"] = "frames"
     views: list[View]
+    train: TrainTask
     folders: list[Path]
     light: Path | None
     samples: list[int]
@@ -100,7 +105,6 @@ class Worker:
         return found[-1] | {"steps": [one["steps"] for one in found], "threads": self.threads}
 
     def _train_one(self, task: TrainTask, weights: Any, folder: Path, epochs: int) -> dict[str, Any]:
-        from dnrtrain.dataset import load_views
         from dnrtrain.events import EpochEnd
         from dnrtrain.step2 import run_step2
 
@@ -108,17 +112,8 @@ class Worker:
         step2 = self.settings.finetune.step2.model_copy(
             update={"epochs": epochs, "start": "fresh", "validation_views": 0}
         )
-        views = load_views(
-            task.base_files,  # base images bring their G-buffer along
-            task.images,
-            read_frame(self.workspace),
-            cameras=task.views,
-            folder=self.workspace.scene,
-            base=self.settings.model.base,
-            base_files=task.base_files,
-        )
         events = run_step2(
-            views,
+            self._views(task),
             None,
             folder,
             self.settings.model,
@@ -151,6 +146,29 @@ class Worker:
             "steps": sum(entry.steps for entry in history),
         }
 
+    def _views(self, task: TrainTask) -> ViewSet:
+        from dnrtrain.dataset import load_views
+
+        return load_views(
+            task.base_files,  # base images bring their G-buffer along
+            task.images,
+            read_frame(self.workspace),
+            cameras=task.views,
+            folder=self.workspace.scene,
+            base=self.settings.model.base,
+            base_files=task.base_files,
+        )
+
+    def _shipped(self, task: TrainTask) -> DNR | None:
+        """The shipped corrector, as far as the training views trust it; None where it corrects no such base image."""
+        from dnrtrain.shipped import corrector
+
+        if self.settings.model.base != "baked":
+            return None
+        model = corrector()
+        best_share(model, self._views(task))
+        return model
+
     def _frames(self, task: FramesTask) -> dict[str, Any]:
         from dnrtrain.checkpoint import load_model
 
@@ -162,6 +180,8 @@ class Worker:
         scene = open_scene(self.workspace.root, views, self.threads, self.settings)
         ours = Ours(scene, (), task.folders[-1], task.light)
         models = [load_model(folder) for folder in task.folders]
+        shipped = self._shipped(task.train)
+        models += [] if shipped is None else [shipped]
         truth = [_references(scene, view, number) for number, view in enumerate(views)]
         clock = Clock("cpu", self.threads)
         for _ in range(WARM):
@@ -176,7 +196,7 @@ class Worker:
                 for name, frame in frames.items():
                     if name.startswith(NEURAL):
                         row.add(frame["picture"], truth[number], frame["parts"])
-                    elif row is neural[-1]:
+                    elif row is neural[0]:
                         base.add(frame["picture"], truth[number], frame["parts"])
         rival = []
         for baseline in baselines.values():
@@ -187,7 +207,8 @@ class Worker:
             rival.append({"name": baseline.name, **row.summary()})
         return {
             "base": {"name": BASE, **base.summary()},
-            "neural": [{"name": NEURAL, **row.summary()} for row in neural],
+            "neural": [{"name": NEURAL, **row.summary()} for row in neural[: len(task.folders)]],
+            "shipped": None if shipped is None else {"name": "shipped", **neural[-1].summary()},
             "rival": rival,
             "deviation": float(np.std(base.psnr, ddof=1)) if len(views) > 1 else 0.0,
             "unknown": sum(int((~known).sum()) for _, _, known in truth),

@@ -105,10 +105,12 @@ class FramePart(Record):
     """Frames of the pilot's held-out views.
 
     neural: a point per training. rival: path tracing with a denoiser, the baselines. deviation: of the base image's
-    PSNR over these views, dB.
+    PSNR over these views, dB. shipped: the shipped corrector, as far as it is trusted; None where it corrects no such
+    base image.
     """
 
     base: FramePoint
+    shipped: FramePoint | None = None
     neural: list[FramePoint]
     rival: list[FramePoint]
     views: int

@@ -1,5 +1,5 @@
 """Whether to train at all: for N frames at a wanted PSNR, the cheapest of path tracing with a denoiser, the base image
-alone, and the neural renderer.
+alone, the shipped corrector without training, and the neural renderer.
 
     total(N) = upfront + N * frame
     N*       = upfront of the neural renderer / (frame of path tracing - frame of the neural renderer), at equal PSNR
@@ -18,6 +18,7 @@ from ..frames.pareto_front import crossover, frontier
 from .quality import with_noise
 from .records import FramePart, FramePoint, Prediction, Route
 
+UNTRAINED = "neural renderer, untrained"
 FURTHEST = 64.0
 """How many times the last baseline's time the slope is followed beyond it."""
 
@@ -48,7 +49,8 @@ def as_reported(part: FramePart, reference: float) -> FramePart:
     def shown(point: FramePoint) -> FramePoint:
         return point.model_copy(update={"psnr": with_noise(point.psnr, reference)})
 
-    changed = {"neural": list(map(shown, part.neural)), "rival": list(map(shown, part.rival))}
+    shipped = None if part.shipped is None else shown(part.shipped)
+    changed = {"shipped": shipped, "neural": list(map(shown, part.neural)), "rival": list(map(shown, part.rival))}
     return part.model_copy(update={"base": shown(part.base), **changed})
 
 
@@ -56,6 +58,7 @@ def routes(
     part: FramePart,
     neural: Prediction | None,
     light_seconds: float,
+    untrained_seconds: float,
     scale: float,
     psnr: float,
     frames: int,
@@ -64,6 +67,7 @@ def routes(
 
     Args:
         neural: the cheapest choice that reaches ``psnr``, None where none does.
+        light_seconds, untrained_seconds: before the first frame of the base image alone and of the shipped corrector.
         scale: pixels of a frame over the pilot's.
     """
 
@@ -85,6 +89,9 @@ def routes(
         add("path tracing + denoiser", what, 0.0, seconds * scale, psnr, True)
     base, alone = part.base.psnr, part.base.ms / 1000 * scale
     add("base image alone", "baked light, no network", light_seconds, alone, base, base >= psnr)
+    if part.shipped is not None:
+        quality, frame = part.shipped.psnr, part.shipped.ms / 1000 * scale
+        add(UNTRAINED, "baked light, shipped corrector", untrained_seconds, frame, quality, quality >= psnr)
     frame = part.neural[-1].ms / 1000 * scale
     if neural is None:
         add("neural renderer", "no choice is expected to reach it", 0.0, frame, None, False)
@@ -96,12 +103,12 @@ def routes(
 
 
 def break_even(found: Sequence[Route]) -> int | None:
-    """Frames from which on the neural renderer is cheaper than path tracing; None where it never is."""
+    """Frames from which on the neural renderer, trained or not, is cheaper than path tracing; None: it never is."""
     by_name = {route.name: route for route in found}
-    neural, traced = by_name["neural renderer"], by_name["path tracing + denoiser"]
-    if not (neural.reaches and traced.reaches):
-        return None
-    return break_even_frames(neural.upfront, traced.frame, neural.frame)
+    traced = by_name["path tracing + denoiser"]
+    ours = [by_name[name] for name in (UNTRAINED, "neural renderer") if name in by_name and by_name[name].reaches]
+    even = [break_even_frames(route.upfront, traced.frame, route.frame) for route in ours if traced.reaches]
+    return min((frames for frames in even if frames is not None), default=None)
 
 
 def _between(line: Sequence[tuple[str, float, float]], seconds: float) -> str:

@@ -18,6 +18,7 @@ import numpy as np
 
 from ...core.errors import UserError
 from ...core.settings import Settings
+from ...stages import trust
 from .records import Clock, Pilot, TracePart
 
 TIME_SPREAD = 1.4
@@ -106,6 +107,12 @@ class Costs:
         """Tracing, baked light and base images of the training views."""
         return self._traced(views, spp) + self.light() + self._base(views)
 
+    def untrained(self) -> float:
+        """Baked light, and the small traced views that say how far the shipped corrector is trusted."""
+        assert self.pilot.base is not None
+        pixels = min(self.work.pixels, trust.SIDE**2)
+        return self.light() + self._traced(trust.VIEWS, trust.SPP, pixels) + self._start(self.pilot.base.startup)
+
     def finetune(self, steps: int, epochs: int) -> float:
         part = self.pilot.training
         assert part is not None
@@ -128,10 +135,10 @@ class Costs:
         slope = getattr(part.bake, self.clock) / (part.bake.size**2 * part.bake.spp)
         return self._start(part.startup) + slope * size**2 * spp
 
-    def _traced(self, views: int, spp: int) -> float:
+    def _traced(self, views: int, spp: int, pixels: int | None = None) -> float:
         part = self.pilot.trace
         assert part is not None
-        each = view_line(part, self.clock).at(spp, self.work.pixels)
+        each = view_line(part, self.clock).at(spp, pixels or self.work.pixels)
         side_by_side = min(part.workers, views) if self.clock == "seconds" else 1
         return self._start(part.startup) + math.ceil(views / side_by_side) * each
 
