@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from dnrpipe.core.cameras import scaled_to
+from dnrpipe.core.cameras import scaled_to, spread
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.scene_files import read_json, split_views
 from dnrpipe.core.workspace import Workspace
@@ -69,7 +69,7 @@ def bench(root: Path, options: Options, tell: Callable[[str], None]) -> dict[str
     config = trace_config(workspace, plan, variant_for(plan, settings).variant)
     worker = Worker({"bundle": config["bundle"], "variant": config["variant"], "threads": 1})
     every = split_views(workspace)["test"]
-    chosen = [every[(2 * i + 1) * len(every) // (2 * options.views)] for i in range(options.views)]
+    chosen = spread(every, options.views)
     runs: list[dict[str, Any]] = []
     for view in (scaled_to(view, options.resolution) for view in chosen):
         common = {

@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from dnrpipe.core.cameras import spread
 from dnrpipe.core.console import Console
 from dnrpipe.core.scene_files import read_frame, read_summary
 from dnrpipe.core.settings import resolve
@@ -80,7 +81,7 @@ def make(seed: int, folder: Path, scratch: Path) -> None:
     settings = resolve("draft", {"cameras": cameras, "passes": {"workers": 1}}, environment={})
     _, by_split = scene_and_views(Run(workspace, settings, Console(quiet=True)))
     path = by_split["train"]  # all frames of the animation
-    chosen = [path[(2 * i + 1) * len(path) // (2 * views)] for i in range(min(views, len(path)))]
+    chosen = spread(path, views)
     took("convert")
     maps, noise = _look(workspace, chosen, rays, seed, took)
     frame = read_frame(workspace)

@@ -12,6 +12,7 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,6 +21,8 @@ from dnrtrain.contract import SPLITS, ContractError, View, file_name, parse_tran
 from .errors import UserError
 from .scene_records import Lens, SceneCamera, SceneSummary
 from .settings import CameraSettings
+
+T = TypeVar("T")
 
 KEYWORDS = ("auto", "dome", "sphere", "inside", "scene", "animation")
 ENCLOSED = 0.75
@@ -197,15 +200,21 @@ def split_views(views: Sequence[View], settings: CameraSettings) -> dict[str, li
     count = len(views)
     test = min(settings.test, count // 5)
     val = min(settings.val, count // 5)
-    chosen_test = _spread(range(count), test)
+    chosen_test = set(spread(range(count), test))
     rest = [i for i in range(count) if i not in chosen_test]
-    chosen_val = _spread(rest, val)
+    chosen_val = set(spread(rest, val))
     train = [i for i in rest if i not in chosen_val]
     return {
         "train": [views[i] for i in train],
         "val": [views[i] for i in sorted(chosen_val)],
         "test": [views[i] for i in sorted(chosen_test)],
     }
+
+
+def spread(items: Sequence[T], count: int) -> list[T]:
+    """``count`` of the items, or all where there are fewer, evenly spread, in their order."""
+    count = min(count, len(items))
+    return [items[(2 * i + 1) * len(items) // (2 * count)] for i in range(count)]
 
 
 def scaled_to(view: View, side: int) -> View:
@@ -287,10 +296,3 @@ def _scene_view(camera: SceneCamera, settings: CameraSettings) -> View:
         cy=height / 2 + camera.shift_y * side,
         c2w=camera.c2w,
     )
-
-
-def _spread(items: Sequence[int], count: int) -> set[int]:
-    if count == 0:
-        return set()
-    positions = (np.arange(count) + 0.5) * len(items) / count
-    return {items[int(p)] for p in positions}

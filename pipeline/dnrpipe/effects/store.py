@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import read_cameras
 
-from ..core.cameras import scaled_to, view_lenses
+from ..core.cameras import scaled_to, spread, view_lenses
 from ..core.effect_names import EffectName
 from ..core.errors import UserError
 from ..core.scene_files import read_census, read_json, read_summary, scene_fingerprint
@@ -110,8 +110,7 @@ def pilot_views(workspace: Workspace, settings: Settings, plan: EffectPlan) -> l
     if not path.exists():
         raise UserError(f"{workspace.root}: no views yet; run `dnrpipe prepare` first")
     views = read_cameras(path)
-    count = min(PILOT_VIEWS, len(views))
-    chosen = [views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)]
+    chosen = spread(views, PILOT_VIEWS)
     known = lenses(workspace, settings) if plan.on("depth-of-field") else {}
     return [
         {"view": scaled_to(view, PILOT_RESOLUTION).model_dump(mode="json"), "lens": known.get(view.name)}

@@ -12,7 +12,7 @@ from pydantic import BaseModel
 
 from dnrtrain.contract import View
 
-from ..core.cameras import scaled_to
+from ..core.cameras import scaled_to, spread
 from ..core.scene_files import split_views
 from ..core.workspace import Workspace
 from .base_images import base_views
@@ -48,9 +48,7 @@ class Trust(BaseModel, frozen=True):
 
 def trust_views(workspace: Workspace) -> list[View]:
     """Candidates spread over all, as small pictures."""
-    candidates = split_views(workspace)["train"]
-    count = min(VIEWS, len(candidates))
-    return [scaled_to(candidates[(2 * i + 1) * len(candidates) // (2 * count)], SIDE) for i in range(count)]
+    return [scaled_to(view, SIDE) for view in spread(split_views(workspace)["train"], VIEWS)]
 
 
 def measure_trust(run: Run, model: DNR) -> Trust:
