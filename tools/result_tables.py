@@ -3,7 +3,8 @@
 A part stands between ``<!-- rows -->`` or ``<!-- KIND FILE -->``, FILE in docs/, and ``<!-- end -->``.
 Kinds: results (of `dnrpipe ablate`), frames (of tools.bench_frames), noise (of tools.bench_noise),
 frontier (of `dnrpipe frontier`), plan-check (of tools.plan_check), selection (of `dnrpipe bench-select`),
-selections (of several of its runs together: FILE,FILE), plan-equal (of tools.plan_equal).
+selections (of several of its runs together: FILE,FILE), plan-equal (of tools.plan_equal),
+untrained (of tools.bench_untrained).
 
 python -m tools.result_tables [--check] docs/ablation.md docs/*.md
 """
@@ -17,6 +18,7 @@ from pathlib import Path
 
 from tools.bench_frames.document import markdown as frames_markdown
 from tools.bench_noise.document import markdown as noise_markdown
+from tools.bench_untrained import markdown as untrained_markdown
 from tools.plan_check import markdown as check_markdown
 from tools.plan_equal import markdown as equal_markdown
 
@@ -28,7 +30,7 @@ from dnrpipe.studies.selectbench.bench_tables import markdown as selection_markd
 from dnrpipe.studies.selectbench.bench_tables import read_results as selection_results
 from dnrpipe.studies.selectbench.bench_tables import together as selections_markdown
 
-KINDS = "rows|results|frames|noise|frontier|plan-check|plan-equal|selections?"
+KINDS = "rows|results|frames|noise|frontier|plan-check|plan-equal|selections?|untrained"
 PART = re.compile(rf"(<!-- ({KINDS})(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -51,6 +53,8 @@ def generate(text: str, folder: Path) -> str:
             body = markdown(read_results(folder / match[3])).rstrip()
         elif match[2] == "noise":
             body = noise_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
+        elif match[2] == "untrained":
+            body = untrained_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
         elif match[2] == "frontier":
             body = lowered(frontier_markdown(read_frontier(folder / match[3])))
         elif match[2] == "selection":
