@@ -10,8 +10,8 @@ Variants, at the draft preset with 8 test views of 256 samples:
     25 views    the preset: 25 views, 1000 steps on from the shipped corrector
     fresh       25 views, 1000 steps of a fresh network with guides in world space: the default before
 
-Seconds are wall time of the commands from `prepare` to the first frame. Light is baked once, by `untrained`, and counted
-in all; so is the path depth pilot.
+Seconds are wall time of the commands from `prepare` to the first frame. Light is baked once, by `untrained`, and
+counted in all; so is the path depth pilot.
 """
 
 from __future__ import annotations
@@ -116,6 +116,7 @@ def markdown(results: dict[str, Any]) -> str:
 def interval(differences: dict[str, float]) -> str:
     """Mean over scenes and its 95% interval (Student)."""
     found = summarise({(scene, 0): value for scene, value in differences.items()})
+    assert found is not None
     if found.half is None:
         return f"{found.mean:+.2f}"
     return f"{found.mean:+.2f} [{found.mean - found.half:+.2f}, {found.mean + found.half:+.2f}]"

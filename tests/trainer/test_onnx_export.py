@@ -32,7 +32,15 @@ KINDS: dict[str, dict[str, Any]] = {
     "mlp": {"modalities": "uv", "network": "mlp", "base": "raster", "guides": True},
     "raster in display space": {"modalities": "uv", "base": "raster", "filter": 3},
     "default": {"modalities": "uv", "base": "baked", "guides": True, "filter": 3, "stride": 2, "output": "log"},
-    "corrector": {"base": "baked", "guides": "camera", "aggregator": "none", "filter": 3, "stride": 2, "output": "log"},
+    "corrector": {
+        "base": "baked",
+        "guides": "camera",
+        "aggregator": "none",
+        "filter": 3,
+        "stride": 2,
+        "output": "log",
+        "trust": 0.6,
+    },
     "chain": {"modalities": "uv", "base": "direct", "guides": True, "chain": True, "output": "log"},
 }
 

@@ -88,8 +88,8 @@ def train(
     """Train the page's network in `folder`, or resume an interrupted training; float32 for inference."""
     # Draft's sizes (milliseconds count), the scene's texture size, and a base image without specular part.
     draft, size = PRESETS["draft"], min(settings.model.texture_size, 256)
-    model = ModelSettings.model_validate({**draft["model"], "base": "raster", "texture_size": size})
-    step2 = Step2Settings.model_validate({**draft["finetune"]["step2"], "patch": 192})
+    model = ModelSettings.model_validate({**draft["model"], "base": "raster", "guides": True, "texture_size": size})
+    step2 = Step2Settings.model_validate({**draft["finetune"]["step2"], "start": "fresh", "patch": 192})
     step2 = step2.model_copy(update={"epochs": epochs or max(step2.epochs, -(-STEPS // len(views)))})
     data = web_views(workspace, views, "train", maps)
     weights = perceptual_weights(console)
