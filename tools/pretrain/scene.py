@@ -43,7 +43,7 @@ SIZES = ((96, 7), (128, 4), (192, 2))
 """(pixels a side, views), one of them drawn for a scene."""
 LIGHT_MAPS = ((256, 32), (512, 16))
 """(texels a side, paths per texel), one of them drawn for a scene."""
-REFERENCE_SPP = 32
+REFERENCE_SPP = 64
 MOST = 60000.0
 """Largest radiance that is kept: half floats end at 65504."""
 Took = Callable[[str], None]
