@@ -44,7 +44,8 @@ def differences(a: Settings, b: Settings) -> set[str]:
 def test_classic_rows_do_not_depend_on_our_model(row: Any, preset: str) -> None:
     """Whatever the preset's own model is, vanilla and the paper stay what they are."""
     base = resolve(preset, {}, environment={})
-    ours = {"model": {"width": 40, "aggregator": "residual"}, "finetune": {"step2": {"epochs": 7, "photometric": "l1"}}}
+    step2 = {"epochs": 7, "photometric": "l1", "start": "fresh"}
+    ours = {"model": {"width": 40, "aggregator": "residual"}, "finetune": {"step2": step2}}
     changed = resolve(preset, ours, environment={})
     assert settings_of(row, base, {}).model == settings_of(row, changed, {}).model
     assert settings_of(row, base, {}).finetune == settings_of(row, changed, {}).finetune

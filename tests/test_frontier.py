@@ -165,7 +165,7 @@ def test_a_scene_is_swept_and_measured_once(
         "raytrace = {spp = 8, evaluation_spp = 16, max_depth = 3}\n"
         "base = {light_size = 32, light_spp = 4, samples = 1}\n"
         "model = {texture_size = 32, width = 8, depth = 2}\n"
-        "finetune = {step2 = {epochs = 2}}\n"
+        'finetune = {step2 = {epochs = 2, start = "fresh"}}\n'
     )
     arguments = [
         "--budgets",

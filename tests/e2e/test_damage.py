@@ -58,7 +58,7 @@ def test_verify_finds_everything_and_repair_clears_the_way(copy: Path) -> None:
     whole = run("verify", "--json", folder=copy)
     assert json.loads(whole.stdout)["faults"] == []
     damaged = [
-        _flip(sorted((copy / "passes" / "test").glob("*.exr"))[0]),
+        _flip(sorted((copy / "passes" / "val").glob("*.exr"))[0]),
         _flip(sorted((copy / "raytraced" / "test").glob("*.exr"))[0]),
         _flip(copy / "checkpoints" / "step2" / "model.safetensors"),
         _cut(copy / "base" / "light.npz"),

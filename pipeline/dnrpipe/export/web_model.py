@@ -48,7 +48,7 @@ CHANNELS = {"uv": 2, "mask": 1, "coverage": 1, "view_dir": 3, "normal": 3, "base
 
 def web_views(workspace: Workspace, views: Sequence[View], split: str, maps: SurfaceMaps) -> ViewSet:
     """The views with the base image that the page would draw, and ray-traced targets."""
-    loaded = load(workspace, list(views), split, raytraced=True)
+    loaded = load(workspace, list(views), split, raytraced=True, base="baked")
     base = base_images(loaded.tensors, maps)
     display = DisplayTransform(read_frame(workspace), workspace.scene)
     return replace(loaded, tensors=replace(loaded.tensors, base=base, display=display))

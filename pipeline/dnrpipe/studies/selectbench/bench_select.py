@@ -40,6 +40,7 @@ SHARED_COARSE = "farthest"
 SMOKE: dict[str, Any] = {
     "cameras": {"train": 10},
     "model": {"base": "none", "chain": False, "filter": 0, "output": "display", "guides": False},
+    "finetune": {"step2": {"start": "fresh"}},
 }
 SMOKE_REQUEST = {"pools": "dome,path", "budgets": "2,4", "policies": "random,farthest,kmedoids"}
 CORE = {"pools": "all", "budgets": "10,25", "policies": "core"}
