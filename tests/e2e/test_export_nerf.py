@@ -30,6 +30,20 @@ def _frames(folder: Path, split: str) -> tuple[dict, list[dict]]:
     return data, data["frames"]
 
 
+def _surface(workspace: Path, split: str, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels that show a surface, and where that is in the world, [4, P]: by the passes, else by the base image."""
+    passes = workspace / "passes" / split / f"{name}.exr"
+    surface, _ = read_exr(passes if passes.exists() else workspace / "base" / split / f"{name}.exr")
+    row, column = np.nonzero(surface["mask"] > 0.5)
+    if passes.exists():
+        points = np.stack([surface[f"position.{c}"][row, column] for c in "XYZ"])
+    else:
+        view = next(v for v in read_cameras(workspace / "cameras" / f"{split}.json") if v.name == name)
+        rays = view.ray_directions()[row, column].T
+        points = view.position[:, None] + rays * surface["depth.Z"][row, column] / -(view.matrix[:3, 2] @ rays)
+    return row, column, np.concatenate([points, np.ones((1, len(row)))])
+
+
 @pytest.mark.parametrize("split", ["train", "test"])
 def test_points_of_the_surface_fall_on_their_pixels(tiny: Path, exported: Path, split: str) -> None:
     """As NeRF-Synthetic's readers do it: focal length from camera_angle_x, centre of the picture, OpenGL's axes."""
@@ -42,11 +56,7 @@ def test_points_of_the_surface_fall_on_their_pixels(tiny: Path, exported: Path, 
         height, width = picture.shape[:2]
         assert picture.shape[2] == 4
         focal = 0.5 * width / math.tan(0.5 * data["camera_angle_x"])
-        if split == "test":  # its passes are not drawn: nothing reads them
-            continue
-        surface, _ = read_exr(tiny / "passes" / split / f"{Path(frame['file_path']).name}.exr")
-        row, column = np.nonzero(surface["mask"] > 0.5)
-        world = np.stack([surface[f"position.{c}"][row, column] for c in "XYZ"] + [np.ones(len(row))])
+        row, column, world = _surface(tiny, split, Path(frame["file_path"]).name)
         x, y, z, _ = np.linalg.inv(np.array(frame["transform_matrix"])) @ world
         assert (z < 0).all()
         assert np.abs(focal * x / -z + width / 2 - (column + 0.5)).max() < 0.01
