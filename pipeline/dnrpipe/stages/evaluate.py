@@ -22,7 +22,7 @@ from .raytrace import trace_views
 from .records import METRICS, Metrics, ViewMetrics
 from .stage import Outcome, Run
 from .trainer import load, perceptual_weights, torch_device
-from .trust import VIEWS, apply_share, best_share
+from .trust import VIEWS, best_share
 
 if TYPE_CHECKING:
     from dnrtrain.model import DNR
@@ -36,7 +36,7 @@ def evaluate(run: Run) -> Outcome:
 
     from dnrtrain.checkpoint import load_model
     from dnrtrain.metrics import image_metrics, psnr
-    from dnrtrain.model import render_views
+    from dnrtrain.model import base_picture, render_views
     from dnrtrain.perceptual import build_lpips
 
     workspace, settings, console = run.workspace, run.settings, run.console
@@ -50,7 +50,7 @@ def evaluate(run: Run) -> Outcome:
     perceptual = perceptual_weights(console)
     lpips = build_lpips(perceptual) if perceptual else None
     rendered = settings.model.base in RENDERED
-    untrained = {name: other.to(device) for name, other in _untrained(run).items()}
+    shipped = _shipped(run, device)
     rows: list[ViewMetrics] = []
     neural_seconds: list[float] = []
     with console.bar("test views", len(views)) as bar:
@@ -58,7 +58,11 @@ def evaluate(run: Run) -> Outcome:
             data = load(workspace, [view], "test", raytraced=True, base=settings.model.base).to(device)
             seconds, prediction = _timed_render(lambda data=data: render_views(model, data), device)
             assert data.tensors.target is not None  # loaded with raytraced=True
-            others = {name: render_views(other, data) for name, other in untrained.items()}
+            others = {}  # what the trained renderer is shown beside
+            if settings.model.base == "baked":
+                others["base"] = base_picture(data.batch([0])).clamp(0, 1).cpu()
+            if shipped is not None:
+                others["shipped"] = render_views(shipped, data)
             target = data.tensors.target.cpu()
             measured = image_metrics(prediction, data.tensors.target.cpu(), data.tensors.mask.cpu(), lpips)
             truth, predicted = picture_of(data.tensors.target[0]), picture_of(prediction[0])
@@ -118,23 +122,18 @@ def evaluate(run: Run) -> Outcome:
     return Outcome(digest(stable), {"mean": mean, "views": len(rows), "perceptual": perceptual is not None})
 
 
-def _untrained(run: Run) -> dict[str, DNR]:
-    """What the trained renderer is shown beside: the base image, and the shipped corrector as far as traced training
-    views trust it. Empty where it corrects no baked light; without the second where that is the renderer."""
-    if run.settings.model.base != "baked":
-        return {}
+def _shipped(run: Run, device: str) -> DNR | None:
+    """The shipped corrector as far as traced training views trust it; None where it corrects no baked light, or where
+    no view was traced: then it is the renderer itself."""
     from dnrtrain.shipped import corrector
 
-    base = corrector()
-    apply_share(base, 0.0)
     names = read_selection(run.workspace).views[:VIEWS]
-    if not names:
-        return {"base": base}
-    shipped, candidates = corrector(), {view.name: view for view in split_views(run.workspace)["train"]}
-    best_share(
-        shipped, load(run.workspace, [candidates[name] for name in names], "train", raytraced=True, base="baked")
-    )
-    return {"base": base, "shipped": shipped}
+    if run.settings.model.base != "baked" or not names:
+        return None
+    model = corrector()
+    traced = [view for view in split_views(run.workspace)["train"] if view.name in names]
+    best_share(model, load(run.workspace, traced, "train", raytraced=True, base="baked"))
+    return model.to(device)
 
 
 def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:

@@ -72,18 +72,16 @@ def best_share(model: DNR, views: ViewSet) -> Trust:
     target = views.tensors.target
     assert target is not None  # loaded with raytraced=True
 
+    def apply(share: float) -> None:
+        model.settings = model.settings.model_copy(update={"trust": share})
+
     def quality(share: float) -> float:
-        apply_share(model, share)
+        apply(share)
         pictures = zip(render_views(model, views), target, strict=True)
         return sum(float(psnr(picture[None], truth[None])) for picture, truth in pictures) / len(views)
 
     with torch.inference_mode():
         found = {share: quality(share) for share in SHARES}
     share = max(found, key=lambda share: found[share])
-    apply_share(model, share)
+    apply(share)
     return Trust(share=share, psnr=(found[0.0], found[share]))
-
-
-def apply_share(model: DNR, share: float) -> None:
-    """Let the model apply so much of its correction."""
-    model.settings = model.settings.model_copy(update={"trust": share})
