@@ -36,7 +36,7 @@ class Finishes:
             "thing": {
                 self.plastic: 3.0,
                 self.matte: 2.5,
-                self.printed: 4.0,
+                self.printed: 7.0,
                 self.metal: 2.2,
                 self.worn: 1.0,
                 self.brushed: 1.0,
@@ -55,7 +55,7 @@ class Finishes:
             "wall": {self.printed: 3.0, self.paint: 4.0, self.grainy: 0.3},
             "ceiling": {self.paint: 5.0, self.printed: 1.0},
             "wood": {self.timber: 3.0, self.paint: 1.0, self.plastic: 0.5},
-            "cloth": {self.cloth: 3.0, self.velvet: 1.0, self.matte: 0.5},
+            "cloth": {self.cloth: 2.0, self.printed: 3.0, self.velvet: 1.0, self.matte: 0.5},
             "metal": {self.metal: 3.0, self.brushed: 1.0, self.worn: 0.5},
             "glass": {self.glass: 3.0, self.tinted_glass: 2.0, self.frosted_glass: 0.7},
             "ceramic": {self.plastic: 2.0, self.printed: 2.0, self.coated: 1.0, self.matte: 1.0},

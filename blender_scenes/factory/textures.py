@@ -167,6 +167,42 @@ def painting(dice: Dice) -> Picture:
     return image, height
 
 
+def ornament(dice: Dice) -> Picture:
+    """Carpets, rosettes and prints: bands of strong colours with bent edges, and a lattice of motifs on them.
+
+    Fine and sharp, so that some of it is smaller than a pixel.
+    """
+    u, v = texel_grid(SIZE, SIZE)
+    palette = np.array([dice.shown() for _ in range(dice.whole(3, 6))])
+    if dice.chance(0.5):  # round a centre
+        x, y = 2 * np.hypot(u - 0.5, v - 0.5), np.arctan2(v - 0.5, u - 0.5) / (2 * np.pi) * dice.whole(1, 4)
+    else:
+        x, y = u, v
+    bands, waves = dice.whole(5, 28), dice.whole(4, 24)
+    wave = dice.pick([np.abs((y * waves) % 1 - 0.5), 0.25 + 0.25 * np.sin(2 * np.pi * waves * y), np.zeros_like(y)])
+    along = x * bands + dice.uniform(0, 2) * wave
+    colour = palette[dice.rng.integers(0, len(palette), 64)[np.floor(along).astype(int) % 64]]
+    if dice.chance(0.6):
+        count = dice.whole(4, 20)
+        across, down = np.abs((u * count) % 1 - 0.5), np.abs((v * count) % 1 - 0.5)
+        far = dice.pick([across + down, np.hypot(across, down), np.maximum(across, down)])
+        colour = mix(colour, palette[0], (far < dice.uniform(0.15, 0.4)) * 1.0)
+        colour = mix(colour, palette[1], (far < dice.uniform(0.05, 0.15)) * 1.0)
+    return colour, colour.mean(axis=-1) * 0.3
+
+
+def mosaic(dice: Dice) -> Picture:
+    """Small squares of few colours: mosaic, knitting, pebbles, flower beds from far."""
+    count = dice.pick([16, 32, 64, 128])
+    base = dice.shown()
+    palette = np.array([dice.near(base, 0.5) if dice.chance(0.5) else dice.shown() for _ in range(dice.whole(2, 6))])
+    cells = dice.rng.integers(0, len(palette), (count, count))
+    if dice.chance(0.4):  # mirrored, as embroidery is
+        cells = np.concatenate([cells[:, : count // 2], cells[:, : count // 2][:, ::-1]], axis=1)
+    whole = np.kron(cells, np.ones((SIZE // count, SIZE // count), dtype=int))
+    return palette[whole], palette[whole].mean(axis=-1) * 0.5
+
+
 def ribs(dice: Dice) -> Picture:
     """Ridges: corrugated card, cord, knurling."""
     u, v = texel_grid(SIZE, SIZE)
@@ -189,6 +225,8 @@ PATTERNS: dict[Callable[[Dice], Picture], float] = {
     blotches: 2.0,
     grit: 1.2,
     painting: 1.6,
+    ornament: 4.0,
+    mosaic: 2.0,
     ribs: 0.7,
 }
 

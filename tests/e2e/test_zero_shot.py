@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from e2e_harness import image, run
 
+from dnrpipe.stages.worth import views_worth
 from dnrtrain.checkpoint import load_model, read_record
 
 pytestmark = [pytest.mark.slow, pytest.mark.e2e]
@@ -34,6 +35,11 @@ def test_no_view_is_selected_and_frames_come_out(tiny: Path, tmp_path: Path) -> 
     assert len(list((workspace / "passes" / "train").glob("*.exr"))) > 2
     refused = run("render", folder=tmp_path, check=False)
     assert refused.returncode == 2 and "raytrace-selected" in refused.stderr
+    told = run("select", "--budget", "auto", folder=tmp_path).stderr
+    selection = json.loads((workspace / "selection.json").read_text())
+    found = selection["details"]["worth"]
+    assert len(selection["views"]) == found["views"] == views_worth(found["gain"], found["seconds"], 0.3 / 60, 25)
+    assert f"{found['gain']:+.2f} dB" in told and found["seconds"] > 0
 
 
 def test_no_view_is_traced_and_frames_come_out(tiny: Path, tmp_path: Path) -> None:

@@ -110,22 +110,23 @@ def _figures(
 ) -> dict[str, Any]:
     masks = [torch.from_numpy(picture[..., 3] > 0.5).float()[None, None] for picture in reference.pictures]
     everything = {**baselines, **own}
+    try:
+        lpips = build_lpips(load_weights())
+    except WeightsMissing:
+        lpips = {}
+    quick, slow = ({kind: lpips[kind]} if lpips else None for kind in ("alex", "vgg"))
     rows = {
         name: {
             "ms": ran.ms(),
             "parts": {part: float(np.median(values)) for part, values in ran.parts.items()},
-            **_quality(ran.pictures, truth, masks, None),
+            **_quality(ran.pictures, truth, masks, quick),
         }
         for name, ran in everything.items()
     }
     points = {name: (rows[name]["ms"], rows[name]["psnr"]) for name in baselines}
-    try:
-        lpips = {"vgg": build_lpips(load_weights())["vgg"]}
-    except WeightsMissing:
-        lpips = None
     best = frontier(points)
     for name in [*best, *own]:
-        rows[name] |= _quality(everything[name].pictures, truth, masks, lpips)
+        rows[name] |= _quality(everything[name].pictures, truth, masks, slow)
     scale = scene.size[0] * scene.size[1] / 128**2
     limits = [1000 * seconds * scale for seconds in CLASSES]
     standings = {}

@@ -12,16 +12,19 @@ as much as the least disturbed quarter. The conversion of the scene, which both 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from dnrpipe.core.ledger import CostRecord, UpfrontPart, break_even_frames, total, upfront_work
-from dnrpipe.studies.frames.ours import NEURAL
-from dnrpipe.studies.frames.pareto_front import quality_at
+from dnrpipe.studies.frames.ours import BASE, NEURAL
+from dnrpipe.studies.frames.pareto_front import crossover, frontier, quality_at
 
 COUNTS = (200, 2000)
 """Numbers of frames that the tables speak of."""
+Figure = Literal["psnr", "lpips_alex"]
+BETTER: dict[Figure, int] = {"psnr": 1, "lpips_alex": -1}
+SHOWN: dict[Figure, str] = {"psnr": "PSNR", "lpips_alex": "LPIPS"}
 TRACING: tuple[UpfrontPart, ...] = ("selection", "tracing", "light", "base images")
 """What the tables call tracing."""
 
@@ -56,19 +59,27 @@ def at_equal_time(scene: Mapping[str, Any], frames: int) -> dict[str, Any]:
     return max(found, key=lambda one: one["psnr"] - one["rival"])
 
 
-def break_even(scene: Mapping[str, Any]) -> tuple[str, int, bool] | None:
-    """From how many frames on ours is cheaper than path tracing at equal PSNR; None: never.
+def break_even(scene: Mapping[str, Any], figure: Figure = "psnr") -> tuple[str, int, bool] | None:
+    """From how many frames on ours is cheaper than path tracing at an equal figure; None: never.
 
     (our number of rays, frames, whether path tracing ends below us, so that it is that many at most): the fewest frames
     of all numbers of rays.
     """
+    sign = BETTER[figure]
+    rows = scene["rows"]
+    points = {
+        name: (row["ms"], sign * row[figure])
+        for name, row in rows.items()
+        if figure in row and not name.startswith((NEURAL, BASE))
+    }
+    line = [points[name] for name in frontier(points)]
     found = []
-    for name, standing in scene["standing"].items():
-        if not name.startswith(NEURAL):
+    for name in scene["standing"]:
+        if not (line and name.startswith(NEURAL)):
             continue
-        level = standing["crossover_ms"]
-        traced = standing["ladder_end_ms"] if level is None else level
-        frames = break_even_frames(scene["upfront"]["total"], traced / 1000, scene["rows"][name]["ms"] / 1000)
+        level = crossover(line, sign * rows[name][figure])
+        traced = line[-1][0] if level is None else level
+        frames = break_even_frames(scene["upfront"]["total"], traced / 1000, rows[name]["ms"] / 1000)
         if frames is not None:
             found.append((name, frames, level is None))
     return min(found, key=lambda one: one[1]) if found else None
@@ -80,9 +91,13 @@ def lines(scenes: Sequence[Mapping[str, Any]]) -> list[str]:
     if not known:
         return []
     heads = [f"{count} frames: ours, rival, lead | a frame, ms" for count in COUNTS]
+    figures: list[Figure] = ["psnr"]
+    if all("lpips_alex" in row for scene in known for row in scene["rows"].values()):
+        figures.append("lpips_alex")
+    ends = [f"cheaper at equal {SHOWN[figure]} from" for figure in figures]
     table = [
-        f"| scene | before the first frame, s | of which training | {' | '.join(heads)} | cheaper from |",
-        "|---|---|---|" + "---|---|" * len(COUNTS) + "---|",
+        f"| scene | before the first frame, s | of which training | {' | '.join([*heads, *ends])} |",
+        "|---|---|---|" + "---|---|" * len(COUNTS) + "---|" * len(ends),
     ]
     for scene in known:
         cells = [scene["scene"], f"{scene['upfront']['total']:.0f}", f"{scene['upfront']['training']:.0f}"]
@@ -91,14 +106,16 @@ def lines(scenes: Sequence[Mapping[str, Any]]) -> list[str]:
             lead = one["psnr"] - one["rival"]
             cells += [f"{one['psnr']:.1f}, {one['rival']:.1f}, {lead:+.1f} dB ({_rays(one['name'])})"]
             cells += [f"{one['ms']:.0f}"]
-        even = break_even(scene)
-        if even is None:
-            cells.append("never")
-        else:
-            name, frames, bound = even
-            cells.append(f"{'at most ' if bound else ''}{frames} frames ({_rays(name)})")
+        cells += [_told(break_even(scene, figure)) for figure in figures]
         table.append(f"| {' | '.join(cells)} |")
     return table
+
+
+def _told(even: tuple[str, int, bool] | None) -> str:
+    if even is None:
+        return "never"
+    name, frames, bound = even
+    return f"{'at most ' if bound else ''}{frames} frames ({_rays(name)})"
 
 
 def _line(scene: Mapping[str, Any]) -> list[tuple[float, float]]:

@@ -30,6 +30,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=20)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--from", dest="begin", type=Path, help="weights to go on from, e.g. the shipped ones")
+    parser.add_argument("--balance", type=float, default=0.0)
     parser.add_argument("--ship", action="store_true")
     options = parser.parse_args()
     found = [SceneMaps(path.parent) for path in sorted(options.data.glob("[0-9]*/scene.json"))]
@@ -40,7 +41,13 @@ def main() -> None:
     history = options.folder / "history.jsonl"
     seconds = 60 * options.minutes
     begin = corrector(options.begin) if options.begin else None
-    settings = {"seconds": seconds, "seed": options.seed, "weights": load_weights(), "begin": begin}
+    settings = {
+        "seconds": seconds,
+        "seed": options.seed,
+        "weights": load_weights(),
+        "begin": begin,
+        "balance": options.balance,
+    }
     for record in pretrain(training, held_out, options.folder, **settings):
         base, ours = record["psnr"]
         print(f"{record['seconds']} s, step {record['step']}: held-out {base:.2f} -> {ours:.2f} dB", flush=True)

@@ -33,8 +33,11 @@ from .schedule import Averaged, adam, averaged_weights, guarded_step
 from .settings import CORRECTOR, LossWeights, ModelSettings, Step2Settings
 
 LOSS = Step2Settings(
-    photometric="l1", perceptual_crop=32, loss=LossWeights(perceptual=0.03, total_variation=0.0, regularisation=0.0)
+    perceptual_crop=32,
+    loss=LossWeights(photometric=0.0, perceptual=0.03, total_variation=0.0, regularisation=0.0),
 )
+TYPICAL, LEAST = 0.02, 0.005
+"""Mean absolute error of a base image: where its picture counts as much as in L1, and what is added to it."""
 RATE, RATE_END = 1e-3, 2e-5
 RATE_ONWARDS = 4e-4
 """The first rate where training goes on from weights."""
@@ -57,6 +60,7 @@ def pretrain(
     seed: int = 0,
     weights: Mapping[str, Mapping[str, Tensor]] | None = None,
     begin: DNR | None = None,
+    balance: float = 0.0,
     every: float = 120.0,
 ) -> Iterator[dict[str, Any]]:
     """Train for so many seconds in all; yields a record every ``every`` seconds, the last one at the end.
@@ -93,7 +97,9 @@ def pretrain(
         pictures = joined([disturbed(picture, random) for picture in drawn])
         assert pictures.target is not None
         loss_of = plain if step % PERCEPTUAL_EVERY else whole
-        loss, _ = loss_of(dnr(pictures), pictures.target, random, bfloat16=False)
+        output = dnr(pictures)
+        loss, _ = loss_of(output, pictures.target, random, bfloat16=False)
+        loss = loss + photometric(output.rgb, pictures, balance)
         if guarded_step(optimiser, loss, rate):
             average.update()
             total, count = total + float(loss.detach()), count + 1
@@ -112,6 +118,15 @@ def pretrain(
                 found = judge(dnr, held_out)
             yield {"seconds": round(spent), "step": step, "loss": total / max(count, 1), **found}
             total, count, clock = 0.0, 0, time.monotonic()
+
+
+def photometric(rgb: Tensor, batch: Batch, balance: float) -> Tensor:
+    """Mean absolute error, of each picture over the power ``balance`` of its base image's: 1 counts a picture that is
+    good already as much as a poor one, as decibels do, 0 is L1."""
+    assert batch.target is not None
+    error = (rgb - batch.target).abs().mean(dim=(1, 2, 3))
+    start = (base_picture(batch) - batch.target).abs().mean(dim=(1, 2, 3))
+    return (error * ((start + LEAST) / TYPICAL) ** -balance).mean()
 
 
 def disturbed(batch: Batch, random: np.random.Generator) -> Batch:

@@ -61,7 +61,11 @@ SCENE_OPTIONS = [
 ]
 """Options of commands that may start from a scene file; `scene_overrides` reads them."""
 SELECT_OPTIONS = [
-    click.option("--budget", type=int, metavar="M", help="Views to ray-trace (default 25); 0: none, no training."),
+    click.option(
+        "--budget",
+        metavar="M",
+        help="Views to ray-trace (default 25); 0: none, no training; auto: as many as are worth their seconds.",
+    ),
     click.option(
         "--policy",
         type=click.Choice(NAMES),
@@ -123,8 +127,11 @@ def scene_overrides(options: dict[str, Any]) -> dict[str, Any]:
 def select_overrides(options: dict[str, Any]) -> dict[str, Any]:
     chosen = {key: options.pop(key) for key in ("budget", "policy")}
     given = {key: value for key, value in chosen.items() if value is not None}
-    if given.get("budget", 0) < 0:
-        raise UserError(f"--budget {given['budget']}: must be at least 0 views")
+    budget = given.get("budget")
+    if budget is not None and budget != "auto":
+        if not budget.isdecimal():
+            raise UserError(f"--budget {budget}: name a number of views, at least 0, or auto")
+        given["budget"] = int(budget)
     return {"select": given} if given else {}
 
 

@@ -131,15 +131,27 @@ class EffectSettings(Strict):
     pixel_tolerance: float = Field(default=0.02, gt=0, le=1, description="the same at the 99th percentile pixel")
 
 
+MOST_VIEWS = 25
+"""The usual number of traced views, and the most that ``auto`` takes."""
+
+
 class SelectSettings(Strict):
     """Which of the candidates are ray-traced."""
 
-    budget: int = Field(
-        default=25, ge=0, description="views to ray-trace; 0: none, and no training: the shipped corrector as it is"
+    budget: Annotated[int, Field(ge=0)] | Literal["auto"] = Field(
+        default=MOST_VIEWS,
+        description="views to ray-trace; 0: none, and no training: the shipped corrector as it is; auto: as many as are"
+        " worth their seconds",
     )
+    worth: float = Field(default=0.3, ge=0, le=1e6, description="decibels that a minute is worth, with budget = auto")
     policy: PolicyName = Field(default="auto", description="how they are chosen (docs/method.md)")
     seed: int = Field(default=0, ge=0)
     step1: Step1Settings = Step1Settings()
+
+    @property
+    def most(self) -> int:
+        """The budget as a number: with ``auto`` the most that it takes."""
+        return MOST_VIEWS if self.budget == "auto" else self.budget
 
 
 class FinetuneSettings(Strict):
@@ -173,8 +185,13 @@ class Settings(Strict):
     @model_validator(mode="after")
     def _fits(self) -> Settings:
         start = self.finetune.step2.start
-        if start == "pretrained" and self.select.budget > 0 and (conflict := self.model.unlike_corrector()):
+        if start == "pretrained" and self.select.budget != 0 and (conflict := self.model.unlike_corrector()):
             raise ValueError(f"finetune.step2.start = pretrained, but {conflict}")
+        if self.select.budget == "auto" and start != "pretrained":
+            raise ValueError(
+                "select.budget = auto weighs training against the shipped corrector, and finetune.step2.start ="
+                f" {start}; type --set finetune.step2.start=pretrained, or name a number of views"
+            )
         if start == "coarse" and self.model.aggregator == "none":
             raise ValueError(
                 "finetune.step2.start = coarse begins with step 1's neural texture, and aggregator = none has none;"
@@ -182,10 +199,14 @@ class Settings(Strict):
             )
         return self
 
+    def with_budget(self, views: int) -> Settings:
+        """With so many views to ray-trace."""
+        return self.model_copy(update={"select": self.select.model_copy(update={"budget": views})})
+
     @property
     def trains_step1(self) -> bool:
         """Whether the coarse model is wanted: by the policy, or as the start of step 2."""
-        return self.select.budget > 0 and (self.select.policy in TRAINED_NAMES or self.starts_coarse)
+        return self.select.budget != 0 and (self.select.policy in TRAINED_NAMES or self.starts_coarse)
 
     @property
     def starts_coarse(self) -> bool:

@@ -58,6 +58,14 @@ def _base(settings: Settings) -> list[Any]:
 
 def _selection(settings: Settings) -> list[Any]:
     """Settings that decide which views are chosen, and the coarse model where there is one."""
+    if settings.select.budget == "auto":
+        tried = [
+            settings.model.model_dump(),
+            settings.finetune.model_dump(),
+            _base(settings),
+            _tracing(settings, test=False),
+        ]
+        return [settings.select.model_dump(exclude={"step1"}), *tried]
     if not settings.trains_step1:
         return [settings.select.model_dump(include={"budget", "policy", "seed"})]
     return [settings.model.coarse().model_dump(), settings.select.model_dump(), _neural(settings)]

@@ -77,14 +77,15 @@ def prepare(run: Run) -> Outcome:
 
 
 def needed_passes(settings: Settings) -> dict[str, bool]:
-    """Splits whose passes later stages read under the settings -> whether with rasterised colour.
+    """Splits whose passes later stages read under the settings -> whether with rasterised colour. With ``budget =
+    auto`` that is not known yet: none are drawn of the candidates.
 
     G-buffers of candidates say what they see. Base images that are rendered bring G-buffers of their own. Rasterised
     colour is what step 1 trains on, and one kind of base image.
     """
     raster = settings.model.base == "raster"
     needed: dict[str, bool] = {}
-    if settings.select.budget > 0:
+    if settings.select.budget not in (0, "auto"):
         needed["train"] = settings.trains_step1 or raster
     if settings.trains_step1:
         needed["val"] = True

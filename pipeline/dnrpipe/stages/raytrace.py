@@ -44,12 +44,13 @@ def raytrace_selected(run: Run) -> Outcome:
 
 def progress(workspace: Workspace, settings: Settings) -> tuple[int, int]:
     """(selected views on disk, selected views)."""
+    wanted = settings.select.most
     if not workspace.selection.exists():
-        return 0, settings.select.budget
+        return 0, wanted
     try:
         names = read_selection(workspace).views
     except ContractError:
-        return 0, settings.select.budget  # damaged: the stage mends it when it runs
+        return 0, wanted  # damaged: the stage mends it when it runs
     rendered = settings.model.base in RENDERED
     made = [
         workspace.raytraced("train", name).exists() and (not rendered or base_path(workspace, "train", name).exists())
@@ -74,7 +75,7 @@ def trace_views(run: Run, views: list[View], split: str, *, spp: int | None = No
     run.console.say(f"ray tracing with Mitsuba {choice.variant}, {plan.integrator}, depth {plan.max_depth}")
     workers = 1 if choice.variant.startswith("cuda") else worker_count(settings.raytrace.workers)
     book = run.book_views(f"mitsuba {choice.variant}")
-    label = "ray tracing" if split == "train" else "ray tracing test views"
+    label = {"train": "ray tracing", "test": "ray tracing test views"}.get(split, "ray tracing small views")
     common = {"bundle": config["bundle"], "variant": choice.variant, "threads": 1}
     if goal is None:
         module = "dnrpipe.raytrace.tracer"

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import shutil
 import time
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Literal
 
 from dnrtrain.contract import View
 from dnrtrain.events import Selected
@@ -20,6 +21,7 @@ from ..core.workspace import Workspace, digest, file_sha256
 from .prepare import draw_missing, needed_passes
 from .stage import Outcome, Run
 from .trainer import epochs_done, follow, load, torch_device
+from .worth import worth
 
 if TYPE_CHECKING:
     from dnrtrain.selector.protocol import Choice, Policy
@@ -28,13 +30,22 @@ if TYPE_CHECKING:
 
 def select_views(run: Run) -> Outcome:
     """Choose ``budget`` views and write ``selection.json``; train the coarse DNR on the way where it is wanted."""
-    workspace, settings = run.workspace, run.settings
+    workspace = run.workspace
     views = split_views(workspace)["train"]
-    check_budget(settings.select.budget, len(views))
+    check_budget(run.settings.select.budget, len(views))
+    details: dict[str, Any] = {}
+    if run.settings.select.budget == "auto":
+        require_baked(run.settings, "--budget auto")
+        found = worth(run, len(views))
+        details["worth"] = found.model_dump()
+        run.console.say(f"select: {found.told}")
+        run = replace(run, settings=run.settings.with_budget(found.views))
+    elif run.settings.select.budget == 0:
+        require_baked(run.settings, "--budget 0")
+        run.console.say("select: no views (--budget 0); the shipped corrector renders as it is")
+    settings = run.settings
     draw_missing(run, needed_passes(settings))
     if settings.select.budget == 0:
-        require_baked(settings, "--budget 0")
-        run.console.say("select: no views (--budget 0); the shipped corrector renders as it is")
         chosen = Selection(policy=settings.select.policy, budget=0, seed=settings.select.seed, views=[])
         made: list[object] = [[]]
     elif settings.trains_step1:
@@ -43,6 +54,7 @@ def select_views(run: Run) -> Outcome:
     else:
         chosen = _choose(run, views)
         made = [chosen.views]
+    chosen.details.update(details)
     write(workspace.selection, chosen)
     return Outcome(digest(made), {"policy": chosen.policy, "views": chosen.views})
 
@@ -64,9 +76,9 @@ def require_baked(settings: Settings, option: str) -> None:
         )
 
 
-def check_budget(budget: int, candidates: int) -> None:
+def check_budget(budget: int | Literal["auto"], candidates: int) -> None:
     """Raises UserError when more views are wanted than there are."""
-    if budget > candidates:
+    if budget != "auto" and budget > candidates:
         raise UserError(
             f"--budget {budget}: only {candidates} candidate views exist; lower the budget or prepare more"
             f" (`dnrpipe prepare --views {budget}`)"
@@ -95,7 +107,7 @@ def _choose_by(rule: Policy, run: Run, views: list[View]) -> Choice:
         def tick(weighed: int) -> None:
             bar.advance(min(weighed, bar.total - bar.done))  # a policy's effort is an estimate
 
-        choice = rule.choose(candidates, select.budget, select.seed, tick)
+        choice = rule.choose(candidates, select.most, select.seed, tick)
         tick(bar.total)
     _book(run, time.monotonic() - clock, time.process_time() - cpu)
     return choice
@@ -122,7 +134,7 @@ def _train_and_choose(run: Run, views: list[View]) -> Selection:
         run.effect_plan.model(settings.model),
         select.step1,
         policy=select.policy,
-        budget=select.budget,
+        budget=select.most,
         seed=select.seed,
         device=torch_device(settings),
         checkpoints=workspace.checkpoints("step1"),

@@ -126,8 +126,7 @@ class Session:
         """Where no view was ever selected, the shipped corrector becomes the renderer, as with ``--budget 0``."""
         if not selects_nothing(self.workspace, self.settings):
             return
-        select = self.settings.select.model_copy(update={"budget": 0})
-        self.settings = self.settings.model_copy(update={"select": select})
+        self.settings = self.settings.with_budget(0)
         for name in UNTRAINED:
             if state(STAGES[name], self.workspace, self.settings) != "done":
                 run_stage(name, self.run)

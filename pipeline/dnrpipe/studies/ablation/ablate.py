@@ -139,7 +139,7 @@ class Ablation(Study[tuple[str, str, int]]):
             return step1[scene.name, row.name].result().selected
         if row.views == "all":
             return list(scene.train)
-        budget = row.budget or self.base.select.budget
+        budget = row.budget or self.base.select.most
         # Farthest points are the same views for every seed.
         chosen = choose_by_pose(list(scene.train.values()), row.views, budget, seed if row.views == "random" else 0)
         return [view.name for view in chosen]
@@ -155,7 +155,7 @@ class Ablation(Study[tuple[str, str, int]]):
 
     def compared(self) -> dict[str, Any]:
         return {
-            "budget": self.base.select.budget,
+            "budget": self.base.select.most,
             "device": self.device,
             "threads": self.threads,
             "rows": {row.name: row.what for row in self.rows},

@@ -149,7 +149,7 @@ class Worker(FileWorker):
         model, step1, step2 = settings.model, settings.select.step1, settings.finetune.step2
         if isinstance(task, Step1Task):
             views = self.views(task.workspace, "train", raytraced=False, base="none")
-            return run_step1(views, None, model, step1, policy=task.policy, budget=settings.select.budget, **run)
+            return run_step1(views, None, model, step1, policy=task.policy, budget=settings.select.most, **run)
         names = tuple(task.views)
         views = self.views(
             task.workspace, "train", names, raytraced=True, base=settings.model.base, targets=task.targets

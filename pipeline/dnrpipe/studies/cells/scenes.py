@@ -104,8 +104,8 @@ def prepared(name: str, run: Run, command: str) -> Scene:
     if not views.get("test"):
         raise UserError(f"{name}: has no test views to measure on; set cameras.test > 0")
     train = {view.name: view for view in views["train"]}
-    if settings.select.budget > len(train):
-        raise UserError(f"a budget of {settings.select.budget} views: {name} has {len(train)} candidate views")
+    if settings.select.most > len(train):
+        raise UserError(f"a budget of {settings.select.most} views: {name} has {len(train)} candidate views")
     return Scene(
         name=name,
         workspace=workspace,

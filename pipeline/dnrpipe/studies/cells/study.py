@@ -163,7 +163,7 @@ class Study(ABC, Generic[Place]):
         self, scene: Scene, settings: Settings, policy: str, seed: int, seconds: float | None = None
     ) -> Step1Task:
         """Step 1: a trained policy's selection, or a coarse model that cells share. seconds: of training at most."""
-        model, step1, budget = settings.model.coarse(), settings.select.step1, settings.select.budget
+        model, step1, budget = settings.model.coarse(), settings.select.step1, settings.select.most
         decisive = [scene.inputs, model.model_dump(), step1.model_dump(), policy, budget, seed, seconds]
         fingerprint = digest([CELL_VERSION, __version__, *decisive, *self.environment])
         return Step1Task(

@@ -140,7 +140,7 @@ def run_frontier(
     if unknown := set(others) - {*OTHERS, CYCLES}:
         raise UserError(f"--also {', '.join(sorted(unknown))}: choose of {', '.join((*OTHERS, CYCLES))}, or none")
     sweep = Sweep(
-        budgets=numbers(budgets, "--budgets", (6, 12, settings.select.budget), candidates),
+        budgets=numbers(budgets, "--budgets", (6, 12, settings.select.most), candidates),
         samples=numbers(spp, "--spp", (16, settings.raytrace.spp)),
         steps=numbers(iterations, "--iterations", (150, 600)),
         also=tuple(name for name in others if name != CYCLES),

@@ -37,7 +37,7 @@ def make_plan(run: Run, wanted: Wanted, prior: Prior | None = None) -> Plan:
     candidates = len(split_views(workspace)["train"])
     grid = list(predictor.grid(candidates))
     chosen = _choose(grid, wanted)
-    views, epochs = min(settings.select.budget, candidates), settings.finetune.step2.epochs
+    views, epochs = min(settings.select.most, candidates), settings.finetune.step2.epochs
     default = predictor.choice(views, settings.raytrace.spp, epochs * -(-views // predictor.batch))
     asked: dict[str, Any] = {}
     if wanted.frames is not None:

@@ -171,7 +171,7 @@ class Bench(Study[Place]):
             self._plan_pool(pool, places, starts)
 
     def _choice_task(self, pool: Pool, contender: Contender, settings: Settings, seed: int) -> ChoiceTask:
-        policy, budget, inputs = contender.policy, settings.select.budget, pool.data.inputs
+        policy, budget, inputs = contender.policy, settings.select.most, pool.data.inputs
         if contender.kind == "step1":  # the preset's epochs: what step 1 takes is part of what its policy costs
             return self.step1_task(pool.data, settings, policy, seed)
         decisive = [CHOICE_VERSION, rules_fingerprint(), inputs, policy, budget, seed]

@@ -42,7 +42,7 @@ class Worker(FileWorker):
             views, settings.model, settings.select.step1, ActiveSettings(), task.seed, self.device, task.folder,
             task.fingerprint,
         )  # fmt: skip
-        choice, cost = members.choose(task.policy, settings.select.budget)
+        choice, cost = members.choose(task.policy, settings.select.most)
         return SelectionResult(
             key=task.fingerprint,
             views=[views.names[i] for i in choice.views],
