@@ -207,5 +207,10 @@ def test_frames_at_equal_time_and_the_frames_from_which_ours_is_cheaper() -> Non
         100,
         False,
     )
-    assert "at most 60 frames (8 rays)" in "\n".join(lines([scene]))
+    assert "at most 60 frames (8 rays)" in "\n".join(lines([scene])) and "LPIPS" not in "\n".join(lines([scene]))
+    for name, row in rows.items():  # where less is better
+        row["lpips_alex"] = 0.5 if name == "neural, 1 rays" else 10 ** (-row["psnr"] / 20)
+    assert break_even(scene, "lpips_alex") == ("neural, 8 rays", 60, True)
+    rows["neural, 8 rays"]["lpips_alex"] = 0.5  # worse than the cheapest that the rival has, which takes less than ours
+    assert break_even(scene, "lpips_alex") is None and "| never |" in "\n".join(lines([scene]))
     assert lines([{"scene": "without a ledger"}]) == []

@@ -32,7 +32,7 @@ def test_more_are_worth_it_where_training_gains_more_or_time_is_cheap() -> None:
 
 def test_auto_is_a_budget_of_the_settings() -> None:
     assert resolve("draft", {"select": {"budget": "auto"}}, environment={}).select.most == MOST_VIEWS
-    with pytest.raises(UserError, match="select.budget"):
+    with pytest.raises(UserError, match=r"select\.budget"):
         resolve("draft", {"select": {"budget": "many"}}, environment={})
     with pytest.raises(UserError, match="start=pretrained"):
         resolve("draft", {"select": {"budget": "auto"}, "finetune": {"step2": {"start": "fresh"}}}, environment={})

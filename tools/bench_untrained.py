@@ -1,6 +1,6 @@
 """The shipped corrector beside trained renderers, scene by scene: quality, and seconds before the first frame.
 
-python -m tools.bench_untrained FOLDER [SCENE.blend ...] [--out docs/results/untrained.json]
+python -m tools.bench_untrained FOLDER [SCENE.blend ...] [--variants untrained,fresh] [--out RESULTS.json]
 
 FOLDER keeps the workspaces; rows that are in the results are not measured again. Without scenes: the example scenes.
 Variants, at the draft preset with 8 test views of 256 samples:
@@ -9,6 +9,8 @@ Variants, at the draft preset with 8 test views of 256 samples:
     6 views     --budget 6, 180 steps on from the shipped corrector
     25 views    the preset: 25 views, 1000 steps on from the shipped corrector
     fresh       25 views, 1000 steps of a fresh network with guides in world space: the default before
+
+With `untrained` goes what `--budget auto` says of the scene: what its trial gained, and how many views it would take.
 
 Seconds are wall time of the commands from `prepare` to the first frame. Light and path depth pilot are made once, by
 `untrained`, and G-buffers of the candidates by `6 views`; all that need them count them. Views are traced anew.
@@ -48,27 +50,29 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("scenes", type=Path, nargs="*")
+    parser.add_argument("--variants", default=",".join(VARIANTS), help="in their order; untrained is always among them")
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
+    chosen = [name for name in VARIANTS if name in ("untrained", *options.variants.split(","))]
     rows: list[dict[str, Any]] = json.loads(options.out.read_text())["rows"] if options.out.exists() else []
     for scene in options.scenes or sorted((ROOT / "blender_scenes").glob("*.blend")):
-        if {row["variant"] for row in rows if row["scene"] == scene.stem} >= set(VARIANTS):
+        if {row["variant"] for row in rows if row["scene"] == scene.stem} >= set(chosen):
             continue
         rows = [row for row in rows if row["scene"] != scene.stem]  # its seconds belong together
-        rows += measured(scene.resolve(), options.folder / f"{scene.stem}.dnr")
+        rows += measured(scene.resolve(), options.folder / f"{scene.stem}.dnr", chosen)
         write_json(options.out, {"machine": f"{os.cpu_count()} cores", "rows": rows})
     print(markdown({"rows": rows}))
 
 
-def measured(scene: Path, root: Path) -> list[dict[str, Any]]:
+def measured(scene: Path, root: Path, variants: list[str]) -> list[dict[str, Any]]:
     """A row per variant."""
-    rows = []
+    rows: list[dict[str, Any]] = []
     shutil.rmtree(root, ignore_errors=True)
     prepared = run(root, "prepare", str(scene), "--set", "select.budget=0", *TESTS)
     shared = 0.0
-    for variant, options in VARIANTS.items():
-        chosen = run(root, "select", *options)
+    for variant in variants:
+        chosen = run(root, "select", *VARIANTS[variant])
         spent = chosen + run(root, "raytrace-selected", "--force") + run(root, "finetune")
         run(root, "evaluate")
         mean = json.loads((root / "evaluation" / "metrics.json").read_text())["mean"]
@@ -80,6 +84,8 @@ def measured(scene: Path, root: Path) -> list[dict[str, Any]]:
         elif variant == "untrained":
             ledger = [json.loads(line) for line in (root / "costs.jsonl").read_text().splitlines()]
             shared = sum(record["seconds"] for record in ledger if record["name"] in ("light", "path depth pilot"))
+            run(root, "select", "--budget", "auto", "--set", "finetune.step2.epochs=40")
+            rows[-1]["worth"] = json.loads((root / "selection.json").read_text())["details"]["worth"]
         print(f"{scene.stem}, {variant}: {mean['psnr']:.2f} dB, {seconds:.0f} s", flush=True)
     return rows
 
@@ -96,23 +102,27 @@ def markdown(results: dict[str, Any]) -> str:
     """PSNR and seconds of every scene, and the mean differences over scenes with their 95% intervals."""
     rows = {(row["scene"], row["variant"]): row for row in results["rows"]}
     scenes = sorted({scene for scene, _ in rows})
-    lines = [
-        f"| scene | base image | {' | '.join(VARIANTS)} | {' | '.join(f'{name}, s' for name in VARIANTS)} |",
-        "|---" * (2 + 2 * len(VARIANTS)) + "|",
-    ]
+    heads = [*VARIANTS, *(f"{name}, s" for name in VARIANTS), "trial", "auto"]
+    lines = [f"| scene | base image | {' | '.join(heads)} |", "|---" * (2 + len(heads)) + "|"]
     for scene in scenes:
-        own = [rows[scene, variant] for variant in VARIANTS]
-        figures = [own[0]["base"], *(row["psnr"] for row in own)]
-        shown = [f"{figure:.2f}" for figure in figures] + [f"{row['seconds']:.0f}" for row in own]
-        lines.append(f"| {scene} | {' | '.join(shown)} |")
+        own = [rows.get((scene, variant)) for variant in VARIANTS]
+        untrained = rows[scene, "untrained"]
+        shown = ["-" if row is None else f"{row['psnr']:.2f}" for row in own]
+        shown += ["-" if row is None else f"{row['seconds']:.0f}" for row in own]
+        worth = untrained.get("worth")
+        shown += ["-", "-"] if worth is None else [f"{worth['gain']:+.2f} dB", f"{worth['views']} views"]
+        lines.append(f"| {scene} | {untrained['base']:.2f} | {' | '.join(shown)} |")
     lines.append("")
-    psnr = {variant: {scene: rows[scene, variant]["psnr"] for scene in scenes} for variant in VARIANTS}
-    base = {scene: rows[scene, "untrained"]["base"] for scene in scenes}
-    pairs = {"untrained to base image": {scene: psnr["untrained"][scene] - base[scene] for scene in scenes}}
-    for name in ("untrained", "6 views", "25 views"):
-        pairs[f"{name} to fresh"] = {scene: psnr[name][scene] - psnr["fresh"][scene] for scene in scenes}
-    lines += [f"- {name}: {interval(values)} dB over {len(scenes)} scenes" for name, values in pairs.items()]
-    shares = [rows[s, "untrained"]["seconds"] / rows[s, "fresh"]["seconds"] for s in scenes]
+    figures = {**rows, **{(scene, "base image"): {"psnr": rows[scene, "untrained"]["base"]} for scene in scenes}}
+    pairs = [("untrained", "base image"), *((name, "fresh") for name in ("untrained", "6 views", "25 views"))]
+    for name, other in pairs:
+        both = [scene for scene in scenes if (scene, name) in figures and (scene, other) in figures]
+        values = {scene: figures[scene, name]["psnr"] - figures[scene, other]["psnr"] for scene in both}
+        if values:
+            worst = min(values, key=lambda scene: values[scene])
+            told = f"{interval(values)} dB over {len(both)} scenes, worst {values[worst]:+.2f} ({worst})"
+            lines.append(f"- {name} to {other}: {told}")
+    shares = [rows[s, "untrained"]["seconds"] / rows[s, "fresh"]["seconds"] for s in scenes if (s, "fresh") in rows]
     return "\n".join([*lines, f"- untrained, of fresh's seconds before the first frame: {np.mean(shares):.0%}"])
 
 

@@ -126,7 +126,7 @@ def predictor_in(root: Path, prior: Prior) -> Predictor:
 def preset_choice(predictor: Predictor, session: Session) -> Callable[[float | None], Prediction]:
     """The preset's views and samples, with its own steps (None) or with as many as fit into so many seconds."""
     settings = session.settings
-    views = min(settings.select.budget, len(split_views(session.workspace)["train"]))
+    views = min(settings.select.most, len(split_views(session.workspace)["train"]))
     per_epoch = -(-views // predictor.batch)
 
     def of(seconds: float | None) -> Prediction:
