@@ -1,7 +1,8 @@
 """Write the generated parts of docs: rows from the code, tables from committed results.
 
 A part stands between ``<!-- rows -->`` or ``<!-- KIND FILE -->``, FILE in docs/, and ``<!-- end -->``.
-Kinds: results (of `dnrpipe ablate`), frames (of tools.bench_frames), noise (of tools.bench_noise),
+Kinds: results (of `dnrpipe ablate`), frames (of tools.bench_frames),
+frames-overview (its tables over all scenes), noise (of tools.bench_noise),
 frontier (of `dnrpipe frontier`), plan-check (of tools.plan_check), selection (of `dnrpipe bench-select`),
 selections (of several of its runs together: FILE,FILE), plan-equal (of tools.plan_equal),
 untrained (of tools.bench_untrained).
@@ -17,6 +18,7 @@ import sys
 from pathlib import Path
 
 from tools.bench_frames.document import markdown as frames_markdown
+from tools.bench_frames.document import overview as frames_overview
 from tools.bench_noise.document import markdown as noise_markdown
 from tools.bench_untrained import markdown as untrained_markdown
 from tools.plan_check import markdown as check_markdown
@@ -30,7 +32,7 @@ from dnrpipe.studies.selectbench.bench_tables import markdown as selection_markd
 from dnrpipe.studies.selectbench.bench_tables import read_results as selection_results
 from dnrpipe.studies.selectbench.bench_tables import together as selections_markdown
 
-KINDS = "rows|results|frames|noise|frontier|plan-check|plan-equal|selections?|untrained"
+KINDS = "rows|results|frames(?:-overview)?|noise|frontier|plan-check|plan-equal|selections?|untrained"
 PART = re.compile(rf"(<!-- ({KINDS})(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -53,6 +55,8 @@ def generate(text: str, folder: Path) -> str:
             body = markdown(read_results(folder / match[3])).rstrip()
         elif match[2] == "noise":
             body = noise_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
+        elif match[2] == "frames-overview":
+            body = "\n".join(frames_overview(json.loads((folder / match[3]).read_text(encoding="utf-8"))))
         elif match[2] == "untrained":
             body = untrained_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
         elif match[2] == "frontier":

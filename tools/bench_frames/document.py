@@ -59,11 +59,17 @@ def _processor() -> str:
 
 def markdown(record: dict[str, Any]) -> str:
     """The tables of a record of `write`."""
+    lines = ["# Our frames against path tracing + Open Image Denoise at equal time", "", *overview(record)]
+    for scene in record["scenes"]:
+        lines += ["", *_scene(scene)]
+    return "\n".join(lines) + "\n"
+
+
+def overview(record: dict[str, Any]) -> list[str]:
+    """Lines of what was run, and of the tables over all scenes."""
     made, scenes = record["made"], record["scenes"]
     first = scenes[0]["options"]
     lines = [
-        "# Our frames against path tracing + Open Image Denoise at equal time",
-        "",
         f"`{made['command']}` on {made['machine']}, {made['date']}, commit {made['commit']}"
         f" ({made['changed_files']} files changed), load {made['load']:.1f} at the end.",
         "",
@@ -82,9 +88,7 @@ def markdown(record: dict[str, Any]) -> str:
             "",
             *counted,
         ]
-    for scene in scenes:
-        lines += ["", *_scene(scene)]
-    return "\n".join(lines) + "\n"
+    return lines
 
 
 def _overview(scenes: list[dict[str, Any]]) -> list[str]:
