@@ -52,6 +52,8 @@ from pydantic import AfterValidator, BaseModel, Field, field_validator
 from .atomic import write_json
 
 RASTER_CHANNELS = ("R", "G", "B", "A")
+RAW_CHANNELS = ("raw.R", "raw.G", "raw.B", "A")
+"""Of a ray-traced file whose colour is denoised: what was traced."""
 GBUFFER_CHANNELS = (
     *("depth.Z", "normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V"),
     *("position.X", "position.Y", "position.Z", "object.Id", "mask", "coverage"),

@@ -11,7 +11,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .contract import BASE_CHANNELS, RASTER_CHANNELS, ContractError, DamagedFile, SceneFrame, View, require_channels
+from .contract import (
+    BASE_CHANNELS,
+    RASTER_CHANNELS,
+    RAW_CHANNELS,
+    ContractError,
+    DamagedFile,
+    SceneFrame,
+    View,
+    require_channels,
+)
 from .display import ALPHA_FLOOR, Display, DisplayTransform
 from .exr import read_exr
 
@@ -158,6 +167,7 @@ def load_views(
     cameras: Sequence[View],
     folder: Path,
     target: bool = True,
+    raw: bool = False,
     base: Base = "none",
     base_files: Sequence[Path] | None = None,
 ) -> ViewSet:
@@ -169,6 +179,7 @@ def load_views(
         frame: near/far and display transform; ``folder`` is where its LUT lies.
         cameras: the views, same order as the files; they give names and view directions.
         target: False leaves the target None (inference on novel views).
+        raw: targets as they were traced, where the files hold denoised ones.
         base: the base image (``ModelSettings.base``). raster: the raster colour of the pass files plays its part,
             all of it diffuse, without albedo and specular path; the other kinds are read from ``base_files``.
         base_files: one file per view; wanted exactly when ``base`` is neither none nor raster.
@@ -207,13 +218,14 @@ def load_views(
             maps |= _base_maps(base_file, base_channels)
         if not target:
             continue
-        image_file = pass_file
+        image_file, names = pass_file, RASTER_CHANNELS
         if image_files is not None:
             image_file = image_files[index]
             channels, _ = read_exr(image_file)
-            require_channels(image_file, channels, RASTER_CHANNELS)
+            names = RAW_CHANNELS if raw and RAW_CHANNELS[0] in channels else RASTER_CHANNELS
+            require_channels(image_file, channels, names)
             _check_size(image_file, channels, size, camera)
-        colour = _stack(image_file, channels, RASTER_CHANNELS)
+        colour = _stack(image_file, channels, names)
         maps["target"] = display.over_white(colour[:3], colour[3:])
     return _view_set(found, cameras, None if base == "none" else display)
 

@@ -132,7 +132,7 @@ def _shipped(run: Run, device: str) -> DNR | None:
         return None
     model = corrector()
     traced = [view for view in split_views(run.workspace)["train"] if view.name in names]
-    best_share(model, load(run.workspace, traced, "train", raytraced=True, base="baked"))
+    best_share(model, load(run.workspace, traced, "train", raytraced=True, raw=True, base="baked"))
     return model.to(device)
 
 

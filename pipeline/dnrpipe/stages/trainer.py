@@ -28,6 +28,7 @@ def load(
     split: str,
     *,
     raytraced: bool = False,
+    raw: bool = False,
     base: Base = "none",
     base_files: Sequence[Path] | None = None,
 ) -> ViewSet:
@@ -36,6 +37,7 @@ def load(
     Base images that are rendered bring G-buffers of their own, which are those that novel views have.
 
     Args:
+        raw: ray-traced targets before the denoiser.
         base_files: where rendered ones lie, instead of ``base/<split>``.
     """
     from dnrtrain.dataset import load_views
@@ -49,6 +51,7 @@ def load(
         cameras=views,
         folder=workspace.scene,
         target=raytraced or split in ("train", "val"),
+        raw=raw,
         base=base,
         base_files=base_files,
     )

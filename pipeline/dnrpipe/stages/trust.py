@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 from pydantic import BaseModel
 
 from dnrtrain.contract import View
@@ -56,32 +57,53 @@ def measure_trust(run: Run, model: DNR) -> Trust:
 
     ``model`` is left with that share.
     """
-    views = trust_views(run.workspace)
+    views, base = trust_views(run.workspace), run.settings.model.base
     trace_views(run, views, SPLIT, spp=SPP)
     base_views(run, views, SPLIT)
-    return best_share(model, load(run.workspace, views, SPLIT, raytraced=True, base=run.settings.model.base))
+    share = best_share(model, load(run.workspace, views, SPLIT, raytraced=True, raw=True, base=base))
+    before, after = _psnr(model, load(run.workspace, views, SPLIT, raytraced=True, base=base))
+    return Trust(share=share, psnr=(before, after))
 
 
-def best_share(model: DNR, views: ViewSet) -> Trust:
-    """The share of the model's correction that is best on views with their references. ``model`` is left with it."""
+def best_share(model: DNR, views: ViewSet) -> float:
+    """The share of the model's correction that is best on views with their references. ``model`` is left with it.
+
+    Load them raw: a denoiser's softness speaks for a soft picture, while noise adds the same to the error of all.
+    """
     import torch
 
-    from dnrtrain.metrics import psnr
     from dnrtrain.model import render_views
 
     target = views.tensors.target
     assert target is not None  # loaded with raytraced=True
 
-    def apply(share: float) -> None:
-        model.settings = model.settings.model_copy(update={"trust": share})
-
-    def quality(share: float) -> float:
-        apply(share)
-        pictures = zip(render_views(model, views), target, strict=True)
-        return sum(float(psnr(picture[None], truth[None])) for picture, truth in pictures) / len(views)
+    def error(share: float) -> float:
+        _apply(model, share)
+        return float((render_views(model, views) - target).square().mean())
 
     with torch.inference_mode():
-        found = {share: quality(share) for share in SHARES}
-    share = max(found, key=lambda share: found[share])
-    apply(share)
-    return Trust(share=share, psnr=(found[0.0], found[share]))
+        found = {share: error(share) for share in SHARES}
+    share = min(found, key=lambda share: found[share])
+    _apply(model, share)
+    return share
+
+
+def _apply(model: DNR, share: float) -> None:
+    model.settings = model.settings.model_copy(update={"trust": share})
+
+
+def _psnr(model: DNR, views: ViewSet) -> tuple[float, float]:
+    """Mean over the views, of the base image and of the model."""
+    import torch
+
+    from dnrtrain.metrics import psnr
+    from dnrtrain.model import base_picture, render_views
+
+    target = views.tensors.target
+    assert target is not None
+    with torch.inference_mode():
+        both = base_picture(views.tensors), render_views(model, views)
+    base, ours = (
+        float(np.mean([float(psnr(p[None], t[None])) for p, t in zip(some, target, strict=True)])) for some in both
+    )
+    return base, ours

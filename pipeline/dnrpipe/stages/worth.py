@@ -29,6 +29,7 @@ from .trust import SPLIT, SPP, best_share, measure_trust, trust_views
 
 if TYPE_CHECKING:
     from dnrtrain.dataset import ViewSet
+    from dnrtrain.model import DNR
 
 GROWTH = 0.42
 EPOCHS = 20
@@ -60,12 +61,14 @@ def worth(run: Run, candidates: int) -> Worth:
     settings = run.settings
     measure_trust(run, corrector())  # traces the small views
     small = trust_views(run.workspace)
-    views = load(run.workspace, small, SPLIT, raytraced=True, base="baked")
+    views, noisy = (load(run.workspace, small, SPLIT, raytraced=True, raw=raw, base="baked") for raw in (False, True))
     started, cpu = time.monotonic(), time.process_time()
     with run.console.bar("what training gains", len(HALVES)) as bar:
         found = []
         for train, test in (HALVES, HALVES[::-1]):
-            found.append(trial(run, views.subset(train), views.subset(test)))
+            before = corrector()
+            best_share(before, noisy.subset(train))
+            found.append(trial(run, before, views.subset(train), views.subset(test)))
             bar.advance()
     spent = time.monotonic() - started
     run.book("training", "scene", "trial of training", spent, cpu_seconds=time.process_time() - cpu, device="cpu")
@@ -79,14 +82,14 @@ def worth(run: Run, candidates: int) -> Worth:
     return Worth(gain=gain, seconds=seconds, views=count, expected=expected_gain(gain, count))
 
 
-def trial(run: Run, training: ViewSet, held_out: ViewSet) -> tuple[float, float]:
-    """(dB gained over the shipped corrector on the held-out views, seconds of an optimiser step)."""
+def trial(run: Run, before: DNR, training: ViewSet, held_out: ViewSet) -> tuple[float, float]:
+    """(dB gained over the shipped corrector, as far as it is trusted, on the held-out views, seconds of an optimiser
+    step)."""
     import torch
 
     from dnrtrain.checkpoint import load_model, read_record
     from dnrtrain.metrics import psnr
-    from dnrtrain.model import DNR, render_views
-    from dnrtrain.shipped import corrector
+    from dnrtrain.model import render_views
     from dnrtrain.step2 import run_step2
 
     def quality(model: DNR) -> float:
@@ -97,8 +100,6 @@ def trial(run: Run, training: ViewSet, held_out: ViewSet) -> tuple[float, float]
             return float(np.mean([float(psnr(picture[None], truth[None])) for picture, truth in pictures]))
 
     settings = run.settings
-    before = corrector()
-    best_share(before, training)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         events = run_step2(

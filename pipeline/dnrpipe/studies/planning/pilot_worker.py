@@ -146,7 +146,7 @@ class Worker:
             "steps": sum(entry.steps for entry in history),
         }
 
-    def _views(self, task: TrainTask) -> ViewSet:
+    def _views(self, task: TrainTask, *, raw: bool = False) -> ViewSet:
         from dnrtrain.dataset import load_views
 
         return load_views(
@@ -155,6 +155,7 @@ class Worker:
             read_frame(self.workspace),
             cameras=task.views,
             folder=self.workspace.scene,
+            raw=raw,
             base=self.settings.model.base,
             base_files=task.base_files,
         )
@@ -166,7 +167,7 @@ class Worker:
         if self.settings.model.base != "baked":
             return None
         model = corrector()
-        best_share(model, self._views(task))
+        best_share(model, self._views(task, raw=True))
         return model
 
     def _frames(self, task: FramesTask) -> dict[str, Any]:
