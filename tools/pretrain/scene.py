@@ -43,7 +43,8 @@ SIZES = ((96, 6), (128, 4), (192, 2))
 """(pixels a side, views), one of them drawn for a scene."""
 LIGHT_MAPS = ((256, 24), (384, 16))
 """(texels a side, paths per texel), one of them drawn for a scene."""
-REFERENCE_SPP = 64
+REFERENCE_SPP = 128
+"""Not denoised: noise of the references averages out over steps, a denoiser's softness would be learned."""
 MOST = 60000.0
 """Largest radiance that is kept: half floats end at 65504."""
 Took = Callable[[str], None]
@@ -146,7 +147,7 @@ def _look(workspace: Workspace, views: list[View], rays: list[int], seed: int, t
         repair(halves, lambda attempt, half: traced(2 + 2 * attempt + half))
         image = (halves[0] + halves[1]) / 2
         raw = half_noise(*halves)
-        target, figures = finished(engine, bundle, view, image, (halves[0], halves[1]), raw, smooth=True)
+        target, figures = finished(engine, bundle, view, image, (halves[0], halves[1]), raw, smooth=False)
         noises.append(figures["noise"] or 0.0)
         first = bases[0][number]
         channels = {**first, "depth.Z": first["depth.Z"] / engine.unit_scale}

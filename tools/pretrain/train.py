@@ -17,7 +17,6 @@ from dnrtrain.atomic import write_json
 from dnrtrain.pretrain import pretrain
 from dnrtrain.pretraining_data import SceneMaps
 from dnrtrain.shipped import WEIGHTS, corrector
-from dnrtrain.weights import load_weights
 
 HELD_OUT = 8
 """Of so many scenes one is held out."""
@@ -30,7 +29,6 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=20)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--from", dest="begin", type=Path, help="weights to go on from, e.g. the shipped ones")
-    parser.add_argument("--balance", type=float, default=0.0)
     parser.add_argument("--ship", action="store_true")
     options = parser.parse_args()
     found = [SceneMaps(path.parent) for path in sorted(options.data.glob("[0-9]*/scene.json"))]
@@ -44,9 +42,7 @@ def main() -> None:
     settings = {
         "seconds": seconds,
         "seed": options.seed,
-        "weights": load_weights(),
         "begin": begin,
-        "balance": options.balance,
     }
     for record in pretrain(training, held_out, options.folder, **settings):
         base, ours = record["psnr"]

@@ -5,14 +5,15 @@ Notation
     y      its path-traced reference, display space over white
 
 Each step draws scenes, one view and one k of each, and a square of it, then disturbs what must not matter: the
-symmetries of the square, the order of the colour channels, the level of light. The objective is step 2's, without the
-texture.
+symmetries of the square, the order of the colour channels, the level of light. References are noisy and not denoised:
+noise averages out over steps, a denoiser's softness would be learned (Lehtinen et al. 2018). Structural and perceptual
+terms would take noise for structure, so they are small or none.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,15 +27,13 @@ from .dataset import DIHEDRAL_ORDER, Batch
 from .losses import Step2Loss
 from .metrics import psnr
 from .model import DNR, base_picture
-from .perceptual import PerceptualLoss
 from .pretraining_data import SceneMaps, joined
 from .records import Epoch, Progress
 from .schedule import Averaged, adam, averaged_weights, guarded_step
 from .settings import CORRECTOR, LossWeights, ModelSettings, Step2Settings
 
 LOSS = Step2Settings(
-    perceptual_crop=32,
-    loss=LossWeights(photometric=0.0, perceptual=0.03, total_variation=0.0, regularisation=0.0),
+    loss=LossWeights(photometric=0.0, ssim=0.02, perceptual=0.0, total_variation=0.0, regularisation=0.0)
 )
 TYPICAL, LEAST = 0.02, 0.005
 """Mean absolute error of a base image: where its picture counts as much as in L1, and what is added to it."""
@@ -42,8 +41,6 @@ RATE, RATE_END = 1e-3, 2e-5
 RATE_ONWARDS = 4e-4
 """The first rate where training goes on from weights."""
 EMA = 0.999
-PERCEPTUAL_EVERY = 4
-"""Steps from one with L_p to the next: it takes half of such a step's time."""
 STOPS = 1.0
 """The level of light varies by so many stops up and down."""
 
@@ -58,9 +55,7 @@ def pretrain(
     batch: int = 4,
     side: int = 64,
     seed: int = 0,
-    weights: Mapping[str, Mapping[str, Tensor]] | None = None,
     begin: DNR | None = None,
-    balance: float = 0.0,
     every: float = 120.0,
 ) -> Iterator[dict[str, Any]]:
     """Train for so many seconds in all; yields a record every ``every`` seconds, the last one at the end.
@@ -68,7 +63,6 @@ def pretrain(
     Args:
         folder: holds the state of an interrupted training, which goes on.
         side: of the squares, pixels.
-        weights: from ``weights.load_weights``; None drops L_p.
         begin: a corrector to go on from; None: fresh.
     """
     dnr, first_rate = DNR(model, seed), RATE if begin is None else RATE_ONWARDS
@@ -84,7 +78,7 @@ def pretrain(
         checkpoint.restore_optimiser(optimiser, saved.parts["adam"])
         average.restore(saved.parts["average"], saved.progress.average_steps)
         step, spent = saved.progress.epoch, saved.progress.history[-1].seconds
-    plain, whole = Step2Loss(LOSS, None), Step2Loss(LOSS, PerceptualLoss(weights["vgg"]) if weights else None)
+    loss_of = Step2Loss(LOSS, None)
     total = 0.0
     count = 0
     told = spent
@@ -96,10 +90,9 @@ def pretrain(
         drawn = [training[int(index)].draw(random, side) for index in random.integers(len(training), size=batch)]
         pictures = joined([disturbed(picture, random) for picture in drawn])
         assert pictures.target is not None
-        loss_of = plain if step % PERCEPTUAL_EVERY else whole
         output = dnr(pictures)
         loss, _ = loss_of(output, pictures.target, random, bfloat16=False)
-        loss = loss + photometric(output.rgb, pictures, balance)
+        loss = loss + photometric(output.rgb, pictures)
         if guarded_step(optimiser, loss, rate):
             average.update()
             total, count = total + float(loss.detach()), count + 1
@@ -120,13 +113,13 @@ def pretrain(
             total, count, clock = 0.0, 0, time.monotonic()
 
 
-def photometric(rgb: Tensor, batch: Batch, balance: float) -> Tensor:
-    """Mean absolute error, of each picture over the power ``balance`` of its base image's: 1 counts a picture that is
-    good already as much as a poor one, as decibels do, 0 is L1."""
+def photometric(rgb: Tensor, batch: Batch) -> Tensor:
+    """Mean absolute error, of each picture over its base image's: one that is good already counts as much as a poor
+    one, as in decibels."""
     assert batch.target is not None
     error = (rgb - batch.target).abs().mean(dim=(1, 2, 3))
     start = (base_picture(batch) - batch.target).abs().mean(dim=(1, 2, 3))
-    return (error * ((start + LEAST) / TYPICAL) ** -balance).mean()
+    return (error * TYPICAL / (start + LEAST)).mean()
 
 
 def disturbed(batch: Batch, random: np.random.Generator) -> Batch:

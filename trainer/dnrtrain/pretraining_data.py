@@ -41,7 +41,8 @@ class Scene(BaseModel, extra="forbid", frozen=True):
 
     frame: its exposure is 0: radiance in the maps is in units of display white.
     rays: per pixel, of the base images.
-    noise: of the references, relative RMSE in display space, as `dnrpipe raytrace-selected` measures it.
+    noise: of the references, relative RMSE in display space, as `dnrpipe raytrace-selected` measures it. They are not
+        denoised.
     """
 
     seed: int
