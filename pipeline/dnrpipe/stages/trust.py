@@ -61,7 +61,7 @@ def measure_trust(run: Run, model: DNR) -> Trust:
     trace_views(run, views, SPLIT, spp=SPP)
     base_views(run, views, SPLIT)
     share = best_share(model, load(run.workspace, views, SPLIT, raytraced=True, raw=True, base=base))
-    before, after = _psnr(model, load(run.workspace, views, SPLIT, raytraced=True, base=base))
+    before, after = mean_psnr(model, load(run.workspace, views, SPLIT, raytraced=True, base=base))
     return Trust(share=share, psnr=(before, after))
 
 
@@ -92,8 +92,8 @@ def _apply(model: DNR, share: float) -> None:
     model.settings = model.settings.model_copy(update={"trust": share})
 
 
-def _psnr(model: DNR, views: ViewSet) -> tuple[float, float]:
-    """Mean over the views, of the base image and of the model."""
+def mean_psnr(model: DNR, views: ViewSet) -> tuple[float, float]:
+    """PSNR over white against the views' targets, dB, mean of the views: of the base images and of the model."""
     import torch
 
     from dnrtrain.metrics import psnr

@@ -21,11 +21,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import BaseModel
 
+from ..core.errors import UserError
 from ..core.settings import MOST_VIEWS
 from ..workers.view_tasks import worker_count
 from .stage import Run
 from .trainer import load, perceptual_weights, torch_device
-from .trust import SPLIT, SPP, best_share, measure_trust, trust_views
+from .trust import SPLIT, SPP, best_share, mean_psnr, measure_trust, trust_views
 
 if TYPE_CHECKING:
     from dnrtrain.dataset import ViewSet
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
 GROWTH = 0.42
 EPOCHS = 20
 """Of a trial."""
-HALVES = ((0, 2), (1, 3))
 
 
 class Worth(BaseModel, frozen=True):
@@ -55,17 +55,20 @@ class Worth(BaseModel, frozen=True):
 
 
 def worth(run: Run, candidates: int) -> Worth:
-    """Try it, and decide. At most MOST_VIEWS, and all candidates."""
+    """Try it, and decide. At most MOST_VIEWS, and all candidates. Raises UserError: there is but one."""
     from dnrtrain.shipped import corrector
 
+    if candidates < 2:
+        raise UserError("--budget auto: one candidate view is too few to try it; name a number of views")
     settings = run.settings
     measure_trust(run, corrector())  # traces the small views
     small = trust_views(run.workspace)
+    halves = [range(first, len(small), 2) for first in range(2)]
     views, noisy = (load(run.workspace, small, SPLIT, raytraced=True, raw=raw, base="baked") for raw in (False, True))
     started, cpu = time.monotonic(), time.process_time()
-    with run.console.bar("what training gains", len(HALVES)) as bar:
+    with run.console.bar("what training gains", len(halves)) as bar:
         found = []
-        for train, test in (HALVES, HALVES[::-1]):
+        for train, test in (halves, halves[::-1]):
             before = corrector()
             best_share(before, noisy.subset(train))
             found.append(trial(run, before, views.subset(train), views.subset(test)))
@@ -85,19 +88,8 @@ def worth(run: Run, candidates: int) -> Worth:
 def trial(run: Run, before: DNR, training: ViewSet, held_out: ViewSet) -> tuple[float, float]:
     """(dB gained over the shipped corrector, as far as it is trusted, on the held-out views, seconds of an optimiser
     step)."""
-    import torch
-
     from dnrtrain.checkpoint import load_model, read_record
-    from dnrtrain.metrics import psnr
-    from dnrtrain.model import render_views
     from dnrtrain.step2 import run_step2
-
-    def quality(model: DNR) -> float:
-        target = held_out.tensors.target
-        assert target is not None
-        with torch.inference_mode():
-            pictures = zip(render_views(model, held_out), target, strict=True)
-            return float(np.mean([float(psnr(picture[None], truth[None])) for picture, truth in pictures]))
 
     settings = run.settings
     with tempfile.TemporaryDirectory() as scratch:
@@ -120,7 +112,8 @@ def trial(run: Run, before: DNR, training: ViewSet, held_out: ViewSet) -> tuple[
         assert record is not None
         later = record.history[1:]  # the first epoch warms up
         step = sum(epoch.seconds for epoch in later) / sum(epoch.steps for epoch in later)
-        return quality(load_model(folder).cpu()) - quality(before), step
+        after = load_model(folder).cpu()
+        return mean_psnr(after, held_out)[1] - mean_psnr(before, held_out)[1], step
 
 
 def expected_gain(gain: float, views: int) -> float:
