@@ -123,7 +123,9 @@ def markdown(results: dict[str, Any]) -> str:
             told = f"{interval(values)} dB over {len(both)} scenes, worst {values[worst]:+.2f} ({worst})"
             lines.append(f"- {name} to {other}: {told}")
     shares = [rows[s, "untrained"]["seconds"] / rows[s, "fresh"]["seconds"] for s in scenes if (s, "fresh") in rows]
-    return "\n".join([*lines, f"- untrained, of fresh's seconds before the first frame: {np.mean(shares):.0%}"])
+    if shares:
+        lines.append(f"- untrained, of fresh's seconds before the first frame: {np.mean(shares):.0%}")
+    return "\n".join(lines)
 
 
 def interval(differences: dict[str, float]) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 
 from dnrpipe.core.ledger import CostRecord, UpfrontPart, break_even_frames, total, upfront_work
 from dnrpipe.studies.frames.ours import BASE, NEURAL
-from dnrpipe.studies.frames.pareto_front import crossover, frontier, quality_at
+from dnrpipe.studies.frames.pareto_front import Point, crossover, frontier, quality_at
 
 COUNTS = (200, 2000)
 """Numbers of frames that the tables speak of."""
@@ -65,19 +65,12 @@ def break_even(scene: Mapping[str, Any], figure: Figure = "psnr") -> tuple[str, 
     (our number of rays, frames, whether path tracing ends below us, so that it is that many at most): the fewest frames
     of all numbers of rays.
     """
-    sign = BETTER[figure]
-    rows = scene["rows"]
-    points = {
-        name: (row["ms"], sign * row[figure])
-        for name, row in rows.items()
-        if figure in row and not name.startswith((NEURAL, BASE))
-    }
-    line = [points[name] for name in frontier(points)]
+    rows, line = scene["rows"], _line(scene, figure)
     found = []
     for name in scene["standing"]:
         if not (line and name.startswith(NEURAL)):
             continue
-        level = crossover(line, sign * rows[name][figure])
+        level = crossover(line, BETTER[figure] * rows[name][figure])
         traced = line[-1][0] if level is None else level
         frames = break_even_frames(scene["upfront"]["total"], traced / 1000, rows[name]["ms"] / 1000)
         if frames is not None:
@@ -118,9 +111,14 @@ def _told(even: tuple[str, int, bool] | None) -> str:
     return f"{'at most ' if bound else ''}{frames} frames ({_rays(name)})"
 
 
-def _line(scene: Mapping[str, Any]) -> list[tuple[float, float]]:
-    rows = scene["rows"]
-    return [(rows[name]["ms"], rows[name]["psnr"]) for name in scene["frontier"]]
+def _line(scene: Mapping[str, Any], figure: Figure = "psnr") -> list[Point]:
+    """The baselines that nothing beats: (ms, figure, the larger the better), cheapest first."""
+    points = {
+        name: (row["ms"], BETTER[figure] * row[figure])
+        for name, row in scene["rows"].items()
+        if figure in row and not name.startswith((NEURAL, BASE))
+    }
+    return [points[name] for name in frontier(points)]
 
 
 def _rays(name: str) -> str:

@@ -39,12 +39,7 @@ def main() -> None:
     history = options.folder / "history.jsonl"
     seconds = 60 * options.minutes
     begin = corrector(options.begin) if options.begin else None
-    settings = {
-        "seconds": seconds,
-        "seed": options.seed,
-        "begin": begin,
-    }
-    for record in pretrain(training, held_out, options.folder, **settings):
+    for record in pretrain(training, held_out, options.folder, seconds=seconds, seed=options.seed, begin=begin):
         base, ours = record["psnr"]
         print(f"{record['seconds']} s, step {record['step']}: held-out {base:.2f} -> {ours:.2f} dB", flush=True)
         with history.open("a") as file:

@@ -26,6 +26,18 @@ def options(options: list[Any]) -> Callable[[Callable[..., Any]], Callable[..., 
     return lambda function: reduce(lambda decorated, option: option(decorated), reversed(options), function)
 
 
+class Budget(click.ParamType):
+    """A number of views, or ``auto``."""
+
+    name = "budget"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        try:
+            return value if value == "auto" else int(value)
+        except ValueError:
+            self.fail(f"'{value}' is neither a number of views nor auto", param, ctx)
+
+
 OUTPUT_OPTIONS = [
     click.option("--json", "as_json", is_flag=True, help="Print one JSON value; messages to stderr."),
     click.option("-q", "--quiet", is_flag=True, help="Warnings and errors only."),
@@ -63,6 +75,7 @@ SCENE_OPTIONS = [
 SELECT_OPTIONS = [
     click.option(
         "--budget",
+        type=Budget(),
         metavar="M",
         help="Views to ray-trace (default 25); 0: none, no training; auto: as many as are worth their seconds.",
     ),
@@ -127,11 +140,9 @@ def scene_overrides(options: dict[str, Any]) -> dict[str, Any]:
 def select_overrides(options: dict[str, Any]) -> dict[str, Any]:
     chosen = {key: options.pop(key) for key in ("budget", "policy")}
     given = {key: value for key, value in chosen.items() if value is not None}
-    budget = given.get("budget")
-    if budget is not None and budget != "auto":
-        if not budget.isdecimal():
-            raise UserError(f"--budget {budget}: name a number of views, at least 0, or auto")
-        given["budget"] = int(budget)
+    budget = given.get("budget", 0)
+    if budget != "auto" and budget < 0:
+        raise UserError(f"--budget {budget}: must be at least 0 views")
     return {"select": given} if given else {}
 
 

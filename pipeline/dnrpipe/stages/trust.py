@@ -52,14 +52,17 @@ def trust_views(workspace: Workspace) -> list[View]:
     return [scaled_to(view, SIDE) for view in spread(split_views(workspace)["train"], VIEWS)]
 
 
-def measure_trust(run: Run, model: DNR) -> Trust:
-    """Trace the views and their base images, where that is not done, and find the best share.
-
-    ``model`` is left with that share.
-    """
-    views, base = trust_views(run.workspace), run.settings.model.base
+def traced_small(run: Run) -> list[View]:
+    """`trust_views`, traced and with their base images: made where they are not yet."""
+    views = trust_views(run.workspace)
     trace_views(run, views, SPLIT, spp=SPP)
     base_views(run, views, SPLIT)
+    return views
+
+
+def measure_trust(run: Run, model: DNR) -> Trust:
+    """Find the best share on the small views. ``model`` is left with it."""
+    views, base = traced_small(run), run.settings.model.base
     share = best_share(model, load(run.workspace, views, SPLIT, raytraced=True, raw=True, base=base))
     before, after = mean_psnr(model, load(run.workspace, views, SPLIT, raytraced=True, base=base))
     return Trust(share=share, psnr=(before, after))

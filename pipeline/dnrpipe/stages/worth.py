@@ -7,8 +7,8 @@ Notation
     c      seconds of a view: its ray tracing, and its share of the training
     w      dB that a second is worth (``select.worth`` / 60)
 
-A view is traced as long as it gains more than it costs: G'(M) > w c. GROWTH is from the ten example scenes
-(docs/cost.md).
+A view is traced as long as it gains more than it costs: G'(M) > w c. GROWTH is from three
+scenes (docs/experiments.md).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from ..core.settings import MOST_VIEWS
 from ..workers.view_tasks import worker_count
 from .stage import Run
 from .trainer import load, perceptual_weights, torch_device
-from .trust import SPLIT, SPP, best_share, mean_psnr, measure_trust, trust_views
+from .trust import SPLIT, SPP, best_share, mean_psnr, traced_small
 
 if TYPE_CHECKING:
     from dnrtrain.dataset import ViewSet
@@ -61,8 +61,7 @@ def worth(run: Run, candidates: int) -> Worth:
     if candidates < 2:
         raise UserError("--budget auto: one candidate view is too few to try it; name a number of views")
     settings = run.settings
-    measure_trust(run, corrector())  # traces the small views
-    small = trust_views(run.workspace)
+    small = traced_small(run)
     halves = [range(first, len(small), 2) for first in range(2)]
     views, noisy = (load(run.workspace, small, SPLIT, raytraced=True, raw=raw, base="baked") for raw in (False, True))
     started, cpu = time.monotonic(), time.process_time()
