@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -94,3 +96,27 @@ def test_light_is_metered_to_the_wanted_display_value(recipe: Any) -> None:
 def test_seeds_draw_every_family(recipe: Any) -> None:
     drawn = [recipe.family_of(seed) for seed in range(200)]
     assert set(drawn) == set(recipe.FAMILIES)
+
+
+A_SMALL_SCENE = """
+import sys
+from pathlib import Path
+from tools.pretrain import scene
+scene.SIZES, scene.LIGHT_MAPS, scene.REFERENCE_SPP = ((48, 2),), ((64, 8),), 32
+scene.make(3042, Path(sys.argv[1]) / "data", Path(sys.argv[1]))
+"""
+
+
+def test_references_of_training_data_hold_the_scenes_effects(tmp_path: Path) -> None:
+    """Seed 3042 is a glass of dark liquid: traced without media, it is clear, and 8 dB further from its base image."""
+    from dnrtrain.metrics import psnr
+    from dnrtrain.model import base_picture
+    from dnrtrain.pretraining_data import SceneMaps
+
+    subprocess.run([sys.executable, "-c", A_SMALL_SCENE, str(tmp_path)], check=True, cwd=FOLDER.parent)
+    scene = SceneMaps(tmp_path / "data")
+    for view in range(2):
+        batch = scene.batch(view, 8)
+        assert batch.display is not None and batch.target is not None
+        target = batch.display.over_white(batch.target[:, :3], batch.target[:, 3:])
+        assert psnr(base_picture(batch).clamp(0, 1), target.clamp(0, 1)) > 17

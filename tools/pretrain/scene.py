@@ -28,6 +28,8 @@ from dnrpipe.core.console import Console
 from dnrpipe.core.scene_files import read_frame, read_summary
 from dnrpipe.core.settings import resolve
 from dnrpipe.core.workspace import Source, Workspace, file_sha256
+from dnrpipe.effects.plan import EffectPlan
+from dnrpipe.effects.store import plan_of
 from dnrpipe.raytrace.variants import choose_variant
 from dnrpipe.stages.prepare import scene_and_views
 from dnrpipe.stages.stage import Run
@@ -38,7 +40,8 @@ from dnrtrain.pretraining_data import BRIGHT, RAY_COUNTS, Scene, channel_names
 FACTORY = Path(__file__).resolve().parents[2] / "blender_scenes" / "factory" / "build.py"
 LEFT_OUT = ("remix",)
 """Families that are made of the example scenes: what is measured on those must come from weights that saw none."""
-DEPTH = 12
+DEPTH = 24
+"""Of the references; base images follow 16 vertices."""
 SIZES = ((96, 6), (128, 4), (192, 2))
 """(pixels a side, views), one of them drawn for a scene."""
 LIGHT_MAPS = ((256, 24), (384, 16))
@@ -79,12 +82,13 @@ def make(seed: int, folder: Path, scratch: Path) -> None:
     rays = [int(random.choice(RAY_COUNTS[:-1])), RAY_COUNTS[-1]]  # the last is what workspaces have
     side, views = SIZES[int(random.integers(len(SIZES)))]
     cameras = {"source": "animation", "train": views, "val": 0, "test": 0, "width": side, "height": side}
-    settings = resolve("draft", {"cameras": cameras, "passes": {"workers": 1}}, environment={})
+    changes = {"cameras": cameras, "passes": {"workers": 1}, "raytrace": {"max_depth": DEPTH}}
+    settings = resolve("draft", changes, environment={})
     _, by_split = scene_and_views(Run(workspace, settings, Console(quiet=True)))
     path = by_split["train"]  # all frames of the animation
     chosen = spread(path, views)
     took("convert")
-    maps, noise = _look(workspace, chosen, rays, seed, took)
+    maps, noise = _look(workspace, plan_of(workspace, settings), chosen, rays, seed, took)
     frame = read_frame(workspace)
     bright = [name.partition("@")[0] in BRIGHT for name in channel_names(rays)]
     maps[:, bright] *= 2.0**frame.exposure
@@ -108,7 +112,9 @@ def make(seed: int, folder: Path, scratch: Path) -> None:
     temporary.rename(folder)
 
 
-def _look(workspace: Workspace, views: list[View], rays: list[int], seed: int, took: Took) -> tuple[np.ndarray, float]:
+def _look(
+    workspace: Workspace, plan: EffectPlan, views: list[View], rays: list[int], seed: int, took: Took
+) -> tuple[np.ndarray, float]:
     """(float32 [views, channels, side, side], relative RMSE of the references), by this process, on one core."""
     choice = choose_variant("auto")
     os.environ.update(choice.environment)
@@ -126,7 +132,7 @@ def _look(workspace: Workspace, views: list[View], rays: list[int], seed: int, t
     engine = Engine(choice.variant, 1, [bundle])
     scene = engine.scenes[str(bundle)]
     took("load")
-    indirect = indirect_integrator(engine.mi, scene, "path", DEPTH)
+    indirect = indirect_integrator(engine.mi, scene, plan.integrator, DEPTH)
     size, spp = LIGHT_MAPS[seed % len(LIGHT_MAPS)]
     light = LightBaker(engine.mi, scene, indirect, grouped_meshes(bundle)).bake(size, spp, seed)
     took("light")
@@ -134,7 +140,7 @@ def _look(workspace: Workspace, views: list[View], rays: list[int], seed: int, t
     bases = [[r.frame(v) for v in scaled] for r in (BaseRenderer(engine.mi, scene, light, k) for k in rays)]
     took("base images")
     silhouettes = Frames(engine, bundle, "path", 2, (views[0].width, views[0].height))
-    integrator, _ = engine.integrator(bundle, "path", DEPTH)
+    integrator, _ = engine.integrator(bundle, plan.integrator, DEPTH)
     pictures, noises = [], []
     for number, view in enumerate(views):
         sensor = engine.sensor(view)

@@ -21,9 +21,9 @@ GOLDEN = (0.7548776662466927, 0.5698402909980532)
 def steps(count: int) -> np.ndarray:
     """Steps of ``count`` sequences, float32: independent, so that no number of a path follows another.
 
-    The first two are the R2 sequence's, the others the roots of primes. Raises ValueError beyond 61.
+    The first two are the R2 sequence's, the others the roots of primes. Raises ValueError beyond 168.
     """
-    primes = [n for n in range(5, 300) if all(n % d for d in range(2, math.isqrt(n) + 1))]
+    primes = [n for n in range(5, 1000) if all(n % d for d in range(2, math.isqrt(n) + 1))]
     found = [*GOLDEN, *(math.sqrt(prime) % 1 for prime in primes)]
     if count > len(found):
         raise ValueError(f"count: is {count}, there are {len(found)} steps")
