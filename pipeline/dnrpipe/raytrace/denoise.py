@@ -7,8 +7,8 @@ Notation
     auxiliary albedo and normal: what keeps the denoiser from blurring textures and edges
 
 The library is Intel's (https://www.openimagedenoise.org, Apache-2.0), bound by ``mitsuba-oidn`` (BSD-3-Clause), which
-works in Dr.Jit's thread pool. One thread gives the same bits each time; more add up the exposure in another order,
-which moves the result by about 1e-5 of its value. One call at a time: filters are shared within the process.
+works in Dr.Jit's thread pool. The same input gives the same bits with any number of threads: the exposure, which the
+library's threads would add up in any order, is given to it. One call at a time: filters are shared within the process.
 """
 
 from __future__ import annotations
@@ -21,6 +21,9 @@ import numpy as np
 from dnrpipe.core.errors import UserError
 
 Quality = Literal["high", "balanced", "fast"]
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+GREY, BLOCK, DARKEST = 0.18, 16, 1e-8
+"""The library's own exposure: mean log luminance of blocks of BLOCK² pixels goes to GREY; darker ones do not count."""
 
 
 def denoise(
@@ -138,6 +141,16 @@ def _filter(threads: int, shape: tuple[int, int], names: tuple[str, ...], qualit
     return filter_
 
 
+def _exposure(image: np.ndarray) -> float:
+    """What the network's input is multiplied with: 0.18 over the geometric mean of blocks' luminance."""
+    height, width = image.shape[:2]
+    rows, columns = np.arange(0, height, BLOCK), np.arange(0, width, BLOCK)
+    sums = np.add.reduceat(np.add.reduceat(image.clip(0) @ LUMINANCE, rows, axis=0), columns, axis=1)
+    means = sums / np.outer(np.minimum(BLOCK, height - rows), np.minimum(BLOCK, width - columns))
+    lit = means[means > DARKEST]
+    return float(GREY / np.exp2(np.log2(lit).mean())) if lit.size else 1.0
+
+
 def _filtered(images: dict[str, np.ndarray], threads: int, quality: Quality, clean_aux: bool) -> np.ndarray:
     """Run one filter. images: contiguous or strided float32 [H, W, 3] by OIDN's names."""
     _device(threads)  # says what is missing before the import below fails
@@ -154,5 +167,6 @@ def _filtered(images: dict[str, np.ndarray], threads: int, quality: Quality, cle
     for name, image in bound.items():
         filter_.set_image(name, image)
     filter_.set_image("output", result)
+    filter_.input_scale = _exposure(bound["color"])
     filter_.execute()
     return result
