@@ -27,6 +27,7 @@ from .dataset import DIHEDRAL_ORDER, Batch
 from .losses import Step2Loss
 from .metrics import psnr
 from .model import DNR, base_picture
+from .precision import decide_bfloat16
 from .pretraining_data import SceneMaps, joined
 from .records import Epoch, Progress
 from .schedule import Averaged, adam, averaged_weights, guarded_step
@@ -68,6 +69,7 @@ def pretrain(
     dnr, first_rate = DNR(model, seed), RATE if begin is None else RATE_ONWARDS
     if begin is not None:
         dnr.load_state_dict(begin.state_dict())
+    dnr.use_bfloat16 = decide_bfloat16("auto", "cpu")
     optimiser = adam([dnr], RATE, "cpu")
     average = Averaged(dnr, EMA)
     spent, step = 0.0, 0
@@ -91,7 +93,7 @@ def pretrain(
         pictures = joined([disturbed(picture, random) for picture in drawn])
         assert pictures.target is not None
         output = dnr(pictures)
-        loss, _ = loss_of(output, pictures.target, random, bfloat16=False)
+        loss, _ = loss_of(output, pictures.target, random, bfloat16=dnr.use_bfloat16)
         loss = loss + photometric(output.rgb, pictures)
         if guarded_step(optimiser, loss, rate):
             average.update()
@@ -104,7 +106,9 @@ def pretrain(
             moments = checkpoint.optimiser_tensors(optimiser)
             parts: checkpoint.Parts = {"dnr": dnr.state_dict(), "adam": moments, "average": average.sums}
             done = [Epoch(epoch=step, seconds=spent)]
-            progress = Progress(run=run, epoch=step, bfloat16=False, history=done, average_steps=average.steps)
+            progress = Progress(
+                run=run, epoch=step, bfloat16=dnr.use_bfloat16, history=done, average_steps=average.steps
+            )
             checkpoint.save_state(folder, parts, progress)
             with averaged_weights(dnr, average):
                 checkpoint.save(folder / "corrector.safetensors", dnr.state_dict(), {"settings": model.model_dump()})

@@ -79,7 +79,7 @@ def _without_training(run: Run) -> Outcome:
     from dnrtrain.shipped import corrector, save_untrained
 
     folder = run.workspace.checkpoints("step2")
-    model = corrector()
+    model = corrector(precision=run.settings.finetune.step2.precision)
     trust = measure_trust(run, model)
     run.console.say(trust.told)
     save_untrained(folder, model, run.settings.finetune.step2, run.fingerprint)

@@ -116,6 +116,7 @@ STAGES: dict[str, Stage] = {
             settings=lambda s: [_tracing(s, test=False), _light(s), _base(s)],
             make=raytrace.raytrace_selected,
             progress=raytrace.progress,
+            version=2,
         ),
         Stage(
             name="finetune",
@@ -127,7 +128,7 @@ STAGES: dict[str, Stage] = {
             settings=lambda s: [s.model.model_dump(), s.finetune.model_dump(exclude={"preview_seconds"}), _neural(s)],
             make=finetune.finetune,
             progress=finetune.progress,
-            version=2,
+            version=3,
         ),
         Stage(
             name="evaluate",
