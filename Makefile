@@ -87,9 +87,9 @@ bench-frames: setup  ## our frames against path tracing + denoiser at equal time
 	$(BIN)/python -m tools.bench_frames $(FRAMES)
 
 PRETRAIN := .cache/pretrain
-pretrain: setup  ## the shipped corrector: data (an hour and more on two cores; goes on where it stopped), training, weights
-	$(BIN)/python -m tools.pretrain.data $(PRETRAIN)/data --scenes 90
-	$(BIN)/python -m tools.pretrain.train $(PRETRAIN)/data $(PRETRAIN)/run --minutes 20 --ship
+pretrain: setup  ## the shipped corrector: data and training, about an hour in all on two cores; goes on where it stopped
+	$(BIN)/python -m tools.pretrain.data $(PRETRAIN)/data --scenes 72
+	$(BIN)/python -m tools.pretrain.train $(PRETRAIN)/data $(PRETRAIN)/run --minutes 28 --ship
 
 fidelity: setup  ## Cycles against our conversion, one feature a scene: docs/fidelity.md
 	$(BIN)/python -m tools.fidelity --docs docs --jobs $$(nproc)
