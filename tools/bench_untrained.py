@@ -12,8 +12,9 @@ Variants, at the draft preset with 8 test views of 256 samples:
 
 With `untrained` goes what `--budget auto` says of the scene: what its trial gained, and how many views it would take.
 
-Seconds are wall time of the commands from `prepare` to the first frame. Light and path depth pilot are made once, by
-`untrained`, and G-buffers of the candidates by `6 views`; all that need them count them. Views are traced anew.
+Seconds are processor time over two cores of the commands from `prepare` to the first frame: other work on the machine
+does not stretch them much. Light and path depth pilot are made once, by `untrained`, and G-buffers of the candidates by
+`6 views`; all that need them count them. Views are traced anew.
 """
 
 from __future__ import annotations
@@ -21,10 +22,10 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
 import shutil
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "25 views": ("--budget", "25", "--set", "finetune.step2.epochs=40"),
     "fresh": ("--budget", "25", "--set", "finetune.step2.epochs=40", *FRESH),
 }
+CORES = 2
 FIGURES = ("psnr", "ssim", "lpips_alex", "flip")
 
 
@@ -83,7 +85,7 @@ def measured(scene: Path, root: Path, variants: list[str]) -> list[dict[str, Any
             shared += chosen
         elif variant == "untrained":
             ledger = [json.loads(line) for line in (root / "costs.jsonl").read_text().splitlines()]
-            shared = sum(record["seconds"] for record in ledger if record["name"] in ("light", "path depth pilot"))
+            shared = sum(r["cpu_seconds"] for r in ledger if r["name"] in ("light", "path depth pilot")) / CORES
             run(root, "select", "--budget", "auto", "--set", "finetune.step2.epochs=40")
             rows[-1]["worth"] = json.loads((root / "selection.json").read_text())["details"]["worth"]
         print(f"{scene.stem}, {variant}: {mean['psnr']:.2f} dB, {seconds:.0f} s", flush=True)
@@ -91,11 +93,12 @@ def measured(scene: Path, root: Path, variants: list[str]) -> list[dict[str, Any
 
 
 def run(root: Path, command: str, *options: str) -> float:
-    """Wall seconds of a command on the workspace."""
-    started = time.monotonic()
+    """Seconds of a command on the workspace: processor time of all its processes over CORES."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     words = [sys.executable, "-m", "dnrpipe.cli", command, *options, "-w", str(root), "-q"]
     subprocess.run(words, check=True, cwd=root.parent)
-    return time.monotonic() - started
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return (after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime) / CORES
 
 
 def markdown(results: dict[str, Any]) -> str:
