@@ -35,7 +35,8 @@ MEANS = (
     *("albedo.R", "albedo.G", "albedo.B"),
 )
 CENTRES = (
-    *("chain.U", "chain.V", "chain.mask", "chain.weight", "chain.Z"),
+    *("chain.U", "chain.V", "chain.mask", "chain.weight", "chain.length"),
+    *("chain.X", "chain.Y", "chain.Z"),
     *("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z", "mask"),
 )
 NOISE = "noise"
@@ -45,6 +46,7 @@ BRIGHTEST = 1e15
 """Luminance above it counts as it where squares are summed."""
 LOST = "lost"
 """Whether a part of the sample was not finite and is left out; of a pixel, the share of such samples."""
+CHAIN = ("chain.length", "chain.X", "chain.Y", "chain.Z")
 GBUFFER = ("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z")
 
 
@@ -78,8 +80,8 @@ class BaseRenderer:
     def frame(self, view: Any, number: int = 0) -> dict[str, np.ndarray]:
         """Channels of BASE_CHANNELS and of the G-buffer: float32 [H, W] each, linear Rec.709, premultiplied.
 
-        view: in the bundle's units, as are ``depth.Z`` and ``chain.Z``, how far the first ray's path goes behind the
-        first surface. number: of the frame among those that remember; frames of other numbers cast other rays but
+        view: in the bundle's units, as are ``depth.Z`` and those of CHAIN: how far the first ray's path goes behind the
+        first surface by mirrors and clear glass, and the point where that ends. number: of the frame among those that remember; frames of other numbers cast other rays but
         for the first of each pixel. ``coverage`` is base.A, at most 1. Where cut-outs stand one
         behind the other, base.A can be above 1 as the colours are: each surface adds its opaque share.
         """
@@ -105,7 +107,7 @@ class BaseRenderer:
         }
         self.repaired = int(np.count_nonzero(channels.pop(LOST)))
         channels, self.masked = masked_channels(channels)
-        for name in (*GBUFFER, "chain.Z"):
+        for name in (*GBUFFER, *CHAIN):
             channels[name] = channels[name] * channels["mask"]
         rays = np.full(shape, self.samples, np.float32)
         return channels | {"coverage": np.minimum(channels["base.A"], 1), "rays": rays}

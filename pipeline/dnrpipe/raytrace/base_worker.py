@@ -10,7 +10,7 @@ import numpy as np
 from dnrtrain.contract import View
 from dnrtrain.exr import write_exr
 
-from .base_renderer import BaseRenderer
+from .base_renderer import CHAIN, BaseRenderer
 from .denoise import denoise
 from .engine import BundleWorker, masked
 from .frames import Frames
@@ -68,7 +68,7 @@ class Worker(BundleWorker):
         renderer = renderer or self.renderer
         channels = renderer.frame(scaled_view(view, self.engine.unit_scale), number)
         self.repaired, self.masked = self.repaired + renderer.repaired, self.masked + renderer.masked
-        for name in ("depth.Z", "chain.Z"):
+        for name in ("depth.Z", *CHAIN):
             channels[name] = channels[name] / self.engine.unit_scale
         channels["coverage"] = self._frames(view).coverage(view, channels["mask"] > 0.5)
         if isinstance(self.common, SampledCommon):

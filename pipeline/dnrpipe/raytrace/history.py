@@ -30,7 +30,8 @@ from dnrtrain.contract import View
 
 from .recorded import Recorded
 
-MOST_DIFFUSE, MOST_MIRRORED, MOST_GLOSSY = 32.0, 32.0, 16.0
+import os
+MOST_DIFFUSE, MOST_MIRRORED, MOST_GLOSSY, MOST_ROUGH_EDGE = [float(x) for x in os.environ.get("MOST","8,32,16,4").split(",")]
 """Rays of earlier frames that count: for D, for S that follows V, for S that follows P."""
 PLANE = 0.01
 """Distance from P's tangent plane over distance to the camera up to which a point lies on the same surface."""
@@ -45,7 +46,10 @@ LEAST_WEIGHT = 0.2
 CORNERS = ((0, 0), (1, 0), (0, 1), (1, 1))
 
 COLOURS = tuple(f"{kind}.{c}" for kind in ("diffuse", "base", "albedo") for c in "RGB")
-TAKEN = (*COLOURS, "base.A", "noise", "rays", "normal.X", "normal.Y", "normal.Z", "mask", "depth.Z", "chain.Z")
+TAKEN = (
+    *(*COLOURS, "base.A", "noise", "rays", "normal.X", "normal.Y", "normal.Z", "mask", "depth.Z"),
+    *("chain.length", "chain.X", "chain.Y", "chain.Z"),
+)
 """Channels that a history reads, in the kernel's order."""
 GIVEN = (*COLOURS, "base.A", "noise", "rays")
 """Channels that it changes."""
@@ -121,7 +125,8 @@ class History:
         origin = camera[0][3]
         point, virtual = (mi.Point3f(origin + sight * far) for far in (distance, distance + planes[17]))
         flat = picture.is_flat(point, normal, distance, mask)
-        away = dr.norm(virtual - origin)
+        length, end = planes[17], mi.Point3f(*planes[18:21])
+        narrow = length > 0
 
         # --------------------- Looked up where P was ----------------------
         at = _Places(mi, picture, earlier, point)
@@ -134,29 +139,30 @@ class History:
             sharp &= same[-1] & (facing.w > 0.5)
         weights, known = at.weights(same)
         d, rest, glossy = (at.bilinear(memory[i], weights) for i in (D, REST, S))
-        rays_d = dr.select(known, dr.minimum(d.w, MOST_DIFFUSE), 0)
+        even = dr.select(sharp, 1e9, MOST_ROUGH_EDGE)
+        rays_d = dr.select(known, dr.minimum(d.w, dr.minimum(even, MOST_DIFFUSE)), 0)
         d = at.spline(memory[D], sharp, d)
-        rays_s = dr.select(known, dr.minimum(at.bilinear(memory[VIRTUAL], weights).w, MOST_GLOSSY), 0)
+        rays_s = dr.select(known & ~narrow, dr.minimum(at.bilinear(memory[END], weights).w, dr.minimum(even, MOST_GLOSSY)), 0)
         squares = at.bilinear(memory[SQUARES], weights)
         low, high = picture.bounds(specular)
         s = dr.clip(mi.Color3f(glossy.xyz), low, high)
 
         # --------------------- Looked up where V was ----------------------
         at = _Places(mi, picture, earlier, virtual)
-        same, sharp, ages = [], at.inside & mask, []
+        same, sharp, ages = [], at.inside & mask & narrow, []
         for index in at.corners:
-            place, facing, seen_before = (dr.gather(mi.Vector4f, memory[i], index) for i in (PLACE, FACING, VIRTUAL))
-            on = at.inside & mask & (place.w == SURFACE) & (dr.dot(facing.xyz, normal) > TURNED)
-            same.append(on & (dr.norm(seen_before.xyz - virtual) < DISPLACED * away))
+            place, facing, ended = (dr.gather(mi.Vector4f, memory[i], index) for i in (PLACE, FACING, END))
+            on = at.inside & narrow & (place.w == SURFACE) & (dr.dot(facing.xyz, normal) > TURNED)
+            same.append(on & (dr.norm(ended.xyz - end) < DISPLACED * (distance + length)))
             sharp &= same[-1] & (facing.w > 0.5)
-            ages.append(seen_before.w)
+            ages.append(ended.w)
         weights, mirrored = at.weights(same)
         age = sum((weight * age for weight, age in zip(weights, ages, strict=True)), mi.Float(0))
         followed = at.bilinear(memory[S], weights)
         s = dr.select(mirrored, mi.Color3f(at.spline(memory[S], sharp, followed).xyz), s)
         light = dr.select(mirrored, followed.w, glossy.w)
         squares = dr.select(mirrored, at.bilinear(memory[SQUARES], weights), squares)
-        rays_s = dr.select(mirrored, dr.minimum(age, MOST_MIRRORED), rays_s)
+        rays_s = dr.select(mirrored, dr.minimum(age, dr.minimum(dr.select(sharp, 1e9, MOST_ROUGH_EDGE), MOST_MIRRORED)), rays_s)
 
         # ---------------------------- Together ----------------------------
         share, share_d = rays / (rays + rays_s), rays / (rays + rays_d)
@@ -167,12 +173,12 @@ class History:
         squares = dr.lerp(squares, bright * bright + noise * noise, share)
         error = dr.sqrt(dr.maximum(squares - light * light, 0) * share)  # of all frames by the variance of one's mean
         given = [*d, *(s + d), *albedo, alpha, error, rays + rays_s]
-        packets = [(*point, seen), (*normal, dr.select(flat, 1.0, 0.0)), (*virtual, rays + rays_s)]
+        packets = [(*point, seen), (*normal, dr.select(flat, 1.0, 0.0)), (*end, rays + rays_s)]
         packets += [(*s, light), (*d, rays + rays_d), (*albedo, alpha)]
         return given, [dr.ravel(mi.Vector4f(*packet)) for packet in packets] + [squares]
 
 
-PLACE, FACING, VIRTUAL, S, D, REST, SQUARES = range(7)
+PLACE, FACING, END, S, D, REST, SQUARES = range(7)
 """What a frame leaves behind: P and what the pixel's centre sees (SURFACE, RIM or 0); n, and 1 where the neighbours lie
 on the same surface; V and R of S; S and the luminance of base; D and its R; albedo and alpha: four values a pixel, side
 by side, which are read at once. And the square of the luminance."""

@@ -38,6 +38,9 @@ MIRRORED = 0.25
 LEAST_THROUGHPUT = 1e-3
 LEAST_RHO = 0.05
 """Diffuse reflectance from which a surface ends a chain."""
+import os
+NARROW = float(os.environ.get('NARROW','1000'))
+"""Density of a direction from which a lobe shows a picture of what it reflects: GGX of roughness 0.2 in its middle."""
 FAR = 1e6
 """Length of a chain's segment that meets no surface."""
 
@@ -107,7 +110,8 @@ class SpecularPaths:
         opacity, lost = mi.Float(0.0), mi.Bool(False)
         normal, uv, depth, covered = mi.Vector3f(0.0), mi.Point2f(0.0), mi.Float(0.0), mi.Bool(False)
         chain_uv, chain_weight, chain_ended = mi.Point2f(0.0), mi.Float(0.0), mi.Bool(False)
-        chain_length = mi.Float(0.0)
+        chain_length, chain_place = mi.Float(0.0), mi.Point3f(0.0)
+        mirrored = mi.Bool(every)  # no lobe so far has blurred what is seen
 
         while dr.hint(active, label="Specular paths"):
             si = scene.ray_intersect(ray, mi.RayFlags.All, True, active)
@@ -139,8 +143,9 @@ class SpecularPaths:
             depth = dr.select(first, dr.dot(si.p - origin, forward), depth)
 
             # ---------------------- Where the chain ends ----------------------
-            behind = going & ~straight & ~chain_ended
+            behind = going & ~straight & ~chain_ended & mirrored
             chain_length += dr.select(behind, dr.minimum(si.t, FAR), 0)
+            chain_place = dr.select(behind, ray(dr.minimum(si.t, FAR)), chain_place)
             ends = met & ~straight & ~chain_ended & (mean_of(rho) > LEAST_RHO)
             chain_uv = dr.select(ends, place, chain_uv)
             chain_weight = dr.select(ends, mean_of(throughput), chain_weight)
@@ -179,12 +184,13 @@ class SpecularPaths:
             prev_rough = rough
             straight &= passed | (null & onwards)
             unforked &= ~forked
+            mirrored &= ~onwards | null | delta | (bsdf_sample.pdf > NARROW)
             active = passed | (alive & (vertex < MAX_VERTICES))
             vertex += 1
 
         lost, chain_ended, covered = (dr.select(where, mi.Float(1), 0) for where in (lost, chain_ended, covered))
         means = [*radiance, opacity, *diffuse, *albedo]
-        return [lost, *means, *chain_uv, chain_ended, chain_weight, chain_length, *normal, *uv, depth, covered]
+        return [lost, *means, *chain_uv, chain_ended, chain_weight, chain_length, *chain_place, *normal, *uv, depth, covered]
 
     def _random_numbers(self, steps: Any, number: Any, vertex: Any) -> list[Any]:
         rows = [dr.gather(mi.Float, steps, vertex * NUMBERS + dimension) for dimension in range(NUMBERS)]
