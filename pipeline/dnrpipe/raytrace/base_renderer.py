@@ -80,10 +80,11 @@ class BaseRenderer:
     def frame(self, view: Any, number: int = 0) -> dict[str, np.ndarray]:
         """Channels of BASE_CHANNELS and of the G-buffer: float32 [H, W] each, linear Rec.709, premultiplied.
 
-        view: in the bundle's units, as are ``depth.Z`` and those of CHAIN: how far the first ray's path goes behind the
-        first surface by mirrors and clear glass, and the point where that ends. number: of the frame among those that remember; frames of other numbers cast other rays but
-        for the first of each pixel. ``coverage`` is base.A, at most 1. Where cut-outs stand one
-        behind the other, base.A can be above 1 as the colours are: each surface adds its opaque share.
+        view: in the bundle's units, as are ``depth.Z`` and those of CHAIN: how far the first ray's path goes behind
+        the first surface by mirrors and clear glass, and the point where that ends. number: of the frame among those
+        that remember; frames of other numbers cast other rays but for the first of each pixel. ``coverage`` is base.A,
+        at most 1. Where cut-outs stand one behind the other, base.A can be above 1 as the colours are: each surface
+        adds its opaque share.
         """
         import drjit as dr
 

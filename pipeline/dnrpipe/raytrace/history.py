@@ -10,10 +10,10 @@ Notation
 
     D_t = lerp(D_t-1 where P was, D of frame t, K / R)        S_t likewise, where V was
 
-D looks the same from everywhere: it is followed by P. What mirrors and glass show moves with V, unless curved ones
-bend the lines of sight: there V is not found again where it was, and S follows P for a few frames only. A pixel that
-finds neither begins anew. S that follows P is kept within what the frame's own neighbourhood shows, so that light
-which moved does not stay behind (variance clipping; Salvi 2016).
+D looks the same from everywhere: it is followed by P. What a mirror or clear glass shows moves with V, unless it is
+curved and bends the lines of sight: then the path through the place where V was ended elsewhere, and S begins anew.
+Other S follows P, for a few frames and within what the frame's own neighbourhood shows, so that light which moved does
+not stay behind (variance clipping; Salvi 2016). Where nothing is found, a pixel begins anew.
 
 Places are looked up by Catmull-Rom splines, which keep what is sharp; at rims of surfaces by those corners that lie on
 the same one.
@@ -22,6 +22,7 @@ the same one.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -30,15 +31,17 @@ from dnrtrain.contract import View
 
 from .recorded import Recorded
 
-import os
-MOST_DIFFUSE, MOST_MIRRORED, MOST_GLOSSY, MOST_ROUGH_EDGE = [float(x) for x in os.environ.get("MOST","8,32,16,4").split(",")]
-"""Rays of earlier frames that count: for D, for S that follows V, for S that follows P."""
+MOST_DIFFUSE, MOST_MIRRORED, MOST_GLOSSY, MOST_UNEVEN = 8.0, 16.0, 8.0, 2.0
+"""Rays of earlier frames that count: for D, for S that follows V, for S that follows P, and at most where the corners
+lie on several surfaces. Each lookup blurs a little, and light moves on what is not a mirror."""
+MOST_RESTING = 512.0
+"""Where the camera has not moved."""
 PLANE = 0.01
 """Distance from P's tangent plane over distance to the camera up to which a point lies on the same surface."""
 TURNED = 0.8
 """Least cosine between its normal and P's."""
-DISPLACED = 0.02
-"""Distance of virtual points over their distance to the camera up to which they are the same."""
+DISPLACED = 4.0
+"""Pixels, as large as they are at the end of a path, up to which two ends show the same."""
 SPREAD, REACH = 1.5, 2
 """Standard deviations of the neighbourhood within which S stays; pixels that it reaches to each side."""
 LEAST_WEIGHT = 0.2
@@ -67,14 +70,18 @@ class History:
 
     def __init__(self, mi: Any) -> None:
         self.mi = mi
-        self.number = 0
         self.kernel = Recorded(self._kernel)
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget."""
+        self.number = 0
         self.before: tuple[View, list[Any]] | None = None
 
     def take(self, view: View, channels: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """The channels of a frame with its base image improved by the frames before; float32 [H, W] each.
 
-        channels: of a base file with its G-buffer and ``chain.Z``, scene units, linear Rec.709, premultiplied. New are
+        channels: of TAKEN, scene units, linear Rec.709, premultiplied. New are
         those of GIVEN: ``rays`` counts those of all frames that are in a pixel's S, ``noise`` is its standard error by
         the spread of their means. A frame of another size than the one before begins anew.
         """
@@ -84,7 +91,9 @@ class History:
             self.before = view, [mi.Float(_aligned([np.zeros(n * pixels)])) for n in (4, 4, 4, 4, 4, 4, 1)]
         planes = mi.Float(_aligned([channels[name] for name in TAKEN]))
         earlier, memory = self.before
-        given, memory = self.kernel(planes, memory, self._camera(view), self._camera(earlier), view.width, view.height)
+        resting = self.number > 0 and view.c2w == earlier.c2w and view.intrinsics == earlier.intrinsics
+        cameras = self._camera(view), self._camera(earlier)
+        given, memory = self.kernel(planes, memory, *cameras, view.width, view.height, resting)
         self.before, self.number = (view, memory), self.number + 1
         found = {name: np.array(values).reshape(size) for name, values in zip(GIVEN, given, strict=True)}
         return {**channels, **found}
@@ -99,89 +108,132 @@ class History:
         return [axes, film]
 
     def _kernel(
-        self, taken: Any, memory: list[Any], camera: Any, earlier: Any, width: int, height: int
+        self, taken: Any, memory: list[Any], camera: Any, earlier: Any, width: int, height: int, resting: bool
     ) -> tuple[list[Any], list[Any]]:
-        """(planes of GIVEN, what the next frame remembers). Recorded once for a size.
+        """(planes of GIVEN, what the next frame remembers). Recorded once for a size, moving and resting.
 
         Args:
             taken: planes of TAKEN one after the other.
             memory: of the frame before; zeros where there is none.
             camera, earlier: see `_camera`.
+            resting: whether they are the same.
         """
         import drjit as dr
 
         mi = self.mi
         picture = _Picture(mi, width, height)
-        pixel = dr.arange(mi.UInt32, width * height)
-        planes = [dr.gather(mi.Float, taken, pixel + i * width * height) for i in range(len(TAKEN))]
+        planes = [dr.gather(mi.Float, taken, picture.pixel + i * width * height) for i in range(len(TAKEN))]
         diffuse, base, albedo = (mi.Color3f(*planes[i : i + 3]) for i in (0, 3, 6))
         alpha, noise, rays = planes[9:12]
-        normal, mask = mi.Normal3f(*planes[12:15]), planes[15] > 0.5
         specular, bright = base - diffuse, mi.luminance(base)
+        seen = picture.seen(camera, planes)
+        past = _rested(mi, memory) if resting else _moved(mi, picture, earlier, memory, seen, specular)
 
-        # ----------------------- Where things are -------------------------
-        depth, seen = picture.filled(planes[16], mask)
-        sight, distance = picture.sight(camera, depth)
-        origin = camera[0][3]
-        point, virtual = (mi.Point3f(origin + sight * far) for far in (distance, distance + planes[17]))
-        flat = picture.is_flat(point, normal, distance, mask)
-        length, end = planes[17], mi.Point3f(*planes[18:21])
-        narrow = length > 0
-
-        # --------------------- Looked up where P was ----------------------
-        at = _Places(mi, picture, earlier, point)
-        same, sharp = [], at.inside & mask
-        for index in at.corners:
-            place, facing = (dr.gather(mi.Vector4f, memory[i], index) for i in (PLACE, FACING))
-            on = (place.w == SURFACE) & (dr.dot(facing.xyz, normal) > TURNED)
-            on &= dr.abs(dr.dot(place.xyz - point, normal)) < PLANE * distance
-            same.append(at.inside & dr.select(mask, on, (seen == RIM) & (place.w >= RIM)))
-            sharp &= same[-1] & (facing.w > 0.5)
-        weights, known = at.weights(same)
-        d, rest, glossy = (at.bilinear(memory[i], weights) for i in (D, REST, S))
-        even = dr.select(sharp, 1e9, MOST_ROUGH_EDGE)
-        rays_d = dr.select(known, dr.minimum(d.w, dr.minimum(even, MOST_DIFFUSE)), 0)
-        d = at.spline(memory[D], sharp, d)
-        rays_s = dr.select(known & ~narrow, dr.minimum(at.bilinear(memory[END], weights).w, dr.minimum(even, MOST_GLOSSY)), 0)
-        squares = at.bilinear(memory[SQUARES], weights)
-        low, high = picture.bounds(specular)
-        s = dr.clip(mi.Color3f(glossy.xyz), low, high)
-
-        # --------------------- Looked up where V was ----------------------
-        at = _Places(mi, picture, earlier, virtual)
-        same, sharp, ages = [], at.inside & mask & narrow, []
-        for index in at.corners:
-            place, facing, ended = (dr.gather(mi.Vector4f, memory[i], index) for i in (PLACE, FACING, END))
-            on = at.inside & narrow & (place.w == SURFACE) & (dr.dot(facing.xyz, normal) > TURNED)
-            same.append(on & (dr.norm(ended.xyz - end) < DISPLACED * (distance + length)))
-            sharp &= same[-1] & (facing.w > 0.5)
-            ages.append(ended.w)
-        weights, mirrored = at.weights(same)
-        age = sum((weight * age for weight, age in zip(weights, ages, strict=True)), mi.Float(0))
-        followed = at.bilinear(memory[S], weights)
-        s = dr.select(mirrored, mi.Color3f(at.spline(memory[S], sharp, followed).xyz), s)
-        light = dr.select(mirrored, followed.w, glossy.w)
-        squares = dr.select(mirrored, at.bilinear(memory[SQUARES], weights), squares)
-        rays_s = dr.select(mirrored, dr.minimum(age, dr.minimum(dr.select(sharp, 1e9, MOST_ROUGH_EDGE), MOST_MIRRORED)), rays_s)
-
-        # ---------------------------- Together ----------------------------
-        share, share_d = rays / (rays + rays_s), rays / (rays + rays_d)
-        s, d = dr.lerp(s, specular, share), dr.lerp(mi.Color3f(d.xyz), diffuse, share_d)
-        albedo = dr.lerp(mi.Color3f(rest.xyz), albedo, share_d)
-        alpha = dr.lerp(rest.w, alpha, share_d)
-        light = dr.lerp(light, bright, share)
-        squares = dr.lerp(squares, bright * bright + noise * noise, share)
+        share, share_d = rays / (rays + past.rays_s), rays / (rays + past.rays_d)
+        s, d = dr.lerp(past.s, specular, share), dr.lerp(past.d, diffuse, share_d)
+        albedo, alpha = dr.lerp(past.albedo, albedo, share_d), dr.lerp(past.alpha, alpha, share_d)
+        light = dr.lerp(past.light, bright, share)
+        squares = dr.lerp(past.squares, bright * bright + noise * noise, share)
         error = dr.sqrt(dr.maximum(squares - light * light, 0) * share)  # of all frames by the variance of one's mean
-        given = [*d, *(s + d), *albedo, alpha, error, rays + rays_s]
-        packets = [(*point, seen), (*normal, dr.select(flat, 1.0, 0.0)), (*end, rays + rays_s)]
-        packets += [(*s, light), (*d, rays + rays_d), (*albedo, alpha)]
-        return given, [dr.ravel(mi.Vector4f(*packet)) for packet in packets] + [squares]
+        given = [*d, *(s + d), *albedo, alpha, error, rays + past.rays_s]
+        packets = [(*seen.point, seen.kind), (*seen.normal, dr.select(seen.flat, 1.0, 0.0))]
+        packets += [(*seen.end, rays + past.rays_s), (*s, light), (*d, rays + past.rays_d), (*albedo, alpha)]
+        return given, [*(dr.ravel(mi.Vector4f(*packet)) for packet in packets), squares]
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What a frame sees, an array element per pixel: n, P, what is at the centre, whether the neighbours lie on P's
+    surface; V, the end of the path and its length behind P; distance of P and the camera's place."""
+
+    normal: Any
+    point: Any
+    kind: Any
+    flat: Any
+    virtual: Any
+    end: Any
+    length: Any
+    distance: Any
+
+
+@dataclass(frozen=True)
+class _Past:
+    """What earlier frames say of each pixel, and how many rays of theirs count (0: nothing is known).
+
+    light, squares: luminance of the base image, and the mean of its square.
+    """
+
+    s: Any
+    d: Any
+    albedo: Any
+    alpha: Any
+    light: Any
+    squares: Any
+    rays_s: Any
+    rays_d: Any
+
+
+def _rested(mi: Any, memory: list[Any]) -> _Past:
+    """Each pixel is where it was."""
+    import drjit as dr
+
+    pixel = dr.arange(mi.UInt32, dr.width(memory[SQUARES]))
+    s, d, rest, end = (dr.gather(mi.Vector4f, memory[i], pixel) for i in (S, D, REST, END))
+    counts = [dr.minimum(rays, MOST_RESTING) for rays in (end.w, d.w)]
+    return _Past(_rgb(mi, s), _rgb(mi, d), _rgb(mi, rest), rest.w, s.w, memory[SQUARES], *counts)
+
+
+def _moved(mi: Any, picture: _Picture, earlier: Any, memory: list[Any], seen: _Seen, specular: Any) -> _Past:
+    """Looked up where P and V were. specular: S of the frame."""
+    import drjit as dr
+
+    mask, narrow = seen.kind == SURFACE, seen.length > 0
+    near = DISPLACED * (seen.distance + seen.length) / earlier[1][0]
+
+    # ------------------------- Where P was ----------------------------
+    at = _Places(mi, picture, earlier, seen.point)
+    same, sharp = [], at.inside & mask
+    for index in at.corners:
+        place, facing = (dr.gather(mi.Vector4f, memory[i], index) for i in (PLACE, FACING))
+        on = (place.w == SURFACE) & (dr.dot(facing.xyz, seen.normal) > TURNED)
+        on &= dr.abs(dr.dot(place.xyz - seen.point, seen.normal)) < PLANE * seen.distance
+        same.append(at.inside & dr.select(mask, on, (seen.kind == RIM) & (place.w >= RIM)))
+        sharp &= same[-1] & (facing.w > 0.5)
+    weights, known = at.weights(same)
+    d, rest, s, end = (at.bilinear(memory[i], weights) for i in (D, REST, S, END))
+    most_d, most_s = (dr.select(sharp, most, MOST_UNEVEN) for most in (MOST_DIFFUSE, MOST_GLOSSY))
+    rays_d = dr.select(known, dr.minimum(d.w, most_d), 0)
+    rays_s = dr.select(known & ~narrow, dr.minimum(end.w, most_s), 0)
+    squares = at.bilinear(memory[SQUARES], weights)
+    low, high = picture.bounds(specular)
+    colour, light = dr.clip(_rgb(mi, s), low, high), s.w
+    d = at.spline(memory[D], sharp, d)
+
+    # ------------------------- Where V was ----------------------------
+    at = _Places(mi, picture, earlier, seen.virtual)
+    same, sharp = [], at.inside & mask & narrow
+    for index in at.corners:
+        place, facing, end = (dr.gather(mi.Vector4f, memory[i], index) for i in (PLACE, FACING, END))
+        on = at.inside & narrow & (place.w == SURFACE) & (dr.dot(facing.xyz, seen.normal) > TURNED)
+        same.append(on & (dr.norm(end.xyz - seen.end) < near))
+        sharp &= same[-1] & (facing.w > 0.5)
+    weights, mirrored = at.weights(same)
+    s, end = (at.bilinear(memory[i], weights) for i in (S, END))
+    colour = dr.select(mirrored, _rgb(mi, at.spline(memory[S], sharp, s)), colour)
+    light = dr.select(mirrored, s.w, light)
+    squares = dr.select(mirrored, at.bilinear(memory[SQUARES], weights), squares)
+    rays_s = dr.select(mirrored, dr.minimum(end.w, dr.select(sharp, MOST_MIRRORED, MOST_UNEVEN)), rays_s)
+    return _Past(colour, _rgb(mi, d), _rgb(mi, rest), rest.w, light, squares, rays_s, rays_d)
+
+
+def _rgb(mi: Any, packet: Any) -> Any:
+    return mi.Color3f(packet.x, packet.y, packet.z)
 
 
 PLACE, FACING, END, S, D, REST, SQUARES = range(7)
 """What a frame leaves behind: P and what the pixel's centre sees (SURFACE, RIM or 0); n, and 1 where the neighbours lie
-on the same surface; V and R of S; S and the luminance of base; D and its R; albedo and alpha: four values a pixel, side
-by side, which are read at once. And the square of the luminance."""
+on the same surface; where the path ends, and R of S; S and the luminance of base; D and its R; albedo and alpha: four
+values a pixel, side by side, which are read at once. And the mean square of the luminance."""
 
 
 def _aligned(planes: list[np.ndarray]) -> np.ndarray:
@@ -204,8 +256,8 @@ class _Picture:
         import drjit as dr
 
         self.mi, self.width, self.height = mi, width, height
-        pixel = dr.arange(mi.Int32, width * height)
-        self.x, self.y = pixel % width, pixel // width
+        self.pixel = dr.arange(mi.UInt32, width * height)
+        self.x, self.y = mi.Int32(self.pixel % width), mi.Int32(self.pixel // width)
 
     def index(self, right: int, below: int) -> Any:
         """Of the neighbours so far away."""
@@ -213,29 +265,29 @@ class _Picture:
 
         return dr.clip(self.y + below, 0, self.height - 1) * self.width + dr.clip(self.x + right, 0, self.width - 1)
 
-    def filled(self, depth: Any, mask: Any) -> tuple[Any, Any]:
-        """(depth, at rims that of the nearest neighbour that sees a surface; SURFACE, RIM or 0)."""
+    def seen(self, camera: Any, planes: list[Any]) -> _Seen:
+        """What the frame sees. planes: of TAKEN."""
         import drjit as dr
 
         mi = self.mi
-        nearest = mi.Float(dr.inf)
+        (right, up, back, origin), (fl_x, fl_y, cx, cy) = camera
+        normal, mask, depth = mi.Normal3f(*planes[12:15]), planes[15] > 0.5, planes[16]
+        nearest = mi.Float(dr.inf)  # at rims: of the neighbours that see a surface
         for below in (-1, 0, 1):
-            for right in (-1, 0, 1):
-                index = self.index(right, below)
-                beside = dr.gather(mi.Float, depth, index)
-                nearest = dr.minimum(nearest, dr.select(dr.gather(mi.Bool, mask, index), beside, dr.inf))
+            for right_ in (-1, 0, 1):
+                index = self.index(right_, below)
+                beside = dr.select(dr.gather(mi.Bool, mask, index), dr.gather(mi.Float, depth, index), dr.inf)
+                nearest = dr.minimum(nearest, beside)
         rim = ~mask & dr.isfinite(nearest)
-        return dr.select(mask, depth, dr.select(rim, nearest, 0)), dr.select(mask, SURFACE, dr.select(rim, RIM, 0.0))
-
-    def sight(self, camera: Any, depth: Any) -> tuple[Any, Any]:
-        """(unit direction through each pixel's centre, distance along it) of points of that planar depth."""
-        import drjit as dr
-
-        (right, up, back, _), (fl_x, fl_y, cx, cy) = camera
-        x, y = (self.mi.Float(self.x) + 0.5 - cx) / fl_x, (self.mi.Float(self.y) + 0.5 - cy) / fl_y
-        direction = self.mi.Vector3f(right * x - up * y - back)
-        length = dr.norm(direction)
-        return direction / length, depth * length
+        depth = dr.select(mask, depth, dr.select(rim, nearest, 0))
+        kind = dr.select(mask, SURFACE, dr.select(rim, RIM, 0.0))
+        x, y = (mi.Float(self.x) + 0.5 - cx) / fl_x, (mi.Float(self.y) + 0.5 - cy) / fl_y
+        sight = mi.Vector3f(right * x - up * y - back)
+        distance, sight = depth * dr.norm(sight), dr.normalize(sight)
+        length, end = planes[17], mi.Point3f(*planes[18:21])
+        point, virtual = (mi.Point3f(origin + sight * far) for far in (distance, distance + length))
+        flat = self.is_flat(point, normal, distance, mask)
+        return _Seen(normal, point, kind, flat, virtual, end, length, distance)
 
     def is_flat(self, point: Any, normal: Any, distance: Any, mask: Any) -> Any:
         """Whether the four neighbours lie on the pixel's surface."""

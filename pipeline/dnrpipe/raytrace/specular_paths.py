@@ -38,9 +38,8 @@ MIRRORED = 0.25
 LEAST_THROUGHPUT = 1e-3
 LEAST_RHO = 0.05
 """Diffuse reflectance from which a surface ends a chain."""
-import os
-NARROW = float(os.environ.get('NARROW','1000'))
-"""Density of a direction from which a lobe shows a picture of what it reflects: GGX of roughness 0.2 in its middle."""
+NARROW = 1000.0
+"""Density of a direction from which a lobe shows a sharp picture of what it reflects: GGX of roughness 0.1."""
 FAR = 1e6
 """Length of a chain's segment that meets no surface."""
 
@@ -190,7 +189,19 @@ class SpecularPaths:
 
         lost, chain_ended, covered = (dr.select(where, mi.Float(1), 0) for where in (lost, chain_ended, covered))
         means = [*radiance, opacity, *diffuse, *albedo]
-        return [lost, *means, *chain_uv, chain_ended, chain_weight, chain_length, *chain_place, *normal, *uv, depth, covered]
+        return [
+            lost,
+            *means,
+            *chain_uv,
+            chain_ended,
+            chain_weight,
+            chain_length,
+            *chain_place,
+            *normal,
+            *uv,
+            depth,
+            covered,
+        ]
 
     def _random_numbers(self, steps: Any, number: Any, vertex: Any) -> list[Any]:
         rows = [dr.gather(mi.Float, steps, vertex * NUMBERS + dimension) for dimension in range(NUMBERS)]
