@@ -81,9 +81,9 @@ class History:
     def take(self, view: View, channels: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """The channels of a frame with its base image improved by the frames before; float32 [H, W] each.
 
-        channels: of TAKEN, scene units, linear Rec.709, premultiplied. New are
-        those of GIVEN: ``rays`` counts those of all frames that are in a pixel's S, ``noise`` is its standard error by
-        the spread of their means. A frame of another size than the one before begins anew.
+        channels: of TAKEN, scene units, linear Rec.709, premultiplied. New are those of GIVEN: ``rays`` counts those of
+        all frames that are in a pixel's S, ``noise`` is the standard error of base by the spread of the frames' means.
+        A frame of another size than the one before begins anew.
         """
         mi, size = self.mi, (view.height, view.width)
         if self.before is None or (self.before[0].height, self.before[0].width) != size:
