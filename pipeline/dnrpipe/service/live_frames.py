@@ -73,7 +73,7 @@ class Worker:
             functools.partial(Frames, self.engine, self.bundle, *tracing)
         )  # by (width, height)
         self.renderers: dict[int, BaseRenderer] = {}
-        remembers = self.base is not None and self.kind == "baked" and not common["base"]["denoise"]
+        remembers = self.kind == "baked" and not (common["base"] or {}).get("denoise")
         self.history = History(self.engine.mi) if remembers else None
         self.resting: View | None = None  # of the last frame, where that was at rest
         self.traced: tuple[str, np.ndarray, int] | None = None
