@@ -92,7 +92,7 @@ def _orbit(socket: Any, size: int, seconds: float, console: Console) -> dict[str
             if isinstance(message, str):
                 raise UserError(json.loads(message)["detail"])
             header = unpack(message)[0]
-            if header["moving"] == moving:
+            if header["moving"] == moving and not header["refined"]:
                 return header, 1000 * (time.perf_counter() - started)
 
     with console.bar("warming up", WARM_FRAMES) as bar:

@@ -44,11 +44,14 @@ class Viewer:
         }
         self.socket.send(json.dumps({"camera": camera, "size": size, "mode": mode, "moving": moving}))
 
-    def frame(self) -> tuple[dict[str, Any], np.ndarray]:
-        """(header, picture [H, W, 3] in [0, 1])."""
-        message = self.socket.recv(timeout=120)
-        assert isinstance(message, bytes), message
-        header, data = unpack(message)
+    def frame(self, refined: bool = False) -> tuple[dict[str, Any], np.ndarray]:
+        """(header, picture [H, W, 3] in [0, 1]). refined: also frames that add samples to the one before."""
+        while True:
+            message = self.socket.recv(timeout=120)
+            assert isinstance(message, bytes), message
+            header, data = unpack(message)
+            if refined or not header["refined"]:
+                break
         picture = Image.open(io.BytesIO(data))
         assert picture.get_format_mimetype() == header["type"]
         return header, np.asarray(picture.convert("RGB"), np.float32) / 255
@@ -90,11 +93,30 @@ def test_a_reference_gets_better(server: Server, trained: str) -> None:
     with connect(url, max_size=None) as socket:
         viewer = Viewer(socket)
         viewer.ask("reference", azimuth=2.5)  # a view that has no samples yet
-        frames = [viewer.frame() for _ in range(12)]
+        frames = [viewer.frame(refined=True) for _ in range(12)]
         assert [header["spp"] for header, _ in frames] == [4 * (i + 1) for i in range(12)]
         last = frames[-1][1]
         errors = [float(np.square(picture - last).mean()) for _, picture in frames]
         assert errors[0] > 2 * errors[5] > 0
+
+
+def test_a_view_at_rest_gathers_rays(server: Server, trained: str) -> None:
+    """Up to 64 rays a pixel, closer and closer to what they show; a moving camera's frames remember, too."""
+    url = server.url.replace("http", "ws") + f"/workspaces/{trained}/live"
+    with connect(url, max_size=None) as socket:
+        viewer = Viewer(socket)
+        viewer.ask("base", azimuth=2.0)
+        frames = [viewer.frame(refined=True) for _ in range(32)]
+        assert [header["rays"] for header, _ in frames] == [2 * (i + 1) for i in range(32)], "two rays a frame"
+        assert [header["refined"] for header, _ in frames] == list(range(32))
+        with pytest.raises(TimeoutError):
+            socket.recv(timeout=1)
+        errors = [float(np.square(picture - frames[-1][1]).mean()) for _, picture in frames]
+        assert errors[0] > 2 * errors[5] > 4 * errors[20]
+        for azimuth in (2.02, 2.04):
+            viewer.ask("base", azimuth=azimuth, moving=True)
+            header, _ = viewer.frame()
+        assert header["moving"] and header["rays"] > header["samples"]
 
 
 def test_bad_requests_do_no_harm(server: Server, trained: str) -> None:

@@ -12,8 +12,9 @@ Notation
     diffuse  = the first vertex's share of it
     noise    = standard error of base's luminance by the spread of the pixel's samples; 0 with one sample
 
-The numbers that choose directions come from Kronecker sequences over the samples of a tile of TILE² pixels, the same
-in every frame: sample s of a pixel at place t of its tile has the number s TILE² + t.
+The numbers that choose directions come from Kronecker sequences over the samples of a tile of TILE² pixels: sample s of
+a pixel at place t of its tile has the number s TILE² + t. They are the same in every picture but in frames that follow
+one another and remember (`dnrtrain.history`): there frame f goes on where f - 1 ended.
 Emitter sampling serves a path's first glossy vertex; multiple importance sampling joins it with hits of emitters.
 """
 
@@ -34,14 +35,18 @@ MEANS = (
     *("albedo.R", "albedo.G", "albedo.B"),
 )
 CENTRES = (
-    *("chain.U", "chain.V", "chain.mask", "chain.weight"),
+    *("chain.U", "chain.V", "chain.mask", "chain.weight", "chain.length"),
+    *("chain.X", "chain.Y", "chain.Z"),
     *("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z", "mask"),
 )
 NOISE = "noise"
+FRAMES = 64
+"""Frames after which the sequences begin again: what is remembered is younger."""
 BRIGHTEST = 1e15
 """Luminance above it counts as it where squares are summed."""
 LOST = "lost"
 """Whether a part of the sample was not finite and is left out; of a pixel, the share of such samples."""
+CHAIN = ("chain.length", "chain.X", "chain.Y", "chain.Z")
 GBUFFER = ("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z")
 
 
@@ -72,11 +77,14 @@ class BaseRenderer:
         # Recorded at the first call: tracing the plugins anew would take longer than the frame itself.
         self.kernel = Recorded(self._kernel, scene)
 
-    def frame(self, view: Any) -> dict[str, np.ndarray]:
+    def frame(self, view: Any, number: int = 0) -> dict[str, np.ndarray]:
         """Channels of BASE_CHANNELS and of the G-buffer: float32 [H, W] each, linear Rec.709, premultiplied.
 
-        view: in the bundle's units, as is ``depth.Z``. ``coverage`` is base.A, at most 1. Where cut-outs stand one
-        behind the other, base.A can be above 1 as the colours are: each surface adds its opaque share.
+        view: in the bundle's units, as are ``depth.Z`` and those of CHAIN: how far the first ray's path goes behind
+        the first surface by mirrors and clear glass, and the point where that ends. number: of the frame among those
+        that remember; frames of other numbers cast other rays but for the first of each pixel. ``coverage`` is base.A,
+        at most 1. Where cut-outs stand one behind the other, base.A can be above 1 as the colours are: each surface
+        adds its opaque share.
         """
         import drjit as dr
 
@@ -84,12 +92,13 @@ class BaseRenderer:
         axes = [mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in m[:3, i])) for i in range(4)]
         film = [dr.opaque(mi.Float, float(v)) for v in (view.fl_x, view.fl_y, view.cx, view.cy)]
         rays = dr.opaque(mi.UInt32, self.samples)  # as data: the kernel is the same for all numbers of them
+        turn = dr.opaque(mi.UInt32, number % FRAMES)
         names = (LOST, *MEANS, *CENTRES, NOISE)
         rows = max(1, min(view.height, MAX_RAYS // (view.width * self.samples)))
         bands: list[list[np.ndarray]] = []
         for first in range(0, view.height, rows):
             start, count = dr.opaque(mi.UInt32, first), min(rows, view.height - first)
-            values = self.kernel(self.scene, self.light, self.tables, axes, film, rays, start, view.width, count)
+            values = self.kernel(self.scene, self.light, self.tables, axes, film, rays, turn, start, view.width, count)
             dr.eval(values)
             bands.append([np.array(value) for value in values])
         shape = (view.height, view.width)
@@ -99,7 +108,7 @@ class BaseRenderer:
         }
         self.repaired = int(np.count_nonzero(channels.pop(LOST)))
         channels, self.masked = masked_channels(channels)
-        for name in GBUFFER:
+        for name in (*GBUFFER, *CHAIN):
             channels[name] = channels[name] * channels["mask"]
         rays = np.full(shape, self.samples, np.float32)
         return channels | {"coverage": np.minimum(channels["base.A"], 1), "rays": rays}
@@ -112,6 +121,7 @@ class BaseRenderer:
         axes: Any,
         film: Any,
         rays: Any,
+        turn: Any,
         start: Any,
         width: int,
         height: int,
@@ -127,6 +137,7 @@ class BaseRenderer:
             axes: the camera's axes and its place, columns of c2w.
             film: fl_x, fl_y, cx, cy in pixels.
             rays: ``self.samples``.
+            turn: number of the frame.
             start: the first row.
         """
         import drjit as dr
@@ -136,12 +147,15 @@ class BaseRenderer:
         pixel, sample = index // rays, index % rays
         x, y = pixel % width, start + pixel // width
         tile = dr.gather(mi.UInt32, tables[0], (y % TILE) * TILE + x % TILE)
-        number, place = mi.Float(sample * (TILE * TILE) + tile), mi.Float(sample)
+        order = mi.Float(sample * (TILE * TILE) + tile)
+        number = order + mi.Float(turn * rays * (TILE * TILE))
+        order = fraction((order + 0.5) / mi.Float(rays * (TILE * TILE)) + mi.Float(turn) * GOLDEN[0])
+        place = dr.select(sample == 0, 0, mi.Float(sample + turn * (rays - 1)))
         right = mi.Float(x) + fraction(0.5 + place * GOLDEN[0]) - film[2]
         down = mi.Float(y) + fraction(0.5 + place * GOLDEN[1]) - film[3]
         direction = axes[0] * (right / film[0]) - axes[1] * (down / film[1]) - axes[2]
         ray = mi.Ray3f(mi.Point3f(axes[3]), dr.normalize(direction))
-        values = self.paths.trace(scene, light, tables[1], ray, -axes[2], number, rays)
+        values = self.paths.trace(scene, light, tables[1], ray, -axes[2], number, order)
         bright = dr.minimum(mi.luminance(mi.Color3f(*values[1:4])), BRIGHTEST)
         values.insert(1 + len(MEANS), bright * bright)
         values.insert(1 + len(MEANS), bright)

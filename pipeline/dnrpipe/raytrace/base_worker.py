@@ -10,7 +10,7 @@ import numpy as np
 from dnrtrain.contract import View
 from dnrtrain.exr import write_exr
 
-from .base_renderer import BaseRenderer
+from .base_renderer import CHAIN, BaseRenderer
 from .denoise import denoise
 from .engine import BundleWorker, masked
 from .frames import Frames
@@ -60,15 +60,16 @@ class Worker(BundleWorker):
         write_exr(task.output, channels, header)
         return answer
 
-    def channels(self, view: View, renderer: BaseRenderer | None = None) -> dict[str, np.ndarray]:
+    def channels(self, view: View, renderer: BaseRenderer | None = None, number: int = 0) -> dict[str, np.ndarray]:
         """Base image and G-buffer of a view in scene units: linear Rec.709, float32 [H, W] each.
 
-        renderer: one with another number of samples.
+        renderer: one with another number of samples. number: see `BaseRenderer.frame`.
         """
         renderer = renderer or self.renderer
-        channels = renderer.frame(scaled_view(view, self.engine.unit_scale))
+        channels = renderer.frame(scaled_view(view, self.engine.unit_scale), number)
         self.repaired, self.masked = self.repaired + renderer.repaired, self.masked + renderer.masked
-        channels["depth.Z"] = channels["depth.Z"] / self.engine.unit_scale
+        for name in ("depth.Z", *CHAIN):
+            channels[name] = channels[name] / self.engine.unit_scale
         channels["coverage"] = self._frames(view).coverage(view, channels["mask"] > 0.5)
         if isinstance(self.common, SampledCommon):
             return channels | self._traced(self.common, view, channels)

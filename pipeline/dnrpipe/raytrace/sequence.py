@@ -1,4 +1,4 @@
-"""Numbers of base images' paths: Kronecker sequences over the samples of a tile of pixels, the same in every frame.
+"""Numbers of base images' paths: Kronecker sequences over the samples of a tile of pixels.
 
 Sample s of a pixel at place t of its tile has the number s TILE² + t.
 """

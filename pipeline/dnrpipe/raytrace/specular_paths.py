@@ -25,7 +25,7 @@ from .lobes import (
     specular_context,
 )
 from .paths import power_heuristic
-from .sequence import TILE, fraction, steps
+from .sequence import fraction, steps
 from .texels import ATTRIBUTE
 from .visibility import LAMP_PREFIX, UNSEEN_PREFIX, is_one_of
 
@@ -38,6 +38,10 @@ MIRRORED = 0.25
 LEAST_THROUGHPUT = 1e-3
 LEAST_RHO = 0.05
 """Diffuse reflectance from which a surface ends a chain."""
+NARROW = 1000.0
+"""Density of a direction from which a lobe shows a sharp picture of what it reflects: GGX of roughness 0.1."""
+FAR = 1e6
+"""Length of a chain's segment that meets no surface."""
 
 
 class SpecularPaths:
@@ -71,19 +75,18 @@ class SpecularPaths:
         self.refracted = context_of(mi, kinds.DeltaTransmission, kinds.GlossyTransmission)
 
     @dr.syntax
-    def trace(self, scene: Any, light: Any, steps: Any, ray: Any, forward: Any, number: Any, samples: Any) -> list[Any]:
+    def trace(self, scene: Any, light: Any, steps: Any, ray: Any, forward: Any, number: Any, order: Any) -> list[Any]:
         """One sample along each ray -> the values that `base_renderer` names by LOST, MEANS and CENTRES, in that order.
 
         Args:
             light: E and S of the front and of the back, two textures of six channels.
             steps: of the random numbers, ``self.steps``.
             forward: where the camera looks, in world space.
-            number: the samples' places in the sequence.
-            samples: rays per pixel.
+            number: the samples' places in the sequences, not negative.
+            order: their places among those of a tile, in [0, 1): which of them the first glass reflects.
         """
         origin = mi.Point3f(ray.o)
         every = number >= 0
-        order = (number + 0.5) / mi.Float(samples * (TILE * TILE))
 
         # ------------------------------ The path ------------------------------
         active = mi.Bool(every)
@@ -106,6 +109,8 @@ class SpecularPaths:
         opacity, lost = mi.Float(0.0), mi.Bool(False)
         normal, uv, depth, covered = mi.Vector3f(0.0), mi.Point2f(0.0), mi.Float(0.0), mi.Bool(False)
         chain_uv, chain_weight, chain_ended = mi.Point2f(0.0), mi.Float(0.0), mi.Bool(False)
+        chain_length, chain_place = mi.Float(0.0), mi.Point3f(0.0)
+        mirrored = mi.Bool(every)  # no lobe so far has blurred what is seen
 
         while dr.hint(active, label="Specular paths"):
             si = scene.ray_intersect(ray, mi.RayFlags.All, True, active)
@@ -137,6 +142,9 @@ class SpecularPaths:
             depth = dr.select(first, dr.dot(si.p - origin, forward), depth)
 
             # ---------------------- Where the chain ends ----------------------
+            behind = going & ~straight & ~chain_ended & mirrored
+            chain_length += dr.select(behind, dr.minimum(si.t, FAR), 0)
+            chain_place = dr.select(behind, ray(dr.minimum(si.t, FAR)), chain_place)
             ends = met & ~straight & ~chain_ended & (mean_of(rho) > LEAST_RHO)
             chain_uv = dr.select(ends, place, chain_uv)
             chain_weight = dr.select(ends, mean_of(throughput), chain_weight)
@@ -175,12 +183,25 @@ class SpecularPaths:
             prev_rough = rough
             straight &= passed | (null & onwards)
             unforked &= ~forked
+            mirrored &= ~onwards | null | delta | (bsdf_sample.pdf > NARROW)
             active = passed | (alive & (vertex < MAX_VERTICES))
             vertex += 1
 
         lost, chain_ended, covered = (dr.select(where, mi.Float(1), 0) for where in (lost, chain_ended, covered))
         means = [*radiance, opacity, *diffuse, *albedo]
-        return [lost, *means, *chain_uv, chain_ended, chain_weight, *normal, *uv, depth, covered]
+        return [
+            lost,
+            *means,
+            *chain_uv,
+            chain_ended,
+            chain_weight,
+            chain_length,
+            *chain_place,
+            *normal,
+            *uv,
+            depth,
+            covered,
+        ]
 
     def _random_numbers(self, steps: Any, number: Any, vertex: Any) -> list[Any]:
         rows = [dr.gather(mi.Float, steps, vertex * NUMBERS + dimension) for dimension in range(NUMBERS)]

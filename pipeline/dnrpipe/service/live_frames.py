@@ -7,6 +7,9 @@ A worker of `dnrpipe.workers.processes`. What it renders (`mode`):
     reference   path-traced; every request for the same view adds samples
     error       FLIP between neural and reference so far
     nearest     the ray-traced picture of a training view
+
+Base images remember the frames before (`raytrace.history`): those of a moving camera, and of one at rest, whose first
+frame begins anew and whose every further frame adds rays.
 """
 
 from __future__ import annotations
@@ -29,6 +32,7 @@ from dnrpipe.raytrace.base_renderer import BaseRenderer
 from dnrpipe.raytrace.base_worker import Worker as BaseWorker
 from dnrpipe.raytrace.engine import Engine, masked, masked_channels
 from dnrpipe.raytrace.frames import Frames
+from dnrpipe.raytrace.history import History
 from dnrpipe.raytrace.light_worker import read_light
 from dnrpipe.stages.trainer import torch_device
 from dnrpipe.studies.frames.scene import shown
@@ -48,7 +52,8 @@ class Worker:
     "integrator", "max_depth", "base": common of the base image worker or None}.
     task: {"view" as JSON, "mode", "samples": rays per pixel of a base image, None for the model's own, "spp": to add to
     a reference, "fine": best quality, "file": for nearest}; the answer is {"picture": base64, "type", "ms": {stage:
-    milliseconds}, "spp", "repaired": pixels traced for this picture that were not finite, "width", "height"}.
+    milliseconds}, "spp", "rays": per pixel of the base image, of all frames at rest, "repaired": pixels traced for this
+    picture that were not finite, "width", "height"}.
     """
 
     def __init__(self, common: dict[str, Any]) -> None:
@@ -68,6 +73,9 @@ class Worker:
             functools.partial(Frames, self.engine, self.bundle, *tracing)
         )  # by (width, height)
         self.renderers: dict[int, BaseRenderer] = {}
+        remembers = self.kind == "baked" and not (common["base"] or {}).get("denoise")
+        self.history = History(self.engine.mi) if remembers else None
+        self.resting: View | None = None  # of the last frame, where that was at rest
         self.traced: tuple[str, np.ndarray, int] | None = None
         self.repaired = 0  # pixels of the current picture that were not finite
 
@@ -76,13 +84,17 @@ class Worker:
         if mode in BASE_ONLY and self.base is None:
             raise UserError(f"{mode}: this model corrects no base image")
         ms: dict[str, float] = {}
-        spp, self.repaired = None, 0
+        spp, rays, self.repaired = None, None, 0
         if mode == "nearest":
             picture = self._timed(ms, "file", self._file, Path(task["file"]))
         elif mode == "reference":
             picture, spp = self._timed(ms, "path tracing", self._reference, view, int(task["spp"]))
         else:
+            self._begin(view, bool(task["fine"]))
             channels = self._timed(ms, "base image" if self.base else "G-buffer", self._channels, view, task["samples"])
+            if self.history is not None:
+                channels = self._timed(ms, "history", self.history.take, view, channels)
+                rays = int(channels["rays"].max())
             if mode in ("neural", "error"):
                 picture = self._timed(ms, "network", self._neural, view, channels)
             else:
@@ -96,6 +108,7 @@ class Worker:
             "type": kind,
             "ms": {name: round(value, 2) for name, value in ms.items()},
             "spp": spp,
+            "rays": rays,
             "repaired": self.repaired,
             "width": picture.shape[1],
             "height": picture.shape[0],
@@ -108,6 +121,12 @@ class Worker:
         ms[name] = 1000 * (time.perf_counter() - started)
         return result
 
+    def _begin(self, view: View, fine: bool) -> None:
+        """Begin the history anew where a camera comes to rest: what moved is good enough to move on, not to stay."""
+        if self.history is not None and fine and view != self.resting:
+            self.history.begin()
+        self.resting = view if fine else None
+
     def _channels(self, view: View, samples: int | None) -> dict[str, np.ndarray]:
         """Base image and G-buffer, or the G-buffer alone."""
         if self.base is None:
@@ -115,14 +134,15 @@ class Worker:
             self.repaired += lost
             return channels
         self.base.repaired = self.base.masked = 0
+        number = 0 if self.history is None else self.history.number
         if samples is None or samples >= self.base.renderer.samples or self.kind != "baked":
-            channels = self.base.channels(view)
+            channels = self.base.channels(view, number=number)
         else:
             if samples not in self.renderers:
                 light = read_light(Path(self.common["base"]["light"]))
                 scene = self.engine.scenes[str(self.bundle)]
                 self.renderers[samples] = BaseRenderer(self.engine.mi, scene, light, samples)
-            channels = self.base.channels(view, self.renderers[samples])
+            channels = self.base.channels(view, self.renderers[samples], number)
         self.repaired += self.base.repaired + self.base.masked
         return channels
 

@@ -3,11 +3,11 @@
 server  {"kind": "hello", center, radius, distance, size, modes}                  text
 client  a LiveRequest as JSON, at any time; only the newest one counts            text
 server  4 bytes length of the header, little endian; header as JSON; the picture  binary
-        header: type, width, height, mode, moving, samples, spp, repaired, ms by stage, total_ms, nearest
+        header: type, width, height, mode, moving, refined, samples, rays, spp, repaired, ms by stage, total_ms, nearest
 server  {"kind": "problem", "detail": one line}                                   text
 
 After the last request of a moving camera the server renders the view once more at full quality; it adds samples to a
-reference until the next request.
+reference, and rays to a base image, until the next request; refined counts such frames.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ from .state import get_state
 
 SETTLED = 0.2
 """Seconds without a request after which a moving camera counts as at rest."""
-REFINED = ("reference", "error")
+REFINED = {"reference": ("spp", MOST_SPP), "error": ("spp", MOST_SPP), "neural": ("rays", 64), "base": ("rays", 64)}
+"""Modes whose pictures get better while the camera rests: by which figure of the answer, and until where."""
 REFUSED = 1008
 
 router = APIRouter()
@@ -87,10 +88,13 @@ async def _read(socket: WebSocket, latest: Latest) -> None:
 async def _answer(socket: WebSocket, session: LiveSession, latest: Latest) -> None:
     current: LiveRequest | None = None
     unsettled = refining = False
+    refined = 0
     while True:
+        refined = refined + 1 if refining else 0
         try:
             async with asyncio.timeout(0.0 if refining else SETTLED if unsettled else None):
                 current = await latest.get()
+                refined = 0
         except TimeoutError:
             if unsettled and current is not None:
                 current = current.model_copy(update={"moving": False})
@@ -102,10 +106,15 @@ async def _answer(socket: WebSocket, session: LiveSession, latest: Latest) -> No
             await socket.send_json({"kind": "problem", "detail": str(error)})
             unsettled = refining = False
             continue
-        await socket.send_bytes(pack(answer, current))
+        await socket.send_bytes(pack(answer | {"refined": refined}, current))
         await session.warm(current)
         unsettled = current.moving
-        refining = current.mode in REFINED and not current.moving and (answer["spp"] or 0) < MOST_SPP
+        refining = not current.moving and _gets_better(current.mode, answer)
+
+
+def _gets_better(mode: str, answer: dict[str, Any]) -> bool:
+    figure, most = REFINED.get(mode, ("", 0))
+    return figure != "" and answer[figure] is not None and answer[figure] < most
 
 
 def pack(answer: dict[str, Any], request: LiveRequest) -> bytes:

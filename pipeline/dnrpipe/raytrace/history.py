@@ -1,0 +1,385 @@
+"""What earlier frames of a moving camera showed, brought into the next one: more rays per pixel than it cast.
+
+Notation
+    P        surface point at a pixel's centre, world space; n its normal
+    V        virtual point: where the end of P's specular path seems to be, on the pixel's line of sight, as far behind
+             P as the path goes on (primary surface replacement; Zimmer et al. 2015)
+    D, S     diffuse part of a base image, and the rest of it
+    K        rays per pixel of a frame, R of all frames that count in a pixel
+    corners  the four pixels of the earlier frame around a point's place in it
+
+    D_t = lerp(D_t-1 where P was, D of frame t, K / R)        S_t likewise, where V was
+
+D looks the same from everywhere: it is followed by P. What a mirror or clear glass shows moves with V, unless it is
+curved and bends the lines of sight: then the path through the place where V was ended elsewhere, and S begins anew.
+Other S follows P, for a few frames and within what the frame's own neighbourhood shows, so that light which moved does
+not stay behind (variance clipping; Salvi 2016). Where nothing is found, a pixel begins anew.
+
+Places are looked up by Catmull-Rom splines, which keep what is sharp; at rims of surfaces by those corners that lie on
+the same one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dnrtrain.contract import View
+
+from .recorded import Recorded
+
+MOST_DIFFUSE, MOST_MIRRORED, MOST_GLOSSY, MOST_UNEVEN = 8.0, 16.0, 8.0, 2.0
+"""Rays of earlier frames that count: for D, for S that follows V, for S that follows P, and at most where the corners
+lie on several surfaces. Each lookup blurs a little, and light moves on what is not a mirror."""
+MOST_RESTING = 512.0
+"""Where the camera has not moved."""
+PLANE = 0.01
+"""Distance from P's tangent plane over distance to the camera up to which a point lies on the same surface."""
+TURNED = 0.8
+"""Least cosine between its normal and P's."""
+DISPLACED = 4.0
+"""Pixels, as large as they are at the end of a path, up to which two ends show the same."""
+SPREAD, REACH = 1.5, 2
+"""Standard deviations of the neighbourhood within which S stays; pixels that it reaches to each side."""
+LEAST_WEIGHT = 0.2
+"""Share of the corners, by their distance, that must lie on the same surface."""
+CORNERS = ((0, 0), (1, 0), (0, 1), (1, 1))
+
+COLOURS = tuple(f"{kind}.{c}" for kind in ("diffuse", "base", "albedo") for c in "RGB")
+TAKEN = (
+    *(*COLOURS, "base.A", "noise", "rays", "normal.X", "normal.Y", "normal.Z", "mask", "depth.Z"),
+    *("chain.length", "chain.X", "chain.Y", "chain.Z"),
+)
+"""Channels that a history reads, in the kernel's order."""
+GIVEN = (*COLOURS, "base.A", "noise", "rays")
+"""Channels that it changes."""
+HALF, TINY = 0.5, 1e-4
+"""Pixels: how far a picture goes beyond the centres of its outer ones; what keeps a place off the last."""
+SURFACE, RIM = 1.0, 0.5
+"""What a pixel's centre sees: a surface; none, but a neighbour's does."""
+
+
+class History:
+    """Accumulates base images of frames that follow one another, of one size. Needs a jit variant.
+
+    ``number`` frames were taken in since it began: what `BaseRenderer.frame` wants for the next.
+    """
+
+    def __init__(self, mi: Any) -> None:
+        self.mi = mi
+        self.kernel = Recorded(self._kernel)
+        self.begin()
+
+    def begin(self) -> None:
+        """Forget."""
+        self.number = 0
+        self.before: tuple[View, list[Any]] | None = None
+
+    def take(self, view: View, channels: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """The channels of a frame with its base image improved by the frames before; float32 [H, W] each.
+
+        channels: of TAKEN, scene units, linear Rec.709, premultiplied. New are those of GIVEN: ``rays`` counts those of
+        all frames that are in a pixel's S, ``noise`` is the standard error of base by the spread of the frames' means.
+        A frame of another size than the one before begins anew.
+        """
+        mi, size = self.mi, (view.height, view.width)
+        if self.before is None or (self.before[0].height, self.before[0].width) != size:
+            pixels = view.width * view.height
+            self.before = view, [mi.Float(_aligned([np.zeros(n * pixels)])) for n in (4, 4, 4, 4, 4, 4, 1)]
+        planes = mi.Float(_aligned([channels[name] for name in TAKEN]))
+        earlier, memory = self.before
+        resting = self.number > 0 and view.c2w == earlier.c2w and view.intrinsics == earlier.intrinsics
+        cameras = self._camera(view), self._camera(earlier)
+        given, memory = self.kernel(planes, memory, *cameras, view.width, view.height, resting)
+        self.before, self.number = (view, memory), self.number + 1
+        found = {name: np.array(values).reshape(size) for name, values in zip(GIVEN, given, strict=True)}
+        return {**channels, **found}
+
+    def _camera(self, view: View) -> list[Any]:
+        """(right, up, backwards, place), (fl_x, fl_y, cx, cy), as data."""
+        import drjit as dr
+
+        mi, m = self.mi, view.matrix
+        axes = [mi.Point3f(*(dr.opaque(mi.Float, float(value)) for value in m[:3, i])) for i in range(4)]
+        film = [dr.opaque(mi.Float, float(value)) for value in (view.fl_x, view.fl_y, view.cx, view.cy)]
+        return [axes, film]
+
+    def _kernel(
+        self, taken: Any, memory: list[Any], camera: Any, earlier: Any, width: int, height: int, resting: bool
+    ) -> tuple[list[Any], list[Any]]:
+        """(planes of GIVEN, what the next frame remembers). Recorded once for a size, moving and resting.
+
+        Args:
+            taken: planes of TAKEN one after the other.
+            memory: of the frame before; zeros where there is none.
+            camera, earlier: see `_camera`.
+            resting: whether they are the same.
+        """
+        import drjit as dr
+
+        mi = self.mi
+        picture = _Picture(mi, width, height)
+        planes = [dr.gather(mi.Float, taken, picture.pixel + i * width * height) for i in range(len(TAKEN))]
+        diffuse, base, albedo = (mi.Color3f(*planes[i : i + 3]) for i in (0, 3, 6))
+        alpha, noise, rays = planes[9:12]
+        specular, bright = base - diffuse, mi.luminance(base)
+        seen = picture.seen(camera, planes)
+        past = _rested(mi, memory) if resting else _moved(mi, picture, earlier, memory, seen, specular)
+
+        share, share_d = rays / (rays + past.rays_s), rays / (rays + past.rays_d)
+        s, d = dr.lerp(past.s, specular, share), dr.lerp(past.d, diffuse, share_d)
+        albedo, alpha = dr.lerp(past.albedo, albedo, share_d), dr.lerp(past.alpha, alpha, share_d)
+        light = dr.lerp(past.light, bright, share)
+        squares = dr.lerp(past.squares, bright * bright + noise * noise, share)
+        error = dr.sqrt(dr.maximum(squares - light * light, 0) * share)  # of all frames by the variance of one's mean
+        given = [*d, *(s + d), *albedo, alpha, error, rays + past.rays_s]
+        packets = [(*seen.point, seen.kind), (*seen.normal, dr.select(seen.flat, 1.0, 0.0))]
+        packets += [(*seen.end, rays + past.rays_s), (*s, light), (*d, rays + past.rays_d), (*albedo, alpha)]
+        return given, [*(dr.ravel(mi.Vector4f(*packet)) for packet in packets), squares]
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What a frame sees, an array element per pixel: n, P, what is at the centre, whether the neighbours lie on P's
+    surface; V, the end of the path and its length behind P; distance of P and the camera's place."""
+
+    normal: Any
+    point: Any
+    kind: Any
+    flat: Any
+    virtual: Any
+    end: Any
+    length: Any
+    distance: Any
+
+
+@dataclass(frozen=True)
+class _Past:
+    """What earlier frames say of each pixel, and how many rays of theirs count (0: nothing is known).
+
+    light, squares: luminance of the base image, and the mean of its square.
+    """
+
+    s: Any
+    d: Any
+    albedo: Any
+    alpha: Any
+    light: Any
+    squares: Any
+    rays_s: Any
+    rays_d: Any
+
+
+def _rested(mi: Any, memory: list[Any]) -> _Past:
+    """Each pixel is where it was."""
+    import drjit as dr
+
+    pixel = dr.arange(mi.UInt32, dr.width(memory[SQUARES]))
+    s, d, rest, end = (dr.gather(mi.Vector4f, memory[i], pixel) for i in (S, D, REST, END))
+    counts = [dr.minimum(rays, MOST_RESTING) for rays in (end.w, d.w)]
+    return _Past(_rgb(mi, s), _rgb(mi, d), _rgb(mi, rest), rest.w, s.w, memory[SQUARES], *counts)
+
+
+def _moved(mi: Any, picture: _Picture, earlier: Any, memory: list[Any], seen: _Seen, specular: Any) -> _Past:
+    """Looked up where P and V were. specular: S of the frame."""
+    import drjit as dr
+
+    mask, narrow = seen.kind == SURFACE, seen.length > 0
+    near = DISPLACED * (seen.distance + seen.length) / earlier[1][0]
+
+    # ------------------------- Where P was ----------------------------
+    at = _Places(mi, picture, earlier, seen.point)
+    same, sharp = [], at.inside & mask
+    for index in at.corners:
+        place, facing = (dr.gather(mi.Vector4f, memory[i], index) for i in (PLACE, FACING))
+        on = (place.w == SURFACE) & (dr.dot(facing.xyz, seen.normal) > TURNED)
+        on &= dr.abs(dr.dot(place.xyz - seen.point, seen.normal)) < PLANE * seen.distance
+        same.append(at.inside & dr.select(mask, on, (seen.kind == RIM) & (place.w >= RIM)))
+        sharp &= same[-1] & (facing.w > 0.5)
+    weights, known = at.weights(same)
+    d, rest, s, end = (at.bilinear(memory[i], weights) for i in (D, REST, S, END))
+    most_d, most_s = (dr.select(sharp, most, MOST_UNEVEN) for most in (MOST_DIFFUSE, MOST_GLOSSY))
+    rays_d = dr.select(known, dr.minimum(d.w, most_d), 0)
+    rays_s = dr.select(known & ~narrow, dr.minimum(end.w, most_s), 0)
+    squares = at.bilinear(memory[SQUARES], weights)
+    low, high = picture.bounds(specular)
+    colour, light = dr.clip(_rgb(mi, s), low, high), s.w
+    d = at.spline(memory[D], sharp, d)
+
+    # ------------------------- Where V was ----------------------------
+    at = _Places(mi, picture, earlier, seen.virtual)
+    same, sharp = [], at.inside & mask & narrow
+    for index in at.corners:
+        place, facing, end = (dr.gather(mi.Vector4f, memory[i], index) for i in (PLACE, FACING, END))
+        on = at.inside & narrow & (place.w == SURFACE) & (dr.dot(facing.xyz, seen.normal) > TURNED)
+        same.append(on & (dr.norm(end.xyz - seen.end) < near))
+        sharp &= same[-1] & (facing.w > 0.5)
+    weights, mirrored = at.weights(same)
+    s, end = (at.bilinear(memory[i], weights) for i in (S, END))
+    colour = dr.select(mirrored, _rgb(mi, at.spline(memory[S], sharp, s)), colour)
+    light = dr.select(mirrored, s.w, light)
+    squares = dr.select(mirrored, at.bilinear(memory[SQUARES], weights), squares)
+    rays_s = dr.select(mirrored, dr.minimum(end.w, dr.select(sharp, MOST_MIRRORED, MOST_UNEVEN)), rays_s)
+    return _Past(colour, _rgb(mi, d), _rgb(mi, rest), rest.w, light, squares, rays_s, rays_d)
+
+
+def _rgb(mi: Any, packet: Any) -> Any:
+    return mi.Color3f(packet.x, packet.y, packet.z)
+
+
+PLACE, FACING, END, S, D, REST, SQUARES = range(7)
+"""What a frame leaves behind: P and what the pixel's centre sees (SURFACE, RIM or 0); n, and 1 where the neighbours lie
+on the same surface; where the path ends, and R of S; S and the luminance of base; D and its R; albedo and alpha: four
+values a pixel, side by side, which are read at once. And the mean square of the luminance."""
+
+
+def _aligned(planes: list[np.ndarray]) -> np.ndarray:
+    """The planes one after the other, float32, at an address that is a multiple of 64.
+
+    Dr.Jit takes memory as it is, and records a kernel anew for memory that is aligned otherwise.
+    """
+    count = sum(plane.size for plane in planes)
+    buffer = np.empty(count + 16, np.float32)
+    start = -buffer.ctypes.data // 4 % 16
+    flat = buffer[start : start + count]
+    np.concatenate([plane.ravel() for plane in planes], out=flat)
+    return flat
+
+
+class _Picture:
+    """Pixels of a frame and their neighbours; beyond the border the last pixel continues."""
+
+    def __init__(self, mi: Any, width: int, height: int) -> None:
+        import drjit as dr
+
+        self.mi, self.width, self.height = mi, width, height
+        self.pixel = dr.arange(mi.UInt32, width * height)
+        self.x, self.y = mi.Int32(self.pixel % width), mi.Int32(self.pixel // width)
+
+    def index(self, right: int, below: int) -> Any:
+        """Of the neighbours so far away."""
+        import drjit as dr
+
+        return dr.clip(self.y + below, 0, self.height - 1) * self.width + dr.clip(self.x + right, 0, self.width - 1)
+
+    def seen(self, camera: Any, planes: list[Any]) -> _Seen:
+        """What the frame sees. planes: of TAKEN."""
+        import drjit as dr
+
+        mi = self.mi
+        (right, up, back, origin), (fl_x, fl_y, cx, cy) = camera
+        normal, mask, depth = mi.Normal3f(*planes[12:15]), planes[15] > 0.5, planes[16]
+        nearest = mi.Float(dr.inf)  # at rims: of the neighbours that see a surface
+        for below in (-1, 0, 1):
+            for right_ in (-1, 0, 1):
+                index = self.index(right_, below)
+                beside = dr.select(dr.gather(mi.Bool, mask, index), dr.gather(mi.Float, depth, index), dr.inf)
+                nearest = dr.minimum(nearest, beside)
+        rim = ~mask & dr.isfinite(nearest)
+        depth = dr.select(mask, depth, dr.select(rim, nearest, 0))
+        kind = dr.select(mask, SURFACE, dr.select(rim, RIM, 0.0))
+        x, y = (mi.Float(self.x) + 0.5 - cx) / fl_x, (mi.Float(self.y) + 0.5 - cy) / fl_y
+        sight = mi.Vector3f(right * x - up * y - back)
+        distance, sight = depth * dr.norm(sight), dr.normalize(sight)
+        length, end = planes[17], mi.Point3f(*planes[18:21])
+        point, virtual = (mi.Point3f(origin + sight * far) for far in (distance, distance + length))
+        flat = self.is_flat(point, normal, distance, mask)
+        return _Seen(normal, point, kind, flat, virtual, end, length, distance)
+
+    def is_flat(self, point: Any, normal: Any, distance: Any, mask: Any) -> Any:
+        """Whether the four neighbours lie on the pixel's surface."""
+        import drjit as dr
+
+        mi = self.mi
+        flat = mi.Bool(mask)
+        for right, below in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+            index = self.index(right, below)
+            beside = dr.gather(mi.Point3f, point, index)
+            flat &= dr.gather(mi.Bool, mask, index) & (dr.abs(dr.dot(beside - point, normal)) < PLANE * distance)
+        return flat
+
+    def bounds(self, colour: Any) -> tuple[Any, Any]:
+        """(lower, upper) bound of what the neighbourhood shows: mean and standard deviation of nine pixels."""
+        import drjit as dr
+
+        mi = self.mi
+        total, squares = mi.Color3f(0), mi.Color3f(0)
+        for below in (-REACH, 0, REACH):
+            for right in (-REACH, 0, REACH):
+                beside = dr.gather(mi.Color3f, colour, self.index(right, below))
+                total, squares = total + beside, squares + beside * beside
+        mean = total / 9
+        spread = SPREAD * dr.sqrt(dr.maximum(squares / 9 - mean * mean, 0))
+        return mean - spread, mean + spread
+
+
+class _Places:
+    """Where points are in the picture of the frame before."""
+
+    def __init__(self, mi: Any, picture: _Picture, camera: Any, points: Any) -> None:
+        import drjit as dr
+
+        (right, up, back, origin), (fl_x, fl_y, cx, cy) = camera
+        self.mi, self.width, self.height = mi, picture.width, picture.height
+        local = points - origin
+        depth = -dr.dot(local, back)
+        ahead = depth > 0
+        depth = dr.select(ahead, depth, 1)
+        x = cx + fl_x * dr.dot(local, right) / depth - 0.5
+        y = cy - fl_y * dr.dot(local, up) / depth - 0.5
+        last_x, last_y = self.width - 1, self.height - 1
+        self.inside = ahead & (x > -HALF) & (y > -HALF) & (x < last_x + HALF) & (y < last_y + HALF)
+        x, y = dr.clip(x, 0, last_x - TINY), dr.clip(y, 0, last_y - TINY)
+        column, row = dr.floor(x), dr.floor(y)
+        self.across, self.down = x - column, y - row
+        self.column, self.row = mi.Int32(column), mi.Int32(row)
+        self.corners = [self.index(*corner) for corner in CORNERS]
+
+    def index(self, right: int, below: int) -> Any:
+        """Of the pixels so far from the upper left corner."""
+        import drjit as dr
+
+        column = dr.clip(self.column + right, 0, self.width - 1)
+        return dr.clip(self.row + below, 0, self.height - 1) * self.width + column
+
+    def weights(self, same: list[Any]) -> tuple[list[Any], Any]:
+        """(weights of the corners, which sum to 1 or are 0; whether enough of them count)."""
+        import drjit as dr
+
+        shares = []
+        for (right, below), counts in zip(CORNERS, same, strict=True):
+            share = (self.across if right else 1 - self.across) * (self.down if below else 1 - self.down)
+            shares.append(dr.select(counts, share, 0))
+        total = shares[0] + shares[1] + shares[2] + shares[3]
+        enough = total > LEAST_WEIGHT
+        return [dr.select(enough, share / total, 0) for share in shares], enough
+
+    def bilinear(self, values: Any, weights: list[Any]) -> Any:
+        """Values at the places, 0 where nothing counts. values: four a pixel, side by side, or one."""
+        import drjit as dr
+
+        kind = self.mi.Float if dr.width(values) == self.width * self.height else self.mi.Vector4f
+        pairs = zip(self.corners, weights, strict=True)
+        return sum((weight * dr.gather(kind, values, index) for index, weight in pairs), kind(0))
+
+    def spline(self, values: Any, active: Any, otherwise: Any) -> Any:
+        """Values at the places by Catmull-Rom splines, not below 0, where ``active``. values: four a pixel."""
+        import drjit as dr
+
+        across, down = _catmull_rom(self.across), _catmull_rom(self.down)
+        found = self.mi.Vector4f(0)
+        for j in range(4):
+            for i in range(4):
+                index = self.index(i - 1, j - 1)
+                found += across[i] * down[j] * dr.gather(self.mi.Vector4f, values, index, active)
+        return dr.select(active, dr.maximum(found, 0), otherwise)
+
+
+def _catmull_rom(t: Any) -> tuple[Any, Any, Any, Any]:
+    """Weights of the pixels at -1, 0, 1 and 2, for t in [0, 1)."""
+    first, last = t * (t - 0.5 - 0.5 * t * t), 0.5 * t * t * (t - 1)
+    second = 1 + t * t * (1.5 * t - 2.5)
+    return first, second, 1 - first - second - last, last
