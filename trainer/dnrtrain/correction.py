@@ -24,15 +24,12 @@ from .contract import ContractError
 from .dataset import Batch
 from .display import Display
 from .settings import ModelSettings
+from .srgb import LUMINANCE
 
 LOG_SCALE = 10.0
 """k of log(1 + k x) / log(1 + k): with 10, the curve is close to display gamma in [0, 1] and keeps going above."""
 IDENTITY = 4.0
 """What the kernels' middle weight has ahead of the others before the softmax, so it starts with 0.87 of the sum."""
-
-
-LUMINANCE = (0.2126, 0.7152, 0.0722)
-"""Of linear Rec.709."""
 LOG_CEILING = 30.0
 """Log values above it (radiance of 2e30) count as it: the exponential would overflow, and its gradient with it."""
 

@@ -1,9 +1,11 @@
-"""The sRGB transfer functions (IEC 61966-2-1) on numpy arrays. Imports no torch; `display.srgb_oetf` is torch's."""
+"""sRGB's transfer functions (IEC 61966-2-1) on numpy arrays, and luminance. Without torch; see `display.srgb_oetf`."""
 
 from __future__ import annotations
 
 import numpy as np
 
+LUMINANCE = (0.2126, 0.7152, 0.0722)
+"""Of linear Rec.709, whose primaries sRGB has."""
 LINEAR_END = 0.0031308
 """Linear value at which the straight segment ends."""
 

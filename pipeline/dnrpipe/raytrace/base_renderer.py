@@ -14,7 +14,7 @@ Notation
 
 The numbers that choose directions come from Kronecker sequences over the samples of a tile of TILE² pixels: sample s of
 a pixel at place t of its tile has the number s TILE² + t. They are the same in every picture but in frames that follow
-one another and remember (`dnrtrain.history`): there frame f goes on where f - 1 ended.
+one another and remember (`history`): there frame f goes on where f - 1 ended.
 Emitter sampling serves a path's first glossy vertex; multiple importance sampling joins it with hits of emitters.
 """
 
@@ -26,6 +26,7 @@ import numpy as np
 
 from .engine import masked_channels
 from .recorded import Recorded, prepare_emitters
+from .sensors import opaque_camera
 from .sequence import GOLDEN, ORDER, TILE, fraction
 
 MAX_RAYS = 1 << 24
@@ -34,9 +35,10 @@ MEANS = (
     *("base.R", "base.G", "base.B", "base.A", "diffuse.R", "diffuse.G", "diffuse.B"),
     *("albedo.R", "albedo.G", "albedo.B"),
 )
+CHAIN = ("chain.length", "chain.X", "chain.Y", "chain.Z")
+"""How far the first ray's path goes behind the first surface by mirrors and clear glass, and where that ends."""
 CENTRES = (
-    *("chain.U", "chain.V", "chain.mask", "chain.weight", "chain.length"),
-    *("chain.X", "chain.Y", "chain.Z"),
+    *("chain.U", "chain.V", "chain.mask", "chain.weight", *CHAIN),
     *("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z", "mask"),
 )
 NOISE = "noise"
@@ -46,7 +48,6 @@ BRIGHTEST = 1e15
 """Luminance above it counts as it where squares are summed."""
 LOST = "lost"
 """Whether a part of the sample was not finite and is left out; of a pixel, the share of such samples."""
-CHAIN = ("chain.length", "chain.X", "chain.Y", "chain.Z")
 GBUFFER = ("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z")
 
 
@@ -80,17 +81,15 @@ class BaseRenderer:
     def frame(self, view: Any, number: int = 0) -> dict[str, np.ndarray]:
         """Channels of BASE_CHANNELS and of the G-buffer: float32 [H, W] each, linear Rec.709, premultiplied.
 
-        view: in the bundle's units, as are ``depth.Z`` and those of CHAIN: how far the first ray's path goes behind
-        the first surface by mirrors and clear glass, and the point where that ends. number: of the frame among those
-        that remember; frames of other numbers cast other rays but for the first of each pixel. ``coverage`` is base.A,
-        at most 1. Where cut-outs stand one behind the other, base.A can be above 1 as the colours are: each surface
-        adds its opaque share.
+        view: in the bundle's units, as are ``depth.Z`` and those of CHAIN. number: of the frame among those that
+        remember; frames of other numbers cast other rays but for the first of each pixel. ``coverage`` is base.A, at
+        most 1. Where cut-outs stand one behind the other, base.A can be above 1 as the colours are: each surface adds
+        its opaque share.
         """
         import drjit as dr
 
-        mi, m = self.mi, view.matrix
-        axes = [mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in m[:3, i])) for i in range(4)]
-        film = [dr.opaque(mi.Float, float(v)) for v in (view.fl_x, view.fl_y, view.cx, view.cy)]
+        mi = self.mi
+        axes, film = opaque_camera(mi, view)
         rays = dr.opaque(mi.UInt32, self.samples)  # as data: the kernel is the same for all numbers of them
         turn = dr.opaque(mi.UInt32, number % FRAMES)
         names = (LOST, *MEANS, *CENTRES, NOISE)

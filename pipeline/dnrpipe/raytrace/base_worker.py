@@ -57,7 +57,7 @@ class Worker(BundleWorker):
             "masked": self.masked,
         }
         header = {**answer, "fingerprint": task.fingerprint, "view": view.model_dump(mode="json")}
-        write_exr(task.output, channels, header)
+        write_exr(task.output, {name: plane for name, plane in channels.items() if name not in CHAIN}, header)
         return answer
 
     def channels(self, view: View, renderer: BaseRenderer | None = None, number: int = 0) -> dict[str, np.ndarray]:

@@ -19,9 +19,9 @@ from typing import Any, Literal
 import numpy as np
 
 from dnrpipe.core.errors import UserError
+from dnrtrain.srgb import LUMINANCE
 
 Quality = Literal["high", "balanced", "fast"]
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 GREY, BLOCK, DARKEST = 0.18, 16, 1e-8
 """The library's own exposure: mean log luminance of blocks of BLOCK² pixels goes to GREY; darker ones do not count."""
 

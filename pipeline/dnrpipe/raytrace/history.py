@@ -29,7 +29,9 @@ import numpy as np
 
 from dnrtrain.contract import View
 
+from .base_renderer import CHAIN
 from .recorded import Recorded
+from .sensors import opaque_camera
 
 MOST_DIFFUSE, MOST_MIRRORED, MOST_GLOSSY, MOST_UNEVEN = 8.0, 16.0, 8.0, 2.0
 """Rays of earlier frames that count: for D, for S that follows V, for S that follows P, and at most where the corners
@@ -51,7 +53,7 @@ CORNERS = ((0, 0), (1, 0), (0, 1), (1, 1))
 COLOURS = tuple(f"{kind}.{c}" for kind in ("diffuse", "base", "albedo") for c in "RGB")
 TAKEN = (
     *(*COLOURS, "base.A", "noise", "rays", "normal.X", "normal.Y", "normal.Z", "mask", "depth.Z"),
-    *("chain.length", "chain.X", "chain.Y", "chain.Z"),
+    *CHAIN,
 )
 """Channels that a history reads, in the kernel's order."""
 GIVEN = (*COLOURS, "base.A", "noise", "rays")
@@ -92,20 +94,11 @@ class History:
         planes = mi.Float(_aligned([channels[name] for name in TAKEN]))
         earlier, memory = self.before
         resting = self.number > 0 and view.c2w == earlier.c2w and view.intrinsics == earlier.intrinsics
-        cameras = self._camera(view), self._camera(earlier)
+        cameras = opaque_camera(mi, view), opaque_camera(mi, earlier)
         given, memory = self.kernel(planes, memory, *cameras, view.width, view.height, resting)
         self.before, self.number = (view, memory), self.number + 1
         found = {name: np.array(values).reshape(size) for name, values in zip(GIVEN, given, strict=True)}
         return {**channels, **found}
-
-    def _camera(self, view: View) -> list[Any]:
-        """(right, up, backwards, place), (fl_x, fl_y, cx, cy), as data."""
-        import drjit as dr
-
-        mi, m = self.mi, view.matrix
-        axes = [mi.Point3f(*(dr.opaque(mi.Float, float(value)) for value in m[:3, i])) for i in range(4)]
-        film = [dr.opaque(mi.Float, float(value)) for value in (view.fl_x, view.fl_y, view.cx, view.cy)]
-        return [axes, film]
 
     def _kernel(
         self, taken: Any, memory: list[Any], camera: Any, earlier: Any, width: int, height: int, resting: bool
@@ -115,7 +108,7 @@ class History:
         Args:
             taken: planes of TAKEN one after the other.
             memory: of the frame before; zeros where there is none.
-            camera, earlier: see `_camera`.
+            camera, earlier: see `opaque_camera`.
             resting: whether they are the same.
         """
         import drjit as dr

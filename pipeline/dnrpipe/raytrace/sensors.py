@@ -15,6 +15,15 @@ import numpy as np
 from dnrtrain.contract import View
 
 
+def opaque_camera(mi: Any, view: View) -> tuple[list[Any], list[Any]]:
+    """(right, up, backwards and place: columns of c2w; fl_x, fl_y, cx, cy in pixels), as data of recorded kernels."""
+    import drjit as dr
+
+    m = view.matrix
+    axes = [mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in m[:3, i])) for i in range(4)]
+    return axes, [dr.opaque(mi.Float, float(value)) for value in (view.fl_x, view.fl_y, view.cx, view.cy)]
+
+
 def sensor_dict(mi: Any, view: View, lens: dict[str, float] | None = None) -> dict[str, Any]:
     """Mitsuba ``perspective`` (``thinlens`` with a lens) sensor of a view: box filter, RGBA film.
 

@@ -43,6 +43,8 @@ from dnrtrain.display import DisplayTransform
 from dnrtrain.exr import read_exr
 
 BASE_ONLY = ("base", "albedo")
+REMEMBERED = ("neural", "base", "error")
+"""Modes that show a base image, or what is made of it."""
 
 
 class Worker:
@@ -92,7 +94,7 @@ class Worker:
         else:
             self._begin(view, bool(task["fine"]))
             channels = self._timed(ms, "base image" if self.base else "G-buffer", self._channels, view, task["samples"])
-            if self.history is not None:
+            if self.history is not None and mode in REMEMBERED:
                 channels = self._timed(ms, "history", self.history.take, view, channels)
                 rays = int(channels["rays"].max())
             if mode in ("neural", "error"):

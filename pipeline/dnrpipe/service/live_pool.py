@@ -23,7 +23,8 @@ FRAME_SECONDS = 120.0
 """Timeout of a frame; the first one loads the scene and compiles kernels."""
 IDLE_CHECK = 2.0
 REFERENCE_SPP = 4
-MOST_SPP = 1024
+MOST_SPP, MOST_RAYS = 1024, 64
+"""Per pixel, of a reference and of a base image at rest."""
 BUDGET = 90.0
 """Milliseconds that a moving frame may take."""
 LEVELS: tuple[tuple[float, int | None], ...] = ((1.0, None), (1.0, 2), (1.0, 1), (0.5, 2), (0.5, 1))

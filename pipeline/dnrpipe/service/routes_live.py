@@ -24,14 +24,17 @@ from pydantic import ValidationError
 
 from ..core.errors import UserError
 from .guard import SUBPROTOCOL
-from .live_pool import MOST_SPP, LiveSession
+from .live_pool import MOST_RAYS, MOST_SPP, LiveSession
 from .live_scene import LiveRequest
 from .models import NAME_PATTERN, first_fault
 from .state import get_state
 
 SETTLED = 0.2
 """Seconds without a request after which a moving camera counts as at rest."""
-REFINED = {"reference": ("spp", MOST_SPP), "error": ("spp", MOST_SPP), "neural": ("rays", 64), "base": ("rays", 64)}
+REFINED = {
+    **dict.fromkeys(("reference", "error"), ("spp", MOST_SPP)),
+    **dict.fromkeys(("neural", "base"), ("rays", MOST_RAYS)),
+}
 """Modes whose pictures get better while the camera rests: by which figure of the answer, and until where."""
 REFUSED = 1008
 

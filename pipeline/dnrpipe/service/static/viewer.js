@@ -64,7 +64,8 @@
     const now = performance.now();
     frames = frames.filter(function (t) { return now - t < 2000; }).concat(now);
     const pace = frames.length > 1 ? (frames.length - 1) / (now - frames[0]) * 1000 : 0;
-    $("status").textContent = header.width + "²" + (header.moving ? header.samples ? ", " + header.samples + " rays" : "" : header.rays ? ", " + header.rays + " rays" : "") + (header.spp ? ", " + header.spp + " spp" : "") +
+    const rays = header.moving ? header.samples : header.rays;
+    $("status").textContent = header.width + "²" + (rays ? ", " + rays + " rays" : "") + (header.spp ? ", " + header.spp + " spp" : "") +
       (header.moving ? ", " + pace.toFixed(1) + " frames/s" : ", full quality") + (header.nearest ? " · nearest training view " + header.nearest : "") +
       (header.repaired ? " · repaired: " + header.repaired + " pixels that were not finite" : "");
     const rows = Object.entries(header.ms).concat([["altogether", header.total_ms]]).map(function (entry) {
