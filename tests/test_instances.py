@@ -122,6 +122,21 @@ def test_charts_cover_a_crowd_without_overlap() -> None:
     assert numbers["occupancy"] > 0.5
 
 
+def test_small_parts_keep_charts_of_their_own_until_they_are_too_many() -> None:
+    """A plate of knobs, whose parts share grid cells: joined, they overlap and leave most of the atlas empty."""
+    places = np.stack(np.meshgrid(np.arange(12.0), np.arange(12.0)), axis=-1).reshape(-1, 1, 2)
+    knobs = np.repeat(0.4 * ball(6)[None], len(places), axis=0)
+    knobs[..., :2] += places
+    meshes = [frozen(knobs.reshape(-1, 3).astype(np.float32))]
+    chart_atlas(meshes, np.ones(1))
+    apart = measure_atlas(meshes, 512)
+    assert apart["occupancy"] > 0.45 and apart["overlap"] < 0.002
+    chart_atlas(meshes, np.ones(1), most=100)
+    joined = measure_atlas(meshes, 512)
+    assert 0 <= meshes[0].atlas.min() and meshes[0].atlas.max() < 1
+    assert joined["occupancy"] < apart["occupancy"] - 0.1 or joined["overlap"] > 0.01
+
+
 def test_a_big_ground_leaves_texels_to_small_things() -> None:
     small, ground = frozen(ball()), frozen(100 * ball())
     density = texel_density([small, small, ground])

@@ -3,7 +3,7 @@
 python -m tools.bench_untrained FOLDER [SCENE.blend ...] [--variants untrained,fresh] [--out RESULTS.json]
 
 FOLDER keeps the workspaces; rows that are in the results are not measured again. Without scenes: the example scenes.
-Variants, at the draft preset with 8 test views of 256 samples:
+Variants, at the draft preset with 8 test views:
 
     untrained   --budget 0
     6 views     --budget 6, 180 steps on from the shipped corrector
@@ -36,7 +36,7 @@ from dnrtrain.atomic import write_json
 
 ROOT = Path(__file__).resolve().parents[1]
 OUT = ROOT / "docs" / "results" / "untrained.json"
-TESTS = ("--set", "cameras.test=8", "--set", "cameras.val=0", "--set", "raytrace.evaluation_spp=256")
+TESTS = ("--set", "cameras.test=8", "--set", "cameras.val=0")
 FRESH = ("--set", "finetune.step2.start=fresh", "--set", "model.guides=true")
 VARIANTS: dict[str, tuple[str, ...]] = {
     "untrained": ("--budget", "0"),
@@ -53,6 +53,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("scenes", type=Path, nargs="*")
     parser.add_argument("--variants", default=",".join(VARIANTS), help="in their order; untrained is always among them")
+    parser.add_argument("--evaluation-spp", type=int, default=256, help="of the test views (before denoising)")
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
@@ -62,16 +63,17 @@ def main() -> None:
         if {row["variant"] for row in rows if row["scene"] == scene.stem} >= set(chosen):
             continue
         rows = [row for row in rows if row["scene"] != scene.stem]  # its seconds belong together
-        rows += measured(scene.resolve(), options.folder / f"{scene.stem}.dnr", chosen)
+        rows += measured(scene.resolve(), options.folder / f"{scene.stem}.dnr", chosen, options.evaluation_spp)
         write_json(options.out, {"machine": f"{os.cpu_count()} cores", "rows": rows})
     print(markdown({"rows": rows}))
 
 
-def measured(scene: Path, root: Path, variants: list[str]) -> list[dict[str, Any]]:
+def measured(scene: Path, root: Path, variants: list[str], evaluation_spp: int) -> list[dict[str, Any]]:
     """A row per variant."""
     rows: list[dict[str, Any]] = []
     shutil.rmtree(root, ignore_errors=True)
-    prepared = run(root, "prepare", str(scene), "--set", "select.budget=0", *TESTS)
+    tests = (*TESTS, "--set", f"raytrace.evaluation_spp={evaluation_spp}")
+    prepared = run(root, "prepare", str(scene), "--set", "select.budget=0", *tests)
     shared = 0.0
     for variant in variants:
         chosen = run(root, "select", *VARIANTS[variant])
@@ -80,7 +82,8 @@ def measured(scene: Path, root: Path, variants: list[str]) -> list[dict[str, Any
         mean = json.loads((root / "evaluation" / "metrics.json").read_text())["mean"]
         figures = {name: mean[name] for name in FIGURES}
         seconds = round(prepared + shared + spent, 1)
-        rows.append({"scene": scene.stem, "variant": variant, "base": mean["psnr_base"], **figures, "seconds": seconds})
+        facts = {"scene": scene.stem, "variant": variant, "evaluation_spp": evaluation_spp}
+        rows.append({**facts, "base": mean["psnr_base"], **figures, "seconds": seconds})
         if variant == "6 views":
             shared += chosen
         elif variant == "untrained":

@@ -1,8 +1,8 @@
 """A UV atlas for scenes too big for Blender's unwrapper: planar charts by direction, shelf-packed. Numpy only.
 
 Every triangle is projected along the axis its normal points to most (box projection). Connected triangles of one
-mesh with one direction form a chart; charts that are too small are joined with their neighbours in space. Charts keep
-one scale and are packed on shelves by their bounding boxes. A million polygons take seconds where ``smart_project``
+mesh with one direction form a chart; where that makes too many, the small ones of the meshes with the most charts are
+joined with their neighbours in space. Charts keep one scale and are packed on shelves by their bounding boxes. A million polygons take seconds where ``smart_project``
 takes minutes. A chart that folds back over itself overlaps; the atlas' facts say how much.
 """
 
@@ -17,20 +17,29 @@ from ..bundle.ply import weld
 from .frozen import FrozenMesh
 
 MARGIN = 1 / 1024  # of the atlas side, between charts
-SMALL_CHART = 64  # triangles; smaller ones are gathered into charts of one grid cell
+MOST_CHARTS = 60_000
+"""Of a scene: with more, margins take most of the atlas. Toy bricks have 30,000; joined, they have half the texels."""
+SMALL_CHART = 64  # triangles; smaller ones may be joined into charts of one grid cell
 CELLS = 24  # grid cells along the longest side of a mesh
 MAX_ROUNDS = 64
 BISECTIONS = 20
 
 
-def chart_atlas(meshes: Sequence[FrozenMesh], density: np.ndarray) -> None:
+def chart_atlas(meshes: Sequence[FrozenMesh], density: np.ndarray, *, most: int = MOST_CHARTS) -> None:
     """Fill ``mesh.atlas`` of every mesh, inside [0, 1).
 
-    density: float64 [N], per mesh, relative texels per world unit.
+    density: float64 [N], per mesh, relative texels per world unit. most: charts, before small ones are joined.
     """
+    found = [_charts(mesh) for mesh in meshes]
+    counts = [int(chart.max()) + 1 for chart, _, _ in found]
+    for number in np.argsort(counts, kind="stable")[::-1]:
+        if sum(counts) <= most:
+            break
+        chart, side, plane = found[number]
+        found[number] = _joined(meshes[number], chart, side), side, plane
+        counts[number] = int(found[number][0].max()) + 1
     layouts, boxes, first = [], [], 0
-    for mesh, factor in zip(meshes, density, strict=True):
-        chart, plane = _charts(mesh)
+    for (chart, _, plane), factor in zip(found, density, strict=True):
         corners = plane.reshape(-1, 3, 2) * factor
         order = np.argsort(chart, kind="stable")
         starts = np.flatnonzero(np.diff(chart[order], prepend=-1))
@@ -60,8 +69,8 @@ def _faces(mesh: FrozenMesh) -> np.ndarray:
     return weld(mesh.positions, np.zeros_like(mesh.positions), None).faces.astype(np.int64)
 
 
-def _charts(mesh: FrozenMesh) -> tuple[np.ndarray, np.ndarray]:
-    """(chart of every triangle, int [T], 0 .. C-1; plane coordinates of every corner, float64 [3T, 2])."""
+def _charts(mesh: FrozenMesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(chart of every triangle, int [T], 0 .. C-1; its direction, int [T]; plane coordinates, float64 [3T, 2])."""
     corners = mesh.positions.reshape(-1, 3, 3)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     axis = np.argmax(np.abs(cross), axis=1)
@@ -69,17 +78,18 @@ def _charts(mesh: FrozenMesh) -> tuple[np.ndarray, np.ndarray]:
     u, v = np.array([1, 2, 0])[axis], np.array([2, 0, 1])[axis]
     rows = np.arange(len(corners))[:, None]
     plane = np.stack([corners[rows, np.arange(3), u[:, None]], corners[rows, np.arange(3), v[:, None]]], axis=2)
-    label = _components(_faces(mesh) * 6 + side[:, None])
-    size = np.bincount(label)
-    small = size[label] < SMALL_CHART
-    if small.any():
-        low = mesh.positions.min(0)
-        cell = (mesh.positions.max(0) - low).max() / CELLS
-        place = np.minimum((corners.mean(1) - low) / max(float(cell), 1e-30), CELLS - 1).astype(np.int64)
-        gathered = (side * CELLS + place[:, 0]) * CELLS * CELLS + place[:, 1] * CELLS + place[:, 2]
-        label = np.where(small, len(size) + gathered, label)
-    _, chart = np.unique(label, return_inverse=True)
-    return chart, plane.reshape(-1, 2).astype(np.float64)
+    _, chart = np.unique(_components(_faces(mesh) * 6 + side[:, None]), return_inverse=True)
+    return chart, side, plane.reshape(-1, 2).astype(np.float64)
+
+
+def _joined(mesh: FrozenMesh, chart: np.ndarray, side: np.ndarray) -> np.ndarray:
+    """Charts with the small ones of one direction and grid cell in one, int [T], 0 .. C-1."""
+    corners, size = mesh.positions.reshape(-1, 3, 3), np.bincount(chart)
+    low = mesh.positions.min(0)
+    cell = (mesh.positions.max(0) - low).max() / CELLS
+    place = np.minimum((corners.mean(1) - low) / max(float(cell), 1e-30), CELLS - 1).astype(np.int64)
+    gathered = (side * CELLS + place[:, 0]) * CELLS * CELLS + place[:, 1] * CELLS + place[:, 2]
+    return np.unique(np.where(size[chart] < SMALL_CHART, len(size) + gathered, chart), return_inverse=True)[1]
 
 
 def _components(keys: np.ndarray) -> np.ndarray:
