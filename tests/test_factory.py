@@ -116,7 +116,7 @@ def test_references_of_training_data_hold_the_scenes_effects(tmp_path: Path) -> 
     subprocess.run([sys.executable, "-c", A_SMALL_SCENE, str(tmp_path)], check=True, cwd=FOLDER.parent)
     scene = SceneMaps(tmp_path / "data")
     for view in range(2):
-        batch = scene.batch(view, 8)
+        batch = scene.batch(view, "8")
         assert batch.display is not None and batch.target is not None
         target = batch.display.over_white(batch.target[:, :3], batch.target[:, 3:])
         assert psnr(base_picture(batch).clamp(0, 1), target.clamp(0, 1)) > 17

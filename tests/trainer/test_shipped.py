@@ -62,19 +62,19 @@ def test_step_2_trains_corrector_and_texture(baked: ViewSet, tmp_path: Path) -> 
 
 def write_scene(folder: Path, seed: int, side: int = 24) -> SceneMaps:
     """Two views of noise whose reference is twice as bright as the base image."""
-    rng, rays = np.random.default_rng(seed), [2, 8]
+    rng, inputs = np.random.default_rng(seed), ["2", "8"]
     views = synthetic.dome(2, side)
-    names = channel_names(rays)
+    names = channel_names(inputs)
     maps = rng.uniform(0.05, 0.4, (2, len(names), side, side)).astype(np.float16)
-    for name in ("mask", "coverage", "target.A", *(f"base.A@{k}" for k in rays)):
+    for name in ("mask", "coverage", "target.A", *(f"base.A@{k}" for k in inputs)):
         maps[:, names.index(name)] = 1
     for c in "RGB":
-        for k in rays:
+        for k in inputs:
             maps[:, names.index(f"base.{c}@{k}")] = maps[:, names.index(f"target.{c}")] / 2
     folder.mkdir(parents=True)
     np.save(folder / "maps.npy", maps)
     scene = Scene(
-        seed=seed, family="noise", views=views, rays=rays, frame=synthetic.FRAME, triangles=2, noise=0.0, seconds={}
+        seed=seed, family="noise", views=views, inputs=inputs, frame=synthetic.FRAME, triangles=2, noise=0.0, seconds={}
     )
     write_json(folder / "scene.json", scene.model_dump(mode="json"))
     return SceneMaps(folder)
@@ -86,6 +86,6 @@ def test_pretraining_learns_what_all_scenes_share_and_goes_on(tmp_path: Path) ->
     options = {"model": model, "batch": 2, "side": 16, "every": 100.0}
     first = list(pretrain(scenes[:2], scenes[2:], tmp_path, seconds=4, **options))  # pyright: ignore[reportArgumentType]
     base, ours = first[-1]["psnr"]
-    assert ours > base + 3 and set(first[-1]["by_rays"]) == {2, 8} and set(first[-1]["by_scene"]) == {2}
+    assert ours > base + 3 and set(first[-1]["by_input"]) == {"2", "8"} and set(first[-1]["by_scene"]) == {2}
     more = list(pretrain(scenes[:2], scenes[2:], tmp_path, seconds=6, **options))  # pyright: ignore[reportArgumentType]
     assert more[-1]["step"] > first[-1]["step"] and more[-1]["seconds"] >= 6 and more[-1]["psnr"][1] > base + 3

@@ -35,7 +35,7 @@ from dnrpipe.stages.prepare import scene_and_views
 from dnrpipe.stages.stage import Run
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import View
-from dnrtrain.pretraining_data import BRIGHT, RAY_COUNTS, Scene, channel_names
+from dnrtrain.pretraining_data import BRIGHT, RAY_COUNTS, REMEMBERED, Scene, channel_names
 
 FACTORY = Path(__file__).resolve().parents[2] / "blender_scenes" / "factory" / "build.py"
 LEFT_OUT = ("remix",)
@@ -48,6 +48,8 @@ LIGHT_MAPS = ((256, 24), (384, 16))
 """(texels a side, paths per texel), one of them drawn for a scene."""
 REFERENCE_SPP = 128
 """Not denoised: noise of the references averages out over steps, a denoiser's softness would be learned."""
+MOST_FRAMES, RESTING = 16, 0.2
+"""Earlier frames of a base image that remembers, at most; in this share of the views the camera rests."""
 MOST = 60000.0
 """Largest radiance that is kept: half floats end at 65504."""
 Took = Callable[[str], None]
@@ -87,10 +89,13 @@ def make(seed: int, folder: Path, scratch: Path) -> None:
     _, by_split = scene_and_views(Run(workspace, settings, Console(quiet=True)))
     path = by_split["train"]  # all frames of the animation
     chosen = spread(path, views)
+    inputs = [*map(str, rays), REMEMBERED]
     took("convert")
-    maps, noise = _look(workspace, plan_of(workspace, settings), chosen, rays, seed, took)
+    ways = [way(path, path.index(view), random) for view in chosen]
+    remembered = int(random.choice(RAY_COUNTS))
+    maps, noise = _look(workspace, plan_of(workspace, settings), ways, (*rays, remembered), seed, took)
     frame = read_frame(workspace)
-    bright = [name.partition("@")[0] in BRIGHT for name in channel_names(rays)]
+    bright = [name.partition("@")[0] in BRIGHT for name in channel_names(inputs)]
     maps[:, bright] *= 2.0**frame.exposure
     temporary = folder.with_name(f".{folder.name}")
     shutil.rmtree(temporary, ignore_errors=True)
@@ -102,7 +107,7 @@ def make(seed: int, folder: Path, scratch: Path) -> None:
         seed=seed,
         family=family.strip(),
         views=chosen,
-        rays=rays,
+        inputs=inputs,
         frame=frame.model_copy(update={"exposure": 0.0}),
         triangles=read_summary(workspace.scene).triangles,
         noise=noise,
@@ -112,15 +117,41 @@ def make(seed: int, folder: Path, scratch: Path) -> None:
     temporary.rename(folder)
 
 
+def way(path: list[View], last: int, random: np.random.Generator) -> list[View]:
+    """Frames of a camera that comes to the view ``last`` of a path, or rests there: that view is the last of them."""
+    view, before = path[last], path[last - 1 if last else 1]
+    count = int(random.integers(1, MOST_FRAMES + 1))
+    step = 0.0 if random.random() < RESTING else random.uniform(0.1, 1.0) / count
+    return [*(between(view, before, step * number) for number in range(count, 0, -1)), view]
+
+
+def between(view: View, other: View, share: float) -> View:
+    """A camera on the way from ``view`` to ``other``."""
+    matrix = (1 - share) * view.matrix + share * other.matrix
+    left, _, right = np.linalg.svd(matrix[:3, :3])
+    matrix[:3, :3] = left @ right
+    return view.model_copy(update={"c2w": tuple(map(tuple, matrix.tolist()))}) if share else view
+
+
 def _look(
-    workspace: Workspace, plan: EffectPlan, views: list[View], rays: list[int], seed: int, took: Took
+    workspace: Workspace,
+    plan: EffectPlan,
+    ways: list[list[View]],
+    rays: tuple[int, int, int],
+    seed: int,
+    took: Took,
 ) -> tuple[np.ndarray, float]:
-    """(float32 [views, channels, side, side], relative RMSE of the references), by this process, on one core."""
+    """(float32 [views, channels, side, side], relative RMSE of the references), by this process, on one core.
+
+    ways: of the cameras; their last frames are the views. rays: of base images that stand alone, and of one that
+    remembers the frames before.
+    """
     choice = choose_variant("auto")
     os.environ.update(choice.environment)
     from dnrpipe.raytrace.base_renderer import BaseRenderer
     from dnrpipe.raytrace.engine import Engine
     from dnrpipe.raytrace.frames import Frames
+    from dnrpipe.raytrace.history import History
     from dnrpipe.raytrace.light_worker import indirect_integrator
     from dnrpipe.raytrace.lightmap import LightBaker
     from dnrpipe.raytrace.noise import half_noise
@@ -136,9 +167,17 @@ def _look(
     size, spp = LIGHT_MAPS[seed % len(LIGHT_MAPS)]
     light = LightBaker(engine.mi, scene, indirect, grouped_meshes(bundle)).bake(size, spp, seed)
     took("light")
-    scaled = [scaled_view(view, engine.unit_scale) for view in views]
-    bases = [[r.frame(v) for v in scaled] for r in (BaseRenderer(engine.mi, scene, light, k) for k in rays)]
+    scaled = [[scaled_view(view, engine.unit_scale) for view in way] for way in ways]
+    renderers, history = [BaseRenderer(engine.mi, scene, light, k) for k in rays], History(engine.mi)
+    bases = [[renderer.frame(way[-1]) for way in scaled] for renderer in renderers[:-1]]
     took("base images")
+    bases.append([])
+    for way in scaled:
+        history.begin()
+        frames = [history.take(view, renderers[-1].frame(view, history.number)) for view in way]
+        bases[-1].append(frames[-1])
+    took("memory")
+    views = [way[-1] for way in ways]
     silhouettes = Frames(engine, bundle, "path", 2, (views[0].width, views[0].height))
     integrator, _ = engine.integrator(bundle, plan.integrator, DEPTH)
     pictures, noises = [], []
@@ -159,9 +198,10 @@ def _look(
         channels = {**first, "depth.Z": first["depth.Z"] / engine.unit_scale}
         channels["coverage"] = silhouettes.coverage(view, first["mask"] > 0.5)
         channels |= {f"target.{c}": target[c] for c in "RGBA"}
-        for k, base in zip(rays, bases, strict=True):
-            channels |= {f"{name}@{k}": values for name, values in base[number].items()}
-        pictures.append(np.stack([channels[name] for name in channel_names(rays)]).astype(np.float32))
+        inputs = [*map(str, rays[:-1]), REMEMBERED]
+        for name, base in zip(inputs, bases, strict=True):
+            channels |= {f"{channel}@{name}": values for channel, values in base[number].items()}
+        pictures.append(np.stack([channels[name] for name in channel_names(inputs)]).astype(np.float32))
     took("references")
     return np.stack(pictures), float(np.mean(noises))
 

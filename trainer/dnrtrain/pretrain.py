@@ -1,10 +1,10 @@
 """Training of the shipped corrector: no scene in it, trained on many scenes, used on scenes that it never saw.
 
 Notation
-    x      base image and guides of a view, k rays per pixel
+    x      a base image of a view and its guides: of k rays per pixel, or with what earlier frames of a camera's way saw
     y      its path-traced reference, display space over white
 
-Each step draws scenes, one view and one k of each, and a square of it, then disturbs what must not matter: the
+Each step draws scenes, one view and one x of each, and a square of it, then disturbs what must not matter: the
 symmetries of the square, the order of the colour channels, the level of light. References are noisy and not denoised:
 noise averages out over steps, a denoiser's softness would be learned (Lehtinen et al. 2018). Structural and perceptual
 terms would take noise for structure, so they are small or none.
@@ -147,20 +147,20 @@ def disturbed(batch: Batch, random: np.random.Generator) -> Batch:
 
 @torch.no_grad()
 def judge(dnr: DNR, scenes: list[SceneMaps]) -> dict[str, Any]:
-    """Mean PSNR over white of base images and of their corrections, by rays per pixel and by scene."""
+    """Mean PSNR over white of base images and of their corrections, by kind of base image and by scene."""
     dnr.eval()
-    rows: list[tuple[int, int, float, float]] = []
+    rows: list[tuple[int, str, float, float]] = []
     for scene in scenes:
         for view in range(len(scene.scene.views)):
-            for rays in scene.scene.rays:
-                batch = scene.batch(view, rays)
+            for chosen in scene.scene.inputs:
+                batch = scene.batch(view, chosen)
                 display, linear = batch.display, batch.target
                 assert display is not None and linear is not None
                 target = display.over_white(linear[:, :3], linear[:, 3:])
                 both = [float(psnr(p.clamp(0, 1), target)) for p in (base_picture(batch), dnr(batch).rgb)]
-                rows.append((scene.scene.seed, rays, both[0], both[1]))
+                rows.append((scene.scene.seed, chosen, both[0], both[1]))
     dnr.train()
     mean = lambda chosen: [round(float(np.mean([r[i] for r in chosen])), 3) for i in (2, 3)]  # noqa: E731
-    by_rays = {k: mean([r for r in rows if r[1] == k]) for k in sorted({r[1] for r in rows})}
+    by_input = {k: mean([r for r in rows if r[1] == k]) for k in sorted({r[1] for r in rows})}
     by_scene = {s: mean([r for r in rows if r[0] == s]) for s in sorted({r[0] for r in rows})}
-    return {"psnr": mean(rows), "by_rays": by_rays, "by_scene": by_scene}
+    return {"psnr": mean(rows), "by_input": by_input, "by_scene": by_scene}

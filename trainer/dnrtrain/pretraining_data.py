@@ -23,7 +23,7 @@ TARGET = ("target.R", "target.G", "target.B", "target.A")
 LAYERS = (
     *("base.R", "base.G", "base.B", "base.A"),
     *("diffuse.R", "diffuse.G", "diffuse.B"),
-    *("albedo.R", "albedo.G", "albedo.B", "noise"),
+    *("albedo.R", "albedo.G", "albedo.B", "noise", "rays"),
 )
 """Of a base image: channels of a base file (see `contract`)."""
 BRIGHT = {*TARGET[:3], *LAYERS[:3], *LAYERS[4:7], "noise"}
@@ -31,16 +31,19 @@ BRIGHT = {*TARGET[:3], *LAYERS[:3], *LAYERS[4:7], "noise"}
 RAY_COUNTS = (1, 2, 4, 8)
 
 
-def channel_names(rays: Sequence[int]) -> list[str]:
-    """Channels of ``maps.npy``, in order; those of a base image of k rays per pixel end in @k."""
-    return [*SHARED, *TARGET, *(f"{name}@{k}" for k in rays for name in LAYERS)]
+REMEMBERED = "remembered"
+
+
+def channel_names(inputs: Sequence[str]) -> list[str]:
+    """Channels of ``maps.npy``, in order; those of the base image called k end in @k."""
+    return [*SHARED, *TARGET, *(f"{name}@{k}" for k in inputs for name in LAYERS)]
 
 
 class Scene(BaseModel, extra="forbid", frozen=True):
     """``scene.json``.
 
     frame: its exposure is 0: radiance in the maps is in units of display white.
-    rays: per pixel, of the base images.
+    inputs: the base images of each view, by their rays per pixel; REMEMBERED is one that earlier frames went into.
     noise: of the references, relative RMSE in display space, as `dnrpipe raytrace-selected` measures it. They are not
         denoised.
     """
@@ -48,7 +51,7 @@ class Scene(BaseModel, extra="forbid", frozen=True):
     seed: int
     family: str
     views: list[View]
-    rays: list[int]
+    inputs: list[str]
     frame: SceneFrame
     triangles: int
     noise: float
@@ -92,27 +95,28 @@ class SceneMaps:
         self.scene = Scene.model_validate_json((folder / "scene.json").read_bytes())
         self.maps = np.load(folder / "maps.npy", mmap_mode="r", allow_pickle=False)
         self.display = DisplayTransform(self.scene.frame, folder)
-        self.places = {name: index for index, name in enumerate(channel_names(self.scene.rays))}
+        self.places = {name: index for index, name in enumerate(channel_names(self.scene.inputs))}
         self.view_dirs = [torch.from_numpy(-view.ray_directions()).permute(2, 0, 1) for view in self.scene.views]
 
     def draw(self, random: np.random.Generator, side: int) -> Batch:
         """A random square of a random view, with one of its base images."""
-        view, rays = int(random.integers(len(self.scene.views))), int(random.choice(self.scene.rays))
+        view, chosen = int(random.integers(len(self.scene.views))), str(random.choice(self.scene.inputs))
         height, width = self.maps.shape[-2:]
         top, left = (int(random.integers(max(1, size - side + 1))) for size in (height, width))
-        return self.batch(view, rays, (slice(top, top + side), slice(left, left + side)))
+        return self.batch(view, chosen, (slice(top, top + side), slice(left, left + side)))
 
-    def batch(self, view: int, rays: int, window: tuple[slice, slice] = (slice(None), slice(None))) -> Batch:
-        """One view as the model sees it. ``target`` is linear, premultiplied, with its alpha: [1, 4, H, W]."""
+    def batch(self, view: int, chosen: str, window: tuple[slice, slice] = (slice(None), slice(None))) -> Batch:
+        """One view as the model sees it, by one of its inputs. ``target`` is linear, premultiplied, with its alpha:
+        [1, 4, H, W]."""
 
         def of(*names: str) -> Tensor:
-            chosen = [self.places[name] for name in names]
-            return torch.from_numpy(np.asarray(self.maps[view, chosen, window[0], window[1]], dtype=np.float32))[None]
+            planes = [self.places[name] for name in names]
+            return torch.from_numpy(np.asarray(self.maps[view, planes, window[0], window[1]], dtype=np.float32))[None]
 
         def layer(name: str) -> Tensor:
-            return of(*(f"{name}.{c}@{rays}" for c in "RGB")) / alpha
+            return of(*(f"{name}.{c}@{chosen}" for c in "RGB")) / alpha
 
-        alpha = of(f"base.A@{rays}").clamp(ALPHA_FLOOR, 1.0)
+        alpha = of(f"base.A@{chosen}").clamp(ALPHA_FLOOR, 1.0)
         mask = (of("mask") > 0.5).float()
         normal = of("normal.X", "normal.Y", "normal.Z") * mask
         zero = torch.zeros_like(mask)
@@ -128,7 +132,7 @@ class SceneMaps:
             base=layer("base"),
             diffuse=layer("diffuse"),
             albedo=layer("albedo"),
-            noise=of(f"noise@{rays}") / alpha,
-            rays=torch.full_like(mask, rays),
+            noise=of(f"noise@{chosen}") / alpha,
+            rays=of(f"rays@{chosen}").clamp_min(1.0),
             display=self.display,
         )
