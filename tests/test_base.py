@@ -462,6 +462,33 @@ def test_base_images_of_few_samples_are_path_traced_and_denoised(
         worker({name: task[name] for name in ("view", "output")})
 
 
+def test_frames_that_remember_are_the_same_when_a_sequence_is_taken_up_again(
+    tmp_path: Path, mitsuba_variant: str
+) -> None:
+    (tmp_path / "scene.xml").write_text(
+        '<scene version="3.0.0"><emitter type="constant"/><shape type="sphere"><bsdf type="roughconductor"/></shape>'
+        "</scene>"
+    )
+    np.savez(tmp_path / "light.npz", light=np.zeros((2, 2, 8, 8, 3), np.float32), fingerprint="f")
+    common = {"bundle": str(tmp_path / "scene.xml"), "variant": mitsuba_variant, "kind": "baked", "samples": 2}
+    common |= {"light": str(tmp_path / "light.npz"), "denoise": False}
+    ways = [camera(0.3 + 0.02 * number).model_dump(mode="json") for number in range(4)]
+
+    def rendered_by(worker: Worker, number: int, earlier: bool = True) -> dict[str, np.ndarray]:
+        task = {"view": ways[number], "output": str(tmp_path / "v.exr"), "fingerprint": "f"}
+        worker(task | {"earlier": ways[:number] if earlier else None})
+        return read_exr(tmp_path / "v.exr")[0]
+
+    steady, resumed = Worker(common), Worker(common)
+    frames = [rendered_by(steady, number) for number in range(4)]
+    again = rendered_by(resumed, 3)
+    assert all((frames[3][name] == again[name]).all() for name in again)
+    inside = frames[3]["mask"] > 0.5
+    assert (frames[0]["rays"][inside] == 2).all() and np.median(frames[3]["rays"][inside]) > 4
+    alone = rendered_by(resumed, 3, earlier=False)
+    assert (alone["rays"][inside] == 2).all() and not (alone["base.R"] == again["base.R"]).all()
+
+
 def test_scenes_without_emitters_are_dark(tmp_path: Path) -> None:
     metal = {"type": "roughconductor", "alpha": 0.2}
     scene = corner_room(tmp_path, {"type": "diffuse"}, metal, {"type": "sphere", "radius": 0.1})

@@ -4,7 +4,7 @@ bench_workspace  one workspace through the benchmark
 reference        many samples per pixel, two halves, kept on disk
 standing         one renderer against the baselines
 motion           reprojection by known motion, flicker (numpy only)
-stability        an orbit of close frames
+moving           an orbit and a walk: ours that remember, and rivals that gather their samples
 equal_time       what N frames cost, everything before the first one included
 document         JSON and Markdown
 

@@ -54,8 +54,8 @@ def _one(options: argparse.Namespace) -> int:
             clock=options.clock,
             threads=options.threads,
             samples=tuple(options.samples),
-            orbit=options.orbit,
-            orbit_spp=options.orbit_spp,
+            moving=options.moving,
+            moving_spp=options.moving_spp,
             rays=tuple(options.rays),
         )
         result = bench(root, chosen, lambda line: print(line, file=sys.stderr))
@@ -75,7 +75,7 @@ def _kept(options: argparse.Namespace) -> list[dict[str, Any]]:
 
 def _passed(options: argparse.Namespace) -> list[str]:
     """The options that decide a scene's figures, as arguments."""
-    names = ("cache", "views", "reference_spp", "reference", "clock", "threads", "orbit", "orbit_spp")
+    names = ("cache", "views", "reference_spp", "reference", "clock", "threads", "moving", "moving_spp")
     given = [text for name in names for text in (f"--{name.replace('_', '-')}", str(getattr(options, name)))]
     rays = ["--rays", *map(str, options.rays)] if options.rays else []
     return [*given, "--samples", *map(str, options.samples), *rays]
@@ -94,8 +94,8 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--reference", choices=("auto", "raw", "denoised"), default="auto")
     parser.add_argument("--clock", choices=("wall", "cpu"), default="wall", help="cpu: CPU time over the threads")
     parser.add_argument("--threads", type=int, default=2, help="of Mitsuba, denoiser and network alike")
-    parser.add_argument("--orbit", type=int, default=12, help="frames of the stability orbit; 0: none")
-    parser.add_argument("--orbit-spp", type=int, default=512, help="samples of the orbit's references")
+    parser.add_argument("--moving", type=int, default=24, help="frames of an orbit and of a walk; 0: none")
+    parser.add_argument("--moving-spp", type=int, default=512, help="samples of their references")
     # One workspace in this very process, result as JSON there: what the command calls for each.
     parser.add_argument("--only-result", type=Path, help=argparse.SUPPRESS)
     return parser.parse_args()

@@ -19,8 +19,8 @@ from dnrtrain.perceptual import build_lpips
 from dnrtrain.weights import WeightsMissing, load_weights
 
 from .equal_time import upfront
+from .moving import measure
 from .reference import Reference, make_references
-from .stability import measure
 from .standing import classes, standing
 
 CLASSES = (0.03, 0.07, 0.3)
@@ -39,8 +39,8 @@ class Options:
     clock: str = "wall"
     threads: int = 2
     samples: tuple[int, ...] = (1, 2, 4, 8, 16, 64)
-    orbit: int = 12
-    orbit_spp: int = 512
+    moving: int = 24
+    moving_spp: int = 512
     rays: tuple[int, ...] = ()
 
 
@@ -81,21 +81,23 @@ def bench(root: Path, options: Options, tell: Callable[[str], None]) -> dict[str
         if baseline.masked and baseline.method == "raw":
             tell(f"{scene.name}: repaired: {baseline.masked} pixels of {baseline.name} were not finite and are black")
     truth = [scene.shown(picture) for picture in reference.pictures]
-    result = _figures(scene, options, reference, truth, baselines, own)
+    lpips = _lpips()
+    result = _figures(scene, options, reference, truth, baselines, own, lpips)
     result["upfront"] = upfront(scene.workspace.ledger.read(), options.threads)
-    if options.orbit > 1:
+    if options.moving:
         best = [baselines[name] for name in result["frontier"]]
         shown = [(baseline.spp, baseline.method) for baseline in best if baseline.method != "raw"]
-        result["stability"] = measure(
+        result["moving"] = measure(
             scene,
             ours,
             clock,
             shown,
-            frames=options.orbit,
-            spp=options.orbit_spp,
+            frames=options.moving,
+            spp=options.moving_spp,
             kind=options.reference,
             folder=folder,
             tell=tell,
+            lpips=lpips["quick"],
         )
     return result
 
@@ -107,26 +109,22 @@ def _figures(
     truth: list[Any],
     baselines: dict[str, Baseline],
     own: dict[str, Ran],
+    lpips: dict[str, Any],
 ) -> dict[str, Any]:
     masks = [torch.from_numpy(picture[..., 3] > 0.5).float()[None, None] for picture in reference.pictures]
     everything = {**baselines, **own}
-    try:
-        lpips = build_lpips(load_weights())
-    except WeightsMissing:
-        lpips = {}
-    quick, slow = ({kind: lpips[kind]} if lpips else None for kind in ("alex", "vgg"))
     rows = {
         name: {
             "ms": ran.ms(),
             "parts": {part: float(np.median(values)) for part, values in ran.parts.items()},
-            **_quality(ran.pictures, truth, masks, quick),
+            **_quality(ran.pictures, truth, masks, lpips["quick"]),
         }
         for name, ran in everything.items()
     }
     points = {name: (rows[name]["ms"], rows[name]["psnr"]) for name in baselines}
     best = frontier(points)
     for name in [*best, *own]:
-        rows[name] |= _quality(everything[name].pictures, truth, masks, slow)
+        rows[name] |= _quality(everything[name].pictures, truth, masks, lpips["slow"])
     scale = scene.size[0] * scene.size[1] / 128**2
     limits = [1000 * seconds * scale for seconds in CLASSES]
     standings = {}
@@ -152,6 +150,15 @@ def _figures(
         "frontier": best,
         "standing": standings,
     }
+
+
+def _lpips() -> dict[str, Any]:
+    """quick: by AlexNet, slow: by VGG; None where the weights are missing. See `dnrtrain.metrics.image_metrics`."""
+    try:
+        found = build_lpips(load_weights())
+    except WeightsMissing:
+        return {"quick": None, "slow": None}
+    return {"quick": {"alex": found["alex"]}, "slow": {"vgg": found["vgg"]}}
 
 
 def _quality(pictures: list[Any], truth: list[Any], masks: list[Any], lpips: Any) -> dict[str, float | None]:

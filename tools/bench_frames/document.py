@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from dnrpipe.studies.frames.ours import BASE, NEURAL
+from dnrpipe.studies.frames.pareto_front import frontier
 from dnrtrain.atomic import atomic_path, write_json
 
 from . import equal_time
@@ -139,6 +140,8 @@ def _scene(scene: dict[str, Any]) -> list[str]:
             f"| {row['limit_ms']:.0f} ms | {row['rival'] or 'none'} | {_number(row['rival_db'], 2)} |"
             f" {_number(mine[0], 2)} | {_number(mine[1], 2)} |"
         )
+    for move, found in scene.get("moving", {}).items():
+        lines += ["", *_moving(move, found)]
     if "stability" in scene:
         lines += ["", *_stability(scene)]
     return lines
@@ -159,6 +162,29 @@ def _stability(scene: dict[str, Any]) -> list[str]:
     for name, row in sorted(rows.items(), key=lambda item: item[1]["flicker"]):
         label = f"**{name}**" if _own(name) else name
         lines.append(f"| {label} | {1000 * row['change']:.2f} | {1000 * row['flicker']:.2f} |")
+    return lines
+
+
+def _moving(move: str, found: dict[str, Any]) -> list[str]:
+    """A move's renderers, by their milliseconds; of the rivals those alone that nothing beats at their time."""
+    rows = found["rows"]
+    points = {name: (row["ms"], row["psnr"]) for name, row in rows.items() if not _own(name)}
+    shown = [*(name for name in rows if _own(name)), *frontier(points)]
+    lines = [
+        f"{move.capitalize()} of {found['frames']} frames: means over six of them, against {found['reference_spp']}"
+        f" samples ({found['reference']}). Flicker: mean absolute difference of the change from frame to frame, after"
+        " reprojection, from the reference's, x 1000.",
+        "",
+        "| renderer | ms | dB | LPIPS | flicker |",
+        "|---|---|---|---|---|",
+    ]
+    for name in sorted(shown, key=lambda name: rows[name]["ms"]):
+        row = rows[name]
+        label = f"**{name}**" if _own(name) else name
+        lines.append(
+            f"| {label} | {row['ms']:.1f} | {row['psnr']:.2f} | {_number(row.get('lpips_alex'), 4)} |"
+            f" {1000 * row['flicker']:.2f} |"
+        )
     return lines
 
 

@@ -93,7 +93,7 @@ def make(seed: int, folder: Path, scratch: Path) -> None:
     took("convert")
     ways = [way(path, path.index(view), random) for view in chosen]
     remembered = int(random.choice(RAY_COUNTS))
-    maps, noise = _look(workspace, plan_of(workspace, settings), ways, (*rays, remembered), seed, took)
+    maps, noise = _look(workspace, plan_of(workspace, settings), ways, [*rays, remembered], seed, took)
     frame = read_frame(workspace)
     bright = [name.partition("@")[0] in BRIGHT for name in channel_names(inputs)]
     maps[:, bright] *= 2.0**frame.exposure
@@ -137,7 +137,7 @@ def _look(
     workspace: Workspace,
     plan: EffectPlan,
     ways: list[list[View]],
-    rays: tuple[int, int, int],
+    rays: list[int],
     seed: int,
     took: Took,
 ) -> tuple[np.ndarray, float]:

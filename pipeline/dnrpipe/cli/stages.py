@@ -154,6 +154,7 @@ def run(scene: Path | None, **options: Any) -> None:
     "--resolution", type=click.IntRange(8, 16384), metavar="PIXELS", help="Square size of the orbit's frames."
 )
 @click.option("--untrained", is_flag=True, help="By the shipped corrector, also where a renderer was trained.")
+@click.option("--alone", is_flag=True, help="No frame remembers those before it: for cameras that are no sequence.")
 @common
 def render(
     orbit: int | None,
@@ -163,6 +164,7 @@ def render(
     movie: str,
     resolution: int | None,
     untrained: bool,
+    alone: bool,
     **options: Any,
 ) -> None:
     """Render novel views with the neural renderer: frames and a movie in renders/.
@@ -198,7 +200,7 @@ def render(
             views = orbit_views(read_summary(session.workspace.scene), cameras, orbit or 60, elevation)
             name = f"orbit-{orbit or 60}"
         run = session.run.for_stage("render")
-        answer = render_novel(run, views, name=name, frames=frames, movie=movie, untrained=untrained)
+        answer = render_novel(run, views, name=name, frames=frames, movie=movie, untrained=untrained, alone=alone)
         session.console.say(f"{answer['frames']} frames, {answer['neural_ms']:.1f} ms each for the network")
         session.console.say(answer["movie"] or answer["folder"])
         session.console.result(answer)

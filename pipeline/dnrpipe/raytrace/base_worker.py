@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from .base_renderer import CHAIN, BaseRenderer
 from .denoise import denoise
 from .engine import BundleWorker, masked
 from .frames import Frames
+from .history import History
 from .light_worker import read_light
 from .sensors import scaled_view
 from .tasks import BakedCommon, BaseAnswer, BaseTask, SampledCommon, costs_since
@@ -37,18 +39,20 @@ class Worker(BundleWorker):
         scene = self.engine.scenes[str(self.bundle)]
         self.renderer = BaseRenderer(self.engine.mi, scene, light, self.common.samples)
         self.silhouettes: dict[tuple[int, int], Frames] = {}
+        self.history, self.seen = History(self.engine.mi), list[View]()
+        """Of the frames ``seen``."""
         self.warm = False
         self.repaired = self.masked = 0  # pixels of the view at hand: samples left out, set to zero
 
     def __call__(self, asked: dict[str, Any]) -> BaseAnswer:
         task = BaseTask.model_validate(asked)
         view = task.view
-        if not self.warm:
-            self.channels(view)  # compiles the kernel, which is no cost of a frame
-            self.warm = True
+        if not self.warm:  # compiles the kernels, which is no cost of a frame
+            self.remembered(view, ()) if task.earlier is not None else self.channels(view)
+            self.seen, self.warm = [], True
         self.repaired = self.masked = 0
         started, cpu = time.monotonic(), time.process_time()
-        channels = self.channels(view)
+        channels = self.channels(view) if task.earlier is None else self.remembered(view, task.earlier)
         answer: BaseAnswer = {
             **costs_since(started, cpu),
             "kind": self.common.kind,
@@ -74,6 +78,23 @@ class Worker(BundleWorker):
         if isinstance(self.common, SampledCommon):
             return channels | self._traced(self.common, view, channels)
         return channels | denoised(channels) if self.common.denoise else channels
+
+    def remembered(self, view: View, earlier: Sequence[View]) -> dict[str, np.ndarray]:
+        """`channels` of a view, with what the frames ``earlier`` of a camera's way saw.
+
+        Those that were the last to be seen are not rendered again: one frame after the other costs one each.
+        """
+        way = [*earlier, view]
+        known = len(self.seen) if self.seen == way[: len(self.seen)] and len(self.seen) < len(way) else 0
+        if not known:
+            self.history.begin()
+        self.seen = way
+        for frame in way[known:-1]:
+            self._taken(frame)
+        return self._taken(view)
+
+    def _taken(self, view: View) -> dict[str, np.ndarray]:
+        return self.history.take(view, self.channels(view, number=self.history.number))
 
     def _frames(self, view: View) -> Frames:
         """Finer silhouettes than the base image's few rays give, for views of one size."""

@@ -220,9 +220,11 @@ class SampledCommon(BundleCommon):
 
 
 class BaseTask(Task):
-    """Render a view's base image into ``output``, an EXR file."""
+    """Render a view's base image into ``output``, an EXR file. earlier: the frames of a moving camera that it remembers
+    (see `history`), in their order; None: it stands alone."""
 
     view: View
+    earlier: tuple[View, ...] | None = None
     output: Path
     fingerprint: str
 

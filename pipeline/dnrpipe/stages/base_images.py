@@ -32,6 +32,9 @@ RENDERED = ("baked", "direct", "path")
 """Kinds of base images that are rendered into files of their own."""
 AUTOMATIC_TEXELS = 4
 """Light map texels per pixel of an image's side: about one texel a pixel where the atlas shows a part of itself."""
+CHUNK, WARM_UP = 64, 8
+"""Frames of a sequence that remember one another; those before a chunk's first that are rendered for it once more, so
+that no seam is seen. A chunk is what an interrupted run does again at most."""
 SIZES = (256, 4096)
 SPP = (16, 64)
 
@@ -96,6 +99,7 @@ def base_views(
     *,
     paths: Sequence[Path] | None = None,
     purpose: Purpose | None = None,
+    sequence: bool = False,
 ) -> list[dict[str, Any]]:
     """Render the base images of the views that are missing or out of date -> all tasks, [] where none is rendered.
 
@@ -103,6 +107,8 @@ def base_views(
         split: that they are of; the ledger names them by it.
         paths: where they go instead of ``base/<split>``.
         purpose: they are booked under, instead of the stage's.
+        sequence: they are the frames of a moving camera, and remember those before them (baked light that is not
+            denoised; other kinds cannot).
 
     Raises UserError where this machine has no jit variant of Mitsuba.
     """
@@ -112,11 +118,14 @@ def base_views(
     with run.timed("baking light: process"):
         bake_light(run, renderer)
     paths = paths or [base_path(run.workspace, split, view.name) for view in views]
-    tasks = []
-    for view, path in zip(views, paths, strict=True):
-        data = view.model_dump(mode="json")
-        fingerprint = digest([BASE_VERSION, renderer.fingerprint, data])
-        tasks.append({"view": data, "output": str(path), "fingerprint": fingerprint})
+    chosen, tasks = run.settings, []
+    remembers = sequence and chosen.model.base == "baked" and not chosen.base.denoise
+    cameras = [view.model_dump(mode="json") for view in views]
+    for number, (data, path) in enumerate(zip(cameras, paths, strict=True)):
+        begin = max(0, number - number % CHUNK - WARM_UP)
+        earlier = cameras[begin:number] if remembers else None
+        fingerprint = digest([BASE_VERSION, renderer.fingerprint, data, *([earlier] if remembers else [])])
+        tasks.append({"view": data, "earlier": earlier, "output": str(path), "fingerprint": fingerprint})
     run.view_tasks(
         "base images",
         "dnrpipe.raytrace.base_worker",

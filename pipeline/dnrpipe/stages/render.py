@@ -33,7 +33,14 @@ FPS = 24
 
 
 def render_novel(
-    run: Run, views: Sequence[View], *, name: str, frames: str, movie: str, untrained: bool = False
+    run: Run,
+    views: Sequence[View],
+    *,
+    name: str,
+    frames: str,
+    movie: str,
+    untrained: bool = False,
+    alone: bool = False,
 ) -> dict[str, Any]:
     """Render the views into ``renders/<name>/``.
 
@@ -44,6 +51,7 @@ def render_novel(
         run: of stage render.
         frames: png, exr or both. movie: mp4, webp or none.
         untrained: by the shipped corrector, into ``renders/<name>-untrained/``.
+        alone: no frame remembers those before it.
 
     Raises UserError: no fine-tuned model, or cameras that no movie can hold.
     """
@@ -59,14 +67,14 @@ def render_novel(
     folder = workspace.root / "renders" / name
     device = torch_device(settings)
     model, model_fingerprint = _renderer(run, device, untrained)
-    fingerprint = digest([model_fingerprint, run.scene_fingerprint, [v.model_dump(mode="json") for v in views]])
+    fingerprint = digest([model_fingerprint, run.scene_fingerprint, alone, [v.model_dump(mode="json") for v in views]])
     record = folder / "frames.json"
     if folder.exists() and (not record.exists() or record.read_text().strip() != f'"{fingerprint}"'):
         for path in [*folder.glob("frame_*"), *folder.glob(f"{name}.*")]:
             path.unlink()
     write_json(record, fingerprint)
     write_cameras(folder / "cameras.json", views, name)
-    paths = _inputs(run, views, folder)
+    paths = _inputs(run, views, folder, alone)
     kind = settings.model.base
     frame = read_frame(workspace)
     pictures: list[np.ndarray] = []
@@ -171,7 +179,7 @@ def write_webp(path: Path, pictures: Sequence[np.ndarray]) -> None:
         first.save(temporary, save_all=True, append_images=rest, duration=1000 // FPS, loop=0, quality=85)
 
 
-def _inputs(run: Run, views: Sequence[View], frames: Path) -> list[Path]:
+def _inputs(run: Run, views: Sequence[View], frames: Path, alone: bool) -> list[Path]:
     """Files with what the network sees of each view. Base images that are rendered bring the G-buffer along."""
     rendered = run.settings.model.base in RENDERED
     paths = [frames / ("base" if rendered else "gbuffers") / f"{view.name}.exr" for view in views]
@@ -179,7 +187,7 @@ def _inputs(run: Run, views: Sequence[View], frames: Path) -> list[Path]:
     if {path.name for path in folder.glob("[!.]*.exr")} - {path.name for path in paths}:  # of other views
         shutil.rmtree(folder)
     if rendered:
-        base_views(run, views, "novel", paths=paths)
+        base_views(run, views, "novel", paths=paths, sequence=not alone)
     else:
         raster = run.settings.model.base == "raster"
         prepared = run.workspace.manifest.prepared

@@ -2,9 +2,9 @@
 
 Every triangle is projected along the axis its normal points to most (box projection). Connected triangles of one
 mesh with one direction form a chart; where that makes too many, the small ones of the meshes with the most charts are
-joined with their neighbours in space. Charts keep one scale and are packed on shelves by their bounding boxes. A million
-polygons take seconds where ``smart_project`` takes minutes. A chart that folds back over itself overlaps; the atlas'
-facts say how much.
+joined with their neighbours in space. Charts keep one scale and are packed on shelves by their bounding boxes. A
+million polygons take seconds where ``smart_project`` takes minutes. A chart that folds back over itself overlaps; the
+atlas' facts say how much.
 """
 
 from __future__ import annotations

@@ -109,7 +109,7 @@ def render_baselines(
         ((image, lost), path_ms), (guide, rays_ms), denoiser_ms = paths[baseline.spp], guides[rays], 0.0
         baseline.masked += lost
         if method.denoise:
-            image, denoiser_ms = clock.time(partial(_denoised, image, guide, method, rays))
+            image, denoiser_ms = clock.time(partial(denoised, image, guide, method, rays))
         if guide is not None:
             image = np.concatenate([image[..., :3], guide.coverage[..., None]], axis=-1)
         for part, ms in (("path", path_ms), ("primary rays", rays_ms), ("denoiser", denoiser_ms)):
@@ -117,7 +117,8 @@ def render_baselines(
         baseline.pictures.append(scene.shown(image).half())
 
 
-def _denoised(image: np.ndarray, guide: Any, method: Method, rays: int) -> np.ndarray:
+def denoised(image: np.ndarray, guide: Any, method: Method, rays: int) -> np.ndarray:
+    """The picture [H, W, 4] as the method denoises it. guide: auxiliary images of so many primary rays."""
     if not method.guided:
         return denoise(image, quality=method.quality)
     clean = method.rays > 0 or rays >= MANY

@@ -20,8 +20,9 @@ from dnrtrain.exr import write_exr
 from dnrtrain.model import render_views
 
 from ...core.errors import UserError
-from ...raytrace.base_renderer import BaseRenderer
+from ...raytrace.base_renderer import CHAIN, BaseRenderer
 from ...raytrace.base_worker import denoised
+from ...raytrace.history import History
 from ...raytrace.light_worker import read_light
 from ...raytrace.sensors import scaled_view
 from ...stages.base_images import light_path
@@ -30,6 +31,8 @@ from .scene import BenchScene, Clock
 TIMED = ("none", "baked")
 """Base images that this benchmark can render frame by frame."""
 NEURAL, BASE = "neural", "base image alone"
+REMEMBERS = ", remembers"
+"""Ends the names of frames that remember the ones before."""
 
 
 class Ours:
@@ -65,14 +68,25 @@ class Ours:
             baked = read_light(light)
             for count in samples or (scene.settings.base.samples,):
                 self.renderers[count] = BaseRenderer(scene.engine.mi, mitsuba_scene, baked, count)
+        self.histories = {count: History(scene.engine.mi) for count in self.renderers}
 
-    def frame(self, view: View, clock: Clock) -> dict[str, dict[str, Any]]:
+    def begin(self) -> None:
+        """Forget the frames so far."""
+        for history in self.histories.values():
+            history.begin()
+
+    def frame(self, view: View, clock: Clock, *, remember: bool = False) -> dict[str, dict[str, Any]]:
         """By NEURAL and BASE, and the rays per pixel: {"picture": display RGB over white [1, 3, H, W], "parts":
-        {name: ms}}."""
+        {name: ms}}.
+
+        remember: with what earlier such frames saw, since `begin`; only of baked light that is not denoised.
+        """
         result: dict[str, dict[str, Any]] = {}
         for renderer in self.renderers.values() or (None,):
-            channels, parts = self._inputs(renderer, view, clock)
+            history = self.histories[renderer.samples] if remember and renderer is not None else None
+            channels, parts = self._inputs(renderer, view, clock, history)
             rays = "" if renderer is None else f", {renderer.samples} rays"
+            rays += REMEMBERS if remember else ""
             if renderer is not None:
                 alpha = channels["coverage"][..., None]
                 base = np.stack([channels[f"base.{c}"] for c in "RGB"], axis=-1)
@@ -86,18 +100,22 @@ class Ours:
         return result
 
     def _inputs(
-        self, renderer: BaseRenderer | None, view: View, clock: Clock
+        self, renderer: BaseRenderer | None, view: View, clock: Clock, history: History | None
     ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
         """(channels that the network sees, ms by part). The base image's kernel gives the G-buffer, too."""
         if renderer is None:
             channels, ms = clock.time(partial(self.scene.frames.gbuffer, view))
             return channels, {"G-buffer": ms}
         scale = self.scene.engine.unit_scale
-        channels, ms = clock.time(partial(renderer.frame, scaled_view(view, scale)))
+        number = 0 if history is None else history.number
+        channels, ms = clock.time(partial(renderer.frame, scaled_view(view, scale), number))
         mask = channels["mask"] > 0.5
         coverage, finer = clock.time(partial(self.scene.frames.coverage, view, mask))
-        changed = {"depth.Z": channels["depth.Z"] / scale, "coverage": coverage}
+        channels |= {name: channels[name] / scale for name in ("depth.Z", *CHAIN)}
+        changed: dict[str, np.ndarray] = {"coverage": coverage}
         parts = {"base image and G-buffer": ms, "silhouettes": finer}
+        if history is not None:
+            channels, parts["history"] = clock.time(partial(history.take, view, channels))
         if self.scene.settings.base.denoise:
             clean, parts["denoiser"] = clock.time(partial(denoised, channels, 0))
             changed |= clean

@@ -1,0 +1,199 @@
+"""Moving cameras: how good each renderer's frames are, what they cost, and how much they change beyond what light does.
+
+Ours with and without memory of earlier frames; path tracing and denoiser, and the same with its samples gathered over
+the frames by the same reprojection before the denoiser sees them: the fair rival.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from dnrpipe.core.cameras import framing, look_at_view, orbit_views
+from dnrpipe.raytrace.base_renderer import CHAIN, BaseRenderer
+from dnrpipe.raytrace.engine import masked
+from dnrpipe.raytrace.history import History
+from dnrpipe.raytrace.sensors import scaled_view
+from dnrpipe.studies.frames.baselines import METHODS, denoised
+from dnrpipe.studies.frames.ours import Ours
+from dnrpipe.studies.frames.scene import BenchScene, Clock
+from dnrtrain.contract import View
+from dnrtrain.metrics import image_metrics
+
+from .motion import Surface, flicker
+from .reference import make_references
+
+STEPS = 360
+"""Frames of a full turn: one degree each, a quarter of a minute at 24 frames per second."""
+CLOSER, SIDEWAYS = 0.01, 0.4
+"""Of a walk, per frame: share of the distance, degrees about the scene's middle."""
+PAIRS = 3
+"""Pairs of frames one after the other that are traced as references, the last of them at the end."""
+PATIENCE = (1, 4)
+"""How many times as many samples of earlier frames the rival keeps as we keep rays."""
+
+
+def measure(
+    scene: BenchScene,
+    ours: Ours,
+    clock: Clock,
+    baselines: list[tuple[int, str]],
+    *,
+    frames: int,
+    spp: int,
+    kind: str,
+    folder: Path,
+    tell: Callable[[str], None],
+    lpips: Any,
+) -> dict[str, Any]:
+    """Figures of an orbit and of a walk.
+
+    Args:
+        scene, ours, clock: of the benchmark.
+        baselines: (samples, method) of each rival.
+        frames: of each move, at least 6.
+        spp, kind: of the references.
+        folder: references are kept there.
+        tell: called with a line per frame.
+        lpips: see `dnrtrain.metrics.image_metrics`.
+
+    Returns {move: {"frames", "reference", "reference_spp", "reference_noise", "rows": {renderer: {"ms", "psnr", ...,
+    and those of `motion.flicker`}}}}.
+    """
+    found = {}
+    for move, views in moves(scene, frames).items():
+        last = [round((frames - 1) * (i + 1) / PAIRS) for i in range(PAIRS)]
+        chosen = sorted({*last, *(number - 1 for number in last)})
+        reference = make_references(scene, [views[i] for i in chosen], move, spp, kind, folder, tell)
+        truth = dict(zip(chosen, (scene.shown(picture) for picture in reference.pictures), strict=True))
+        surfaces = {i: surface_of(views[i], scene.frames.gbuffer(views[i])) for i in chosen}
+        rivals = Rivals(scene, ours, baselines)
+        ours.begin()
+        pictures: dict[str, dict[int, torch.Tensor]] = {}
+        took: dict[str, list[float]] = {}
+        for number, view in enumerate(views):
+            for name, (picture, ms) in (_own(ours, view, clock) | rivals.frame(view, number, clock)).items():
+                took.setdefault(name, []).append(ms)
+                if number in truth:
+                    pictures.setdefault(name, {})[number] = picture.half()
+            tell(f"{scene.name}: {move}, frame {number + 1} of {frames}")
+        rows = {name: _figures(shown, truth, surfaces, last, lpips) for name, shown in pictures.items()}
+        found[move] = {
+            "frames": frames,
+            "reference": reference.kind,
+            "reference_spp": spp,
+            "reference_noise": float(np.mean(reference.noise)),
+            "rows": {name: {"ms": float(np.median(took[name][1:])), **row} for name, row in rows.items()},
+        }
+    return found
+
+
+def moves(scene: BenchScene, frames: int) -> dict[str, list[View]]:
+    """An orbit, a degree a frame, and a walk towards the scene."""
+    width, height = scene.size
+    cameras = scene.settings.cameras.model_copy(update={"width": width, "height": height})
+    focal, distance = framing(scene.summary, cameras)
+    centre, walk = np.asarray(scene.summary.bounds.center), []
+    for number in range(frames):
+        turn, rise = math.radians(200 + SIDEWAYS * number), math.radians(18)
+        away = np.array([math.cos(rise) * math.cos(turn), math.cos(rise) * math.sin(turn), math.sin(rise)])
+        eye = centre + away * distance * 0.85 * (1 - CLOSER) ** number
+        walk.append(look_at_view(f"{number:04d}", eye, centre, focal, cameras))
+    return {"orbit": orbit_views(scene.summary, cameras, STEPS)[:frames], "walk": walk}
+
+
+def surface_of(view: View, gbuffer: dict[str, np.ndarray]) -> Surface:
+    """What the G-buffer's camera sees."""
+    position = np.stack([gbuffer[f"position.{axis}"] for axis in "XYZ"], axis=-1).astype(np.float64)
+    return Surface(view, position, gbuffer["depth.Z"].astype(np.float64), gbuffer["mask"] > 0.5)
+
+
+def _own(ours: Ours, view: View, clock: Clock) -> dict[str, tuple[Any, float]]:
+    found = {**ours.frame(view, clock), **ours.frame(view, clock, remember=True)}
+    return {name: (frame["picture"], sum(frame["parts"].values())) for name, frame in found.items()}
+
+
+def _figures(
+    shown: dict[int, torch.Tensor],
+    truth: dict[int, torch.Tensor],
+    surfaces: dict[int, Surface],
+    last: list[int],
+    lpips: Any,
+) -> dict[str, float]:
+    masks = {i: torch.from_numpy(surface.mask).float()[None, None] for i, surface in surfaces.items()}
+    rows = [image_metrics(picture.float(), truth[i], masks[i], lpips) for i, picture in shown.items()]
+    quality = {key: float(np.mean([row[key] for row in rows])) for key in rows[0] if rows[0][key] is not None}  # pyright: ignore
+    pairs = []
+    for i in last:
+        pair = (i - 1, i)
+        planes = [[_plane(images[j]) for j in pair] for images in (shown, truth)]
+        pairs.append(flicker(*planes, [surfaces[j] for j in pair]))
+    return {**quality, **{key: float(np.mean([pair[key] for pair in pairs])) for key in pairs[0]}}
+
+
+class Rivals:
+    """Path tracing and denoiser, by themselves and with samples gathered over the frames.
+
+    What is gathered follows surfaces, and mirrors as ours does: what tells them apart comes from a base image of one
+    ray, whose time the rival does not pay.
+    """
+
+    def __init__(self, scene: BenchScene, ours: Ours, baselines: list[tuple[int, str]]) -> None:
+        self.scene, self.baselines = scene, baselines
+        mi = scene.engine.mi
+        dark = np.zeros((2, 2, 2, 2, 3), np.float32)
+        self.guide = BaseRenderer(mi, scene.engine.scenes[str(scene.bundle)], dark, 1)
+        samples = {spp for spp, _ in baselines}
+        self.histories = {(spp, patience): History(mi) for spp in samples for patience in PATIENCE}
+
+    def frame(self, view: View, number: int, clock: Clock) -> dict[str, tuple[Any, float]]:
+        """By name: (display picture, ms)."""
+        scene, seed = self.scene, 1_000_003 * (number + 1)
+        channels = self.guide.frame(scaled_view(view, scene.engine.unit_scale))
+        for name in ("depth.Z", *CHAIN):
+            channels[name] = channels[name] / scene.engine.unit_scale
+        paths, gathered, guides = {}, {}, {}
+        for spp in {spp for spp, _ in self.baselines}:
+            paths[spp] = clock.time(lambda spp=spp: masked(scene.frames.path(view, spp, seed + spp))[0])
+            for patience in PATIENCE:
+                history = self.histories[spp, patience]
+                taken = _as_base(channels, paths[spp][0], spp / patience)
+                gathered[spp, patience] = clock.time(partial(history.take, view, taken))
+        found = {}
+        for spp, method in self.baselines:
+            chosen = METHODS[method]
+            rays = spp if chosen.rays < 0 else chosen.rays
+            if rays not in guides:
+                guides[rays] = clock.time(partial(scene.frames.auxiliary, view, rays, seed + 7919 * rays))
+            guide, rays_ms = guides[rays]
+            image, ms = paths[spp]
+            pictures = {f"{spp} spp {method}": (image, ms)}
+            for patience in PATIENCE:
+                channels_, more = gathered[spp, patience]
+                one = np.stack([channels_[f"base.{c}"] for c in "RGBA"], axis=-1)
+                pictures[f"{spp} spp {method}, gathered x{patience}"] = (one, ms + more)
+            for name, (noisy, spent) in pictures.items():
+                smooth, denoiser_ms = clock.time(partial(denoised, noisy, guide, chosen, rays))
+                shown = np.concatenate([smooth[..., :3], guide.coverage[..., None]], axis=-1)
+                found[name] = (scene.shown(shown), spent + rays_ms + denoiser_ms)
+        return found
+
+
+def _as_base(channels: dict[str, np.ndarray], image: np.ndarray, rays: float) -> dict[str, np.ndarray]:
+    """A path-traced picture in a base image's place: what mirrors and glass show is its specular part."""
+    surface = channels[CHAIN[0]] == 0
+    planes = {f"base.{c}": np.ascontiguousarray(image[..., i]) for i, c in enumerate("RGBA")}
+    planes |= {f"diffuse.{c}": planes[f"base.{c}"] * surface for c in "RGB"}
+    even = np.ones(surface.shape, np.float32)
+    return {**channels, **planes, "noise": 0 * even, "rays": even * np.float32(rays)}
+
+
+def _plane(picture: torch.Tensor) -> np.ndarray:
+    """[1, 3, H, W] -> float64 [H, W, 3]."""
+    return picture[0].double().clamp(0, 1).permute(1, 2, 0).numpy()
