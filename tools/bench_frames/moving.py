@@ -158,7 +158,7 @@ class Rivals:
         channels = self.guide.frame(scaled_view(view, scene.engine.unit_scale))
         for name in ("depth.Z", *CHAIN):
             channels[name] = channels[name] / scene.engine.unit_scale
-        paths, gathered, guides = {}, {}, {}
+        paths, gathered, guides = {}, {}, {0: (None, 0.0)}
         for spp in {spp for spp, _ in self.baselines}:
             paths[spp] = clock.time(lambda spp=spp: masked(scene.frames.path(view, spp, seed + spp))[0])
             for patience in PATIENCE:
@@ -180,8 +180,9 @@ class Rivals:
                 pictures[f"{spp} spp {method}, gathered x{patience}"] = (one, ms + more)
             for name, (noisy, spent) in pictures.items():
                 smooth, denoiser_ms = clock.time(partial(denoised, noisy, guide, chosen, rays))
-                shown = np.concatenate([smooth[..., :3], guide.coverage[..., None]], axis=-1)
-                found[name] = (scene.shown(shown), spent + rays_ms + denoiser_ms)
+                if guide is not None:
+                    smooth = np.concatenate([smooth[..., :3], guide.coverage[..., None]], axis=-1)
+                found[name] = (scene.shown(smooth), spent + rays_ms + denoiser_ms)
         return found
 
 
