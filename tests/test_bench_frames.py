@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.scene_records import sphere_summary
+from tools.bench_frames import moving_tables
 from tools.bench_frames.equal_time import at_equal_time, break_even, lines, upfront
 from tools.bench_frames.motion import Surface, changes, flicker, project, reproject
 from tools.bench_frames.standing import classes, standing
@@ -214,3 +215,28 @@ def test_frames_at_equal_time_and_the_frames_from_which_ours_is_cheaper() -> Non
     rows["neural, 8 rays"]["lpips_alex"] = 0.5  # worse than the cheapest that the rival has, which takes less than ours
     assert break_even(scene, "lpips_alex") is None and "| never |" in "\n".join(lines([scene]))
     assert lines([{"scene": "without a ledger"}]) == []
+
+
+def test_moving_cameras_are_judged_by_both_moves_and_against_the_better_rival() -> None:
+    def rows(worse: float) -> dict[str, dict[str, float]]:
+        found = {
+            "neural, 1 rays": (90.0, 30.0, 0.004),
+            "neural, 1 rays, remembers": (100.0, 33.0, 0.002),
+            "base image alone, 1 rays, remembers": (50.0, 40.0, 0.001),
+            "4 spp clean16-fast": (110.0, 29.0, 0.008),
+            "4 spp clean16-fast, gathered x1": (118.0, 31.0, 0.005),
+            "16 spp clean16": (200.0, 34.0, 0.004),
+        }
+        return {
+            name: {"ms": ms, "psnr": psnr - worse, "lpips_alex": 0.1, "flicker": flicker}
+            for name, (ms, psnr, flicker) in found.items()
+        }
+
+    moves = {move: {"frames": 24, "reference_spp": 512, "rows": rows(i)} for i, move in enumerate(("orbit", "walk"))}
+    scene = {"scene": "box", "size": [256, 256], "moving": moves, "upfront": {"training": 0.0, "total": 10.0}}
+    table = moving_tables.lines([scene, {"scene": "not measured"}])
+    fast, slow = (line for line in table if line.startswith("| box | ") and " ms | 1 rays" in line)
+    assert "1 rays, remembers, 100 ms | 32.50" in fast and "gathered x1, 118 ms | 30.50" in fast
+    assert fast.endswith("| +2.00 | 40% |") and slow.endswith("| -1.00 | 50% |")
+    assert any("cheaper at equal PSNR" in line for line in table)
+    assert moving_tables.lines([{"scene": "not measured"}]) == []

@@ -21,10 +21,8 @@ from dnrtrain.weights import WeightsMissing, load_weights
 from .equal_time import upfront
 from .moving import measure
 from .reference import Reference, make_references
-from .standing import classes, standing
+from .standing import class_limits, classes, standing
 
-CLASSES = (0.03, 0.07, 0.3)
-"""Seconds per 128² pixels that the classes are named by; their limits grow with the pixel count."""
 WARM = 2
 
 
@@ -125,8 +123,7 @@ def _figures(
     best = frontier(points)
     for name in [*best, *own]:
         rows[name] |= _quality(everything[name].pictures, truth, masks, lpips["slow"])
-    scale = scene.size[0] * scene.size[1] / 128**2
-    limits = [1000 * seconds * scale for seconds in CLASSES]
+    limits = class_limits(scene.size)
     standings = {}
     for name in own:
         point = (rows[name]["ms"], rows[name]["psnr"])

@@ -16,7 +16,7 @@ from dnrpipe.studies.frames.ours import BASE, NEURAL
 from dnrpipe.studies.frames.pareto_front import frontier
 from dnrtrain.atomic import atomic_path, write_json
 
-from . import equal_time
+from . import equal_time, moving_tables
 
 PACKAGES = ("mitsuba", "drjit", "mitsuba-oidn", "torch", "numpy")
 
@@ -89,7 +89,8 @@ def overview(record: dict[str, Any]) -> list[str]:
             "",
             *counted,
         ]
-    return lines
+    moving = moving_tables.lines(scenes)
+    return [*lines, "", *moving] if moving else lines
 
 
 def _overview(scenes: list[dict[str, Any]]) -> list[str]:

@@ -7,6 +7,14 @@ from typing import Any
 
 from dnrpipe.studies.frames.pareto_front import Point, crossover, frontier, quality_at
 
+CLASSES = (0.03, 0.07, 0.3)
+"""Seconds per 128² pixels that the classes are named by; their limits grow with the pixel count."""
+
+
+def class_limits(size: Sequence[int]) -> list[float]:
+    """Milliseconds of CLASSES for pictures of that width and height."""
+    return [1000 * seconds * size[0] * size[1] / 128**2 for seconds in CLASSES]
+
 
 def standing(points: Mapping[str, Point], ours: Point) -> dict[str, Any]:
     """Ours against the baselines.
