@@ -16,12 +16,14 @@ from dnrpipe.blender.bundle.ply import weld, write_ply
 from dnrpipe.raytrace.base_renderer import CENTRES, MEANS, NOISE, BaseRenderer
 from dnrpipe.raytrace.base_worker import Worker
 from dnrpipe.raytrace.engine import Engine
+from dnrpipe.raytrace.history import History
 from dnrpipe.raytrace.lightmap import LightBaker
 from dnrpipe.raytrace.lobes import diffuse_context
 from dnrpipe.raytrace.second_targets import second_targets
 from dnrpipe.raytrace.sensors import sensor_dict
 from dnrpipe.raytrace.surface_maps import SurfaceMapper
 from dnrpipe.raytrace.texels import grouped_meshes, seen_sides
+from dnrpipe.stages.base_images import WARM_UP
 from dnrtrain.contract import BASE_CHANNELS, View
 from dnrtrain.exr import read_exr
 
@@ -517,3 +519,56 @@ def test_lobes_of_the_principled_plugin_add_up() -> None:
         ratio = np.array(value)[:, good] / np.array(density)[good]
         assert np.array(weight)[:, good] == pytest.approx(ratio, rel=1e-3)
     assert (np.array(found.sampled_type) == int(mi.BSDFFlags.GlossyReflection)).all()
+
+
+def remembering(renderer: BaseRenderer, views: list[View], number: int = 0) -> dict[str, np.ndarray]:
+    """Channels of the last of the frames, with what those before it saw. number: of the first."""
+    history = History(mi)
+    history.begin(number)
+    for view in views:
+        channels = history.take(view, renderer.frame(view, history.number))
+    return channels
+
+
+def test_highlights_that_wander_and_mirrors_leave_no_ghosts(tmp_path: Path) -> None:
+    """Frame 24 of an orbit around a glossy floor, a curved and a flat mirror: error by region against many rays."""
+    glossy = {"type": "twosided", "b": {"type": "roughconductor", "alpha": 0.25}}
+    mirror = {"type": "twosided", "b": {"type": "conductor", "material": "none"}}
+    ball = {"type": "sphere", "center": [0.3, -0.2, 0.35], "radius": 0.35, "bsdf": dict(mirror)}
+    lamp = {"type": "sphere", "center": [-0.6, -0.6, 1.6], "radius": 0.15}
+    lamp["emitter"] = {"type": "area", "radiance": rgb(30, 24, 18)}  # type: ignore[assignment]
+    scene = corner_room(tmp_path, glossy, mirror, {"type": "constant", "radiance": rgb(0.2, 0.3, 0.4)}, b=ball, l=lamp)
+    dark = np.zeros((2, 2, 8, 8, 3), np.float32)
+    way = [camera(0.3 + 0.02 * number) for number in range(24)]
+    few, many = (BaseRenderer(mi, scene, dark, samples) for samples in (2, 512))
+    truth, fresh, kept = many.frame(way[-1]), few.frame(way[-1]), remembering(few, way)
+
+    def error(channels: dict[str, np.ndarray]) -> np.ndarray:
+        shown = [np.clip(colour(c), 0, 1) ** (1 / 2.2) for c in (channels, truth)]
+        return ((shown[0] - shown[1])[..., :3] ** 2).mean(axis=-1)
+
+    floor = (truth["normal.Z"] > 0.99) & (truth["mask"] > 0.5)
+    wall = (truth["normal.Y"] < -0.99) & (truth["mask"] > 0.5)
+    curved = (truth["mask"] > 0.5) & ~floor & ~wall
+    for region in (floor, wall, curved, np.ones_like(floor)):
+        assert region.sum() > 60
+        lost = 10 * np.log10(error(kept)[region].mean() / error(fresh)[region].mean())
+        assert lost < 0.2, "dB that remembering costs"
+    assert np.median(kept["rays"][wall]) > 4, "a flat mirror is followed"
+
+
+def test_a_chunk_of_a_sequence_begins_without_a_seam(tmp_path: Path) -> None:
+    """From the last frame of a chunk to the first of the next the picture changes as from any frame to the next."""
+    glossy = {"type": "twosided", "b": {"type": "roughconductor", "alpha": 0.25}}
+    matt = {"type": "twosided", "b": {"type": "diffuse"}}
+    lamp = {"type": "point", "position": [0.0, -0.5, 1.5], "intensity": rgb(6, 6, 6)}
+    scene = corner_room(tmp_path, glossy, matt, lamp)
+    renderer = BaseRenderer(mi, scene, np.ones((2, 2, 8, 8, 3), np.float32), 4)
+    way = [camera(0.3 + 0.01 * number) for number in range(2 * WARM_UP + 1)]
+    before, onwards = (colour(remembering(renderer, frames)) for frames in (way[:-1], way))
+    begun = colour(remembering(renderer, way[WARM_UP:], WARM_UP))
+    within, across, alone = (
+        np.abs(frame - before).mean() for frame in (onwards, begun, colour(renderer.frame(way[-1])))
+    )
+    assert across < 1.05 * within < 0.9 * alone, "what a frame that remembers nothing changes by"
+    assert np.abs(begun - onwards).mean() < 0.2 * within

@@ -52,7 +52,8 @@ class Worker(BundleWorker):
             self.seen, self.warm = [], True
         self.repaired = self.masked = 0
         started, cpu = time.monotonic(), time.process_time()
-        channels = self.channels(view) if task.earlier is None else self.remembered(view, task.earlier)
+        earlier = task.earlier
+        channels = self.channels(view) if earlier is None else self.remembered(view, earlier, task.number)
         answer: BaseAnswer = {
             **costs_since(started, cpu),
             "kind": self.common.kind,
@@ -79,15 +80,15 @@ class Worker(BundleWorker):
             return channels | self._traced(self.common, view, channels)
         return channels | denoised(channels) if self.common.denoise else channels
 
-    def remembered(self, view: View, earlier: Sequence[View]) -> dict[str, np.ndarray]:
-        """`channels` of a view, with what the frames ``earlier`` of a camera's way saw.
+    def remembered(self, view: View, earlier: Sequence[View], number: int = 0) -> dict[str, np.ndarray]:
+        """`channels` of a view, with what the frames ``earlier`` of a camera's way saw, the first of that number.
 
         Those that were the last to be seen are not rendered again: one frame after the other costs one each.
         """
         way = [*earlier, view]
         known = len(self.seen) if self.seen == way[: len(self.seen)] and len(self.seen) < len(way) else 0
         if not known:
-            self.history.begin()
+            self.history.begin(number)
         self.seen = way
         for frame in way[known:-1]:
             self._taken(frame)

@@ -67,7 +67,7 @@ SURFACE, RIM = 1.0, 0.5
 class History:
     """Accumulates base images of frames that follow one another, of one size. Needs a jit variant.
 
-    ``number`` frames were taken in since it began: what `BaseRenderer.frame` wants for the next.
+    ``number`` of the next frame, which `BaseRenderer.frame` wants: how many came before it.
     """
 
     def __init__(self, mi: Any) -> None:
@@ -75,9 +75,9 @@ class History:
         self.kernel = Recorded(self._kernel)
         self.begin()
 
-    def begin(self) -> None:
-        """Forget."""
-        self.number = 0
+    def begin(self, number: int = 0) -> None:
+        """Forget. number: of the next frame, where it stands in the middle of a sequence."""
+        self.number = number
         self.before: tuple[View, list[Any]] | None = None
 
     def take(self, view: View, channels: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -87,13 +87,13 @@ class History:
         all frames that are in a pixel's S, ``noise`` is the standard error of base by the spread of the frames' means.
         A frame of another size than the one before begins anew.
         """
-        mi, size = self.mi, (view.height, view.width)
+        mi, size, first = self.mi, (view.height, view.width), self.before is None
         if self.before is None or (self.before[0].height, self.before[0].width) != size:
             pixels = view.width * view.height
             self.before = view, [mi.Float(_aligned([np.zeros(n * pixels)])) for n in (4, 4, 4, 4, 4, 4, 1)]
         planes = mi.Float(_aligned([channels[name] for name in TAKEN]))
         earlier, memory = self.before
-        resting = self.number > 0 and view.c2w == earlier.c2w and view.intrinsics == earlier.intrinsics
+        resting = not first and view.c2w == earlier.c2w and view.intrinsics == earlier.intrinsics
         cameras = opaque_camera(mi, view), opaque_camera(mi, earlier)
         given, memory = self.kernel(planes, memory, *cameras, view.width, view.height, resting)
         self.before, self.number = (view, memory), self.number + 1

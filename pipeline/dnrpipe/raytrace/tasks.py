@@ -221,10 +221,11 @@ class SampledCommon(BundleCommon):
 
 class BaseTask(Task):
     """Render a view's base image into ``output``, an EXR file. earlier: the frames of a moving camera that it remembers
-    (see `history`), in their order; None: it stands alone."""
+    (see `history`), in their order; None: it stands alone. number: of the first of them in the camera's way."""
 
     view: View
     earlier: tuple[View, ...] | None = None
+    number: int = 0
     output: Path
     fingerprint: str
 

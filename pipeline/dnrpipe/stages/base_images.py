@@ -123,9 +123,11 @@ def base_views(
     cameras = [view.model_dump(mode="json") for view in views]
     for number, (data, path) in enumerate(zip(cameras, paths, strict=True)):
         begin = max(0, number - number % CHUNK - WARM_UP)
-        earlier = cameras[begin:number] if remembers else None
-        fingerprint = digest([BASE_VERSION, renderer.fingerprint, data, *([earlier] if remembers else [])])
-        tasks.append({"view": data, "earlier": earlier, "output": str(path), "fingerprint": fingerprint})
+        task = {"view": data, "output": str(path)}
+        if remembers:
+            task |= {"earlier": cameras[begin:number], "number": begin}
+        known = [task[key] for key in ("earlier", "number") if key in task]
+        tasks.append(task | {"fingerprint": digest([BASE_VERSION, renderer.fingerprint, data, *known])})
     run.view_tasks(
         "base images",
         "dnrpipe.raytrace.base_worker",
