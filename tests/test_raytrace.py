@@ -18,7 +18,7 @@ from dnrpipe.core.settings import CameraSettings
 from dnrpipe.raytrace.noise import half_noise
 from dnrpipe.raytrace.variants import choose_variant, llvm_libraries
 from dnrpipe.workers.processes import TaskResult, run_tasks
-from dnrtrain.exr import read_exr
+from dnrtrain.exr import read_exr, write_exr
 
 SUMMARY = sphere_summary((0.0, 0.0, 0.0), 1.2)
 BUNDLE = """<scene version="3.0.0">
@@ -184,3 +184,23 @@ def test_an_unusable_variant_is_refused_and_llvm_15_is_not_tried() -> None:
         pytest.skip("this machine has CUDA")
     assert "\n" not in str(caught.value)
     assert not [p for p in llvm_libraries() if "LLVM-15" in p.name or "LLVM-16" in p.name]
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="no way to leave a process one core here")
+def test_one_core_is_enough_for_a_bundle_with_an_image(tmp_path: Path) -> None:
+    """Mitsuba's EXR reader waited for ever there."""
+    write_exr(tmp_path / "sky.exr", {c: np.ones((64, 128), np.float32) for c in "RGB"}, {})
+    bundle = tmp_path / "scene.xml"
+    bundle.write_text(
+        BUNDLE.replace('"constant"/>', f'"envmap"><string name="filename" value="{tmp_path}/sky.exr"/></emitter>')
+    )
+    script = """
+import os, sys
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+from pathlib import Path
+from dnrpipe.raytrace.engine import Engine
+Engine(sys.argv[1], 0, [Path(sys.argv[2])])
+"""
+    choice = choose_variant()
+    command = [sys.executable, "-c", script, choice.variant, str(bundle)]
+    subprocess.run(command, check=True, env={**os.environ, **choice.environment}, timeout=60)

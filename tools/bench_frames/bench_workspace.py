@@ -24,6 +24,8 @@ from .reference import Reference, make_references
 from .standing import class_limits, classes, standing
 
 WARM = 2
+LONGEST = 1.5
+"""Of the second class's time: rivals that take longer are not tried with moving cameras."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,8 @@ def bench(root: Path, options: Options, tell: Callable[[str], None]) -> dict[str
     result["upfront"] = upfront(scene.workspace.ledger.read(), options.threads)
     if options.moving:
         best = [baselines[name] for name in result["frontier"]]
-        shown = [(baseline.spp, baseline.method) for baseline in best if baseline.method != "raw"]
+        limit = LONGEST * class_limits(scene.size)[1]
+        shown = [(ran.spp, ran.method) for ran in best if ran.method != "raw" and ran.ms() <= limit]
         result["moving"] = measure(
             scene,
             ours,

@@ -78,10 +78,12 @@ def measure(
         pictures: dict[str, dict[int, torch.Tensor]] = {}
         took: dict[str, list[float]] = {}
         for number, view in enumerate(views):
-            for name, (picture, ms) in (_own(ours, view, clock) | rivals.frame(view, number, clock)).items():
+            judged = number in truth
+            for name, (picture, ms) in (
+                _own(ours, view, clock, judged) | rivals.frame(view, number, clock, judged)
+            ).items():
                 took.setdefault(name, []).append(ms)
-                if number in truth:
-                    pictures.setdefault(name, {})[number] = picture.half()
+                pictures.setdefault(name, {})[number] = picture.half()
             tell(f"{scene.name}: {move}, frame {number + 1} of {frames}")
         rows = {name: _figures(shown, truth, surfaces, last, lpips) for name, shown in pictures.items()}
         found[move] = {
@@ -89,7 +91,7 @@ def measure(
             "reference": reference.kind,
             "reference_spp": spp,
             "reference_noise": float(np.mean(reference.noise)),
-            "rows": {name: {"ms": float(np.median(took[name][1:])), **row} for name, row in rows.items()},
+            "rows": {name: {"ms": float(np.median(took[name])), **row} for name, row in rows.items()},
         }
     return found
 
@@ -114,7 +116,11 @@ def surface_of(view: View, gbuffer: dict[str, np.ndarray]) -> Surface:
     return Surface(view, position, gbuffer["depth.Z"].astype(np.float64), gbuffer["mask"] > 0.5)
 
 
-def _own(ours: Ours, view: View, clock: Clock) -> dict[str, tuple[Any, float]]:
+def _own(ours: Ours, view: View, clock: Clock, judged: bool) -> dict[str, tuple[Any, float]]:
+    """By name: (display picture, ms); of a frame that is not judged nothing but what the next ones remember."""
+    if not judged:
+        ours.remember(view, clock)
+        return {}
     found = {**ours.frame(view, clock), **ours.frame(view, clock, remember=True)}
     return {name: (frame["picture"], sum(frame["parts"].values())) for name, frame in found.items()}
 
@@ -152,8 +158,8 @@ class Rivals:
         samples = {spp for spp, _ in baselines}
         self.histories = {(spp, patience): History(mi) for spp in samples for patience in PATIENCE}
 
-    def frame(self, view: View, number: int, clock: Clock) -> dict[str, tuple[Any, float]]:
-        """By name: (display picture, ms)."""
+    def frame(self, view: View, number: int, clock: Clock, judged: bool) -> dict[str, tuple[Any, float]]:
+        """By name: (display picture, ms); of a frame that is not judged nothing but what is gathered."""
         scene, seed = self.scene, 1_000_003 * (number + 1)
         channels = self.guide.frame(scaled_view(view, scene.engine.unit_scale))
         for name in ("depth.Z", *CHAIN):
@@ -166,7 +172,7 @@ class Rivals:
                 taken = _as_base(channels, paths[spp][0], spp / patience)
                 gathered[spp, patience] = clock.time(partial(history.take, view, taken))
         found = {}
-        for spp, method in self.baselines:
+        for spp, method in self.baselines if judged else ():
             chosen = METHODS[method]
             rays = spp if chosen.rays < 0 else chosen.rays
             if rays not in guides:

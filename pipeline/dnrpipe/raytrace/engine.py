@@ -24,6 +24,8 @@ from .visibility import camera_integrator
 MAX_WAVEFRONT = 4_000_000
 MAX_AUXILIARY = 1 << 24
 """The same of auxiliary images, whose rays carry less."""
+LEAST_THREADS = 2
+"""While a bundle loads: Mitsuba's EXR reader waits for a helper of its thread pool, which one core has not: for ever."""
 PASSES = "albedo:albedo,depth:depth,position:position,normal:sh_normal,geometric:geo_normal,uv:uv"
 
 
@@ -55,6 +57,8 @@ class Engine:
             _refuse_instances(bundles)
         self.mi = mi
         self.variant = variant
+        if dr.thread_count() < LEAST_THREADS:
+            dr.set_thread_count(LEAST_THREADS)
         started = time.monotonic()
         self.scenes = {str(bundle): mi.load_file(str(bundle), parallel=False) for bundle in bundles}
         self.load_seconds = time.monotonic() - started

@@ -75,6 +75,11 @@ class Ours:
         for history in self.histories.values():
             history.begin()
 
+    def remember(self, view: View, clock: Clock) -> None:
+        """Take in what a frame of a moving camera sees."""
+        for renderer in self.renderers.values():
+            self._inputs(renderer, view, clock, self.histories[renderer.samples])
+
     def frame(self, view: View, clock: Clock, *, remember: bool = False) -> dict[str, dict[str, Any]]:
         """By NEURAL and BASE, and the rays per pixel: {"picture": display RGB over white [1, 3, H, W], "parts":
         {name: ms}}.
