@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dnrpipe.raytrace.history import History
-from dnrtrain.contract import View
+from dnrtrain.contract import FRESH_CHANNELS, View
 
 mi = pytest.importorskip("mitsuba")
 SIDE = 48
@@ -81,6 +81,8 @@ def test_a_first_frame_is_as_it_was() -> None:
     taken = History(mi).take(camera(0), channels)
     for name, values in channels.items():
         np.testing.assert_allclose(taken[name], values, atol=1e-6)
+    assert set(taken) - set(channels) == set(FRESH_CHANNELS)
+    np.testing.assert_allclose(taken["fresh.G"], channels["base.G"], atol=1e-6)
 
 
 def test_a_resting_camera_adds_up_to_the_mean_of_its_frames() -> None:
@@ -89,6 +91,8 @@ def test_a_resting_camera_adds_up_to_the_mean_of_its_frames() -> None:
         taken = history.take(camera(0), channels)
     np.testing.assert_allclose(rgb(taken), np.mean([rgb(channels) for channels in frames], axis=0), atol=1e-3)
     assert (taken["rays"] == 16).all() and history.number == 8
+    np.testing.assert_allclose(taken["fresh.R"], frames[-1]["base.R"], atol=1e-5)
+    assert (taken["fresh.rays"] == 2).all()
     # The standard error of the mean of eight frames, by their spread.
     true = 0.1 * np.sqrt(0.2126**2 + 0.7152**2 + 0.0722**2) / np.sqrt(8)
     assert np.sqrt((taken["noise"] ** 2).mean()) == pytest.approx(true, rel=0.15)

@@ -321,3 +321,32 @@ def test_bfloat16_is_close(baked: ViewSet) -> None:
         model.use_bfloat16 = True
         coarse = render_views(model, baked)
     assert not torch.equal(exact, coarse) and (exact - coarse).abs().max() < 0.05
+
+
+def test_a_frame_that_remembers_is_mixed_with_the_frame_itself(scene: Scene) -> None:
+    """Read from its channels; by g alone the picture goes from what is remembered to what the frame saw."""
+    view = synthetic.dome(TRAIN, 32)[2]
+    channels = {
+        k: v for folder in ("passes", "base") for k, v in read_exr(scene.folder / folder / "0002.exr")[0].items()
+    }
+    own = {f"fresh.{c}": 0.5 * channels[f"base.{c}"] for c in "RGB"} | {"fresh.rays": 0 * channels["rays"] + 2}
+    display = DisplayTransform(synthetic.FRAME, scene.folder)
+    alone, both = (
+        view_in_memory(c, synthetic.FRAME, view, display=display, base="baked").batch([0])
+        for c in (channels, channels | own)
+    )
+    assert alone.fresh is None and both.fresh is not None and both.fresh_rays is not None
+    assert torch.allclose(both.fresh, 0.5 * both.base) and (both.fresh_rays == 2).all()
+    settings = ModelSettings.model_validate(
+        {**SMALL, "aggregator": "none", "base": "baked", "guides": "camera", "filter": 3, "output": "log", "stride": 2}
+    )
+    model = DNR(settings, seed=0).eval()
+    shown = {}
+    with torch.inference_mode():
+        for bias in (-40.0, 40.0):
+            model.renderer.head.bias.data[-1] = bias  # type: ignore[union-attr]
+            shown[bias] = model(both).radiance
+        still = model(alone).radiance
+        halved = model(dataclasses.replace(alone, base=both.fresh)).radiance
+    assert torch.allclose(shown[-40.0], still, atol=1e-6) and torch.allclose(shown[40.0], halved, atol=1e-6)
+    assert not torch.allclose(shown[-40.0], shown[40.0], atol=1e-3)

@@ -2,8 +2,11 @@
 
 Notation
     f        log space (see `to_log`) or display space
+    base     the base image; with camera guides, of a frame that remembers: (1 - g) of what is remembered, g of the
+             frame's own, in f
     K        per-pixel kernels, k×k weights each, that sum to 1; they start close to the identity
     a, m     added and multiplied correction, 3 channels each; they start at 0
+    g        starts at sigmoid(OWN)
     t        share of the correction that is applied (``settings.trust``)
 
     f(picture) = (1 - t) · f(base) + t · (K * f(base) · (1 + m) + a)
@@ -30,6 +33,7 @@ LOG_SCALE = 10.0
 """k of log(1 + k x) / log(1 + k): with 10, the curve is close to display gamma in [0, 1] and keeps going above."""
 IDENTITY = 4.0
 """What the kernels' middle weight has ahead of the others before the softmax, so it starts with 0.87 of the sum."""
+OWN = -2.0
 LOG_CEILING = 30.0
 """Log values above it (radiance of 2e30) count as it: the exponential would overflow, and its gradient with it."""
 
@@ -54,12 +58,17 @@ def require_base(batch: Batch) -> tuple[Tensor, Display]:
 def correct(batch: Batch, outputs: Tensor, settings: ModelSettings) -> tuple[Tensor, Tensor | None]:
     """-> (display RGB [N, 3, H, W], linear straight radiance or None where the output space is display).
 
-    ``outputs``: a, m and the kernels' weights before the softmax, [N, 6 + k², H, W].
+    ``outputs``: a, m, the kernels' weights before the softmax and, with camera guides, g before the sigmoid:
+    [N, `output_channels`, H, W].
     """
     base, display = require_base(batch)
     added, scaled = outputs[:, :6].chunk(2, dim=1)
     start = to_log(display.scale * base) if settings.output == "log" else display(base)
-    value = filter_by(start, outputs[:, 6:]) if settings.filter else start
+    value, kernels = start, outputs[:, 6 : 6 + settings.filter**2]
+    if batch.fresh is not None and settings.guides == "camera":
+        own = to_log(display.scale * batch.fresh) if settings.output == "log" else display(batch.fresh)
+        value = torch.lerp(start, own, torch.sigmoid(outputs[:, -1:] + OWN))
+    value = filter_by(value, kernels) if settings.filter else value
     value = torch.addcmul(value + added, value, scaled)
     if settings.trust < 1:
         value = torch.lerp(start, value, settings.trust)
@@ -88,11 +97,18 @@ def filter_by(image: Tensor, weights: Tensor) -> Tensor:
     return total
 
 
+def output_channels(settings: ModelSettings) -> int:
+    """Of the network: what `correct` reads, or a colour."""
+    if settings.base == "none":
+        return 3
+    return 6 + settings.filter**2 + (1 if settings.guides == "camera" else 0)
+
+
 def guide_channels(settings: ModelSettings) -> int:
     """Channels of `guide_maps`."""
     shown = 0 if settings.base == "none" else 3
     if settings.guides == "camera":
-        return shown + 13
+        return shown + 17
     if not settings.guides:
         return shown
     return shown + 10 + (6 if settings.base in ("baked", "direct", "path") else 0)
@@ -104,7 +120,8 @@ def guide_maps(batch: Batch, settings: ModelSettings) -> list[Tensor]:
     albedo and the specular part in log space (display space would clip it). [N, C, H, W] each.
 
     Camera guides say nothing of where in the world the camera is: normal in camera space, cosine, albedo, specular
-    part, coverage, the base's standard error relative to its luminance, and log2 of the rays per pixel over 3.
+    part, coverage, the base's standard error relative to its luminance, log2 of the rays per pixel over 3; and the
+    frame's own base image with its rays, which are the same where nothing is remembered.
 
     Raises ContractError when the model wants a base image and the views were loaded without.
     """
@@ -123,7 +140,11 @@ def guide_maps(batch: Batch, settings: ModelSettings) -> list[Tensor]:
         noise = display.scale * batch.noise / (display.scale * luminance.clamp_min(0.0) + 1.0 / LOG_SCALE)
         specular = to_log(display.scale * (base - batch.diffuse).clamp_min(0.0))
         rays = batch.rays.log2() / 3.0
-        return [*maps, batch.camera_normal, cosine, batch.albedo, specular, batch.coverage, noise.clamp_max(2.0), rays]
+        own = [maps[0], rays]
+        if batch.fresh is not None and batch.fresh_rays is not None:
+            own = [display(batch.fresh), batch.fresh_rays.log2() / 3.0]
+        maps += [batch.camera_normal, cosine, batch.albedo, specular, batch.coverage, noise.clamp_max(2.0), rays]
+        return [*maps, *own]
     reflection = 2.0 * cosine * batch.normal - batch.view_dir
     maps += [batch.view_dir, batch.normal, reflection * batch.mask, cosine]
     if settings.base in ("baked", "direct", "path"):

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from .contract import (
     BASE_CHANNELS,
+    FRESH_CHANNELS,
     RASTER_CHANNELS,
     RAW_CHANNELS,
     ContractError,
@@ -52,6 +53,8 @@ class Batch:
     chain_uv      [N, 2, H, W] atlas coordinates at the end of the specular path, as ``uv``
     chain_mask    [N, 1, H, W] 1 where the specular path ends on a surface
     chain_weight  [N, 1, H, W] its throughput in [0, 1]
+    fresh         [N, 3, H, W] where ``base`` remembers earlier frames: that of the frame by itself
+    fresh_rays    [N, 1, H, W] its rays per pixel
     display       the scene's display transform (linear -> display RGB)
     """
 
@@ -71,6 +74,8 @@ class Batch:
     chain_uv: Tensor | None = None
     chain_mask: Tensor | None = None
     chain_weight: Tensor | None = None
+    fresh: Tensor | None = None
+    fresh_rays: Tensor | None = None
     display: Display | None = None
 
     def to(self, device: torch.device | str) -> Batch:
@@ -290,7 +295,12 @@ def _base_maps(path: Path, channels: dict[str, np.ndarray]) -> dict[str, Tensor]
     """The maps of `Batch` that base files hold, [C, H, W]."""
     values = _stack(path, channels, BASE_CHANNELS)
     alpha, mask = values[3:4], (values[14:15] > 0.5).float()
+    fresh = {}
+    if FRESH_CHANNELS[0] in channels:
+        own = _stack(path, channels, FRESH_CHANNELS)
+        fresh = {"fresh": _straight(own[:3], alpha), "fresh_rays": own[3:].clamp_min(1.0)}
     return {
+        **fresh,
         "base": _straight(values[0:3], alpha),
         "diffuse": _straight(values[4:7], alpha),
         "albedo": _straight(values[7:10], alpha),

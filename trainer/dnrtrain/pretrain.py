@@ -133,11 +133,12 @@ def disturbed(batch: Batch, random: np.random.Generator) -> Batch:
     gain = float(2.0 ** random.uniform(-STOPS, STOPS))
     linear, display = batch.target, batch.display
     assert linear is not None and display is not None and batch.base is not None and batch.noise is not None
-    assert batch.diffuse is not None and batch.albedo is not None
+    assert batch.diffuse is not None and batch.albedo is not None and batch.fresh is not None
     linear = torch.cat([linear[:, order] * gain, linear[:, 3:]], dim=1)
     return replace(
         batch,
         base=batch.base[:, order] * gain,
+        fresh=batch.fresh[:, order] * gain,
         diffuse=batch.diffuse[:, order] * gain,
         albedo=batch.albedo[:, order],
         noise=batch.noise * gain,

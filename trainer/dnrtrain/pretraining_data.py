@@ -14,7 +14,7 @@ import torch
 from pydantic import BaseModel
 from torch import Tensor
 
-from .contract import SceneFrame, View
+from .contract import FRESH_CHANNELS, SceneFrame, View
 from .dataset import Batch, in_camera_space
 from .display import ALPHA_FLOOR, Display, DisplayTransform
 
@@ -26,7 +26,7 @@ LAYERS = (
     *("albedo.R", "albedo.G", "albedo.B", "noise", "rays"),
 )
 """Of a base image: channels of a base file (see `contract`)."""
-BRIGHT = {*TARGET[:3], *LAYERS[:3], *LAYERS[4:7], "noise"}
+BRIGHT = {*TARGET[:3], *LAYERS[:3], *LAYERS[4:7], "noise", *FRESH_CHANNELS[:3]}
 """Channels that are radiance."""
 RAY_COUNTS = (1, 2, 4, 8)
 
@@ -36,7 +36,9 @@ REMEMBERED = "remembered"
 
 def channel_names(inputs: Sequence[str]) -> list[str]:
     """Channels of ``maps.npy``, in order; those of the base image called k end in @k."""
-    return [*SHARED, *TARGET, *(f"{name}@{k}" for k in inputs for name in LAYERS)]
+    fresh = FRESH_CHANNELS if REMEMBERED in inputs else ()
+    layers = [f"{name}@{k}" for k in inputs for name in LAYERS]
+    return [*SHARED, *TARGET, *layers, *(f"{name}@{REMEMBERED}" for name in fresh)]
 
 
 class Scene(BaseModel, extra="forbid", frozen=True):
@@ -130,6 +132,8 @@ class SceneMaps:
             camera_normal=in_camera_space(normal[0], self.scene.views[view])[None],
             target=of(*TARGET),
             base=layer("base"),
+            fresh=layer("fresh" if chosen == REMEMBERED else "base"),
+            fresh_rays=of(f"{'fresh.' if chosen == REMEMBERED else ''}rays@{chosen}").clamp_min(1.0),
             diffuse=layer("diffuse"),
             albedo=layer("albedo"),
             noise=of(f"noise@{chosen}") / alpha,

@@ -13,6 +13,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from .correction import output_channels
 from .precision import at_least_float32
 from .settings import ModelSettings
 
@@ -168,7 +169,7 @@ def pad_to_multiple(x: Tensor, multiple: int) -> Tensor:
 
 def build_renderer(groups: Sequence[int], settings: ModelSettings) -> UNet | HalfUNet | PixelMLP:
     """The network that ``settings.network`` and ``settings.stride`` name, for inputs in groups of so many channels."""
-    outputs = 3 if settings.base == "none" else 6 + settings.filter**2
+    outputs = output_channels(settings)
     if settings.network == "mlp":
         return PixelMLP(sum(groups), settings.width, outputs)
     if settings.stride == 2:

@@ -25,7 +25,7 @@ MAX_WAVEFRONT = 4_000_000
 MAX_AUXILIARY = 1 << 24
 """The same of auxiliary images, whose rays carry less."""
 LEAST_THREADS = 2
-"""While a bundle loads: Mitsuba's EXR reader waits for a helper of its thread pool, which one core has not: for ever."""
+"""While a bundle loads: Mitsuba's EXR reader waits for a helper of its thread pool. With one core there is none."""
 PASSES = "albedo:albedo,depth:depth,position:position,normal:sh_normal,geometric:geo_normal,uv:uv"
 
 

@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from dnrtrain.contract import View
+from dnrtrain.contract import FRESH_CHANNELS, View
 
 from .base_renderer import CHAIN
 from .recorded import Recorded
@@ -57,7 +57,8 @@ TAKEN = (
 )
 """Channels that a history reads, in the kernel's order."""
 GIVEN = (*COLOURS, "base.A", "noise", "rays")
-"""Channels that it changes."""
+"""Channels that it changes; it adds FRESH_CHANNELS, the frame's own."""
+LEAST_ALPHA = 1e-3
 HALF, TINY = 0.5, 1e-4
 """Pixels: how far a picture goes beyond the centres of its outer ones; what keeps a place off the last."""
 SURFACE, RIM = 1.0, 0.5
@@ -98,7 +99,9 @@ class History:
         given, memory = self.kernel(planes, memory, *cameras, view.width, view.height, resting)
         self.before, self.number = (view, memory), self.number + 1
         found = {name: np.array(values).reshape(size) for name, values in zip(GIVEN, given, strict=True)}
-        return {**channels, **found}
+        share = found["base.A"] / np.maximum(channels["base.A"], LEAST_ALPHA)
+        own = [*(channels[f"base.{c}"] * share for c in "RGB"), channels["rays"]]
+        return {**channels, **found, **dict(zip(FRESH_CHANNELS, own, strict=True))}
 
     def _kernel(
         self, taken: Any, memory: list[Any], camera: Any, earlier: Any, width: int, height: int, resting: bool

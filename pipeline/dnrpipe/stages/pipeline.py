@@ -128,7 +128,7 @@ STAGES: dict[str, Stage] = {
             settings=lambda s: [s.model.model_dump(), s.finetune.model_dump(exclude={"preview_seconds"}), _neural(s)],
             make=finetune.finetune,
             progress=finetune.progress,
-            version=3,
+            version=4,
         ),
         Stage(
             name="evaluate",
