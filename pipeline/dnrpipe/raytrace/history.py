@@ -33,7 +33,7 @@ from .base_renderer import CHAIN
 from .recorded import Recorded
 from .sensors import opaque_camera
 
-MOST_DIFFUSE, MOST_MIRRORED, MOST_GLOSSY, MOST_UNEVEN = 8.0, 16.0, 8.0, 2.0
+MOST_DIFFUSE, MOST_MIRRORED, MOST_GLOSSY, MOST_UNEVEN = 2.0, 16.0, 2.0, 1.0
 """Rays of earlier frames that count: for D, for S that follows V, for S that follows P, and at most where the corners
 lie on several surfaces. Each lookup blurs a little, and light moves on what is not a mirror."""
 MOST_RESTING = 512.0
