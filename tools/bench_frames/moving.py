@@ -35,7 +35,7 @@ CLOSER, SIDEWAYS = 0.01, 0.4
 """Of a walk, per frame: share of the distance, degrees about the scene's middle."""
 PAIRS = 3
 """Pairs of frames one after the other that are traced as references, the last of them at the end."""
-PATIENCE = (1, 4)
+PATIENCE = (4, 16)
 """How many times as many samples of earlier frames the rival keeps as we keep rays."""
 
 
