@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 SIZE = 64
-LATTICE = 34  # squared: more instances than get a place of their own
+LATTICE = 64  # squared: more instances than get a place of their own
 
 
 def build() -> None:

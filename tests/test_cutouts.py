@@ -40,8 +40,8 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 def test_thousand_instances_share_one_mesh(scene: dict[str, Any]) -> None:
     meshes = scene["report"]["meshes"]
-    assert meshes["pebble"][:2] == [12, 34**2]
-    assert "1,157 instances" in str(scene["report"]["findings"])
+    assert meshes["pebble"][:2] == [12, 64**2]
+    assert "4,097 instances" in str(scene["report"]["findings"])
 
 
 def test_coverage_is_the_alpha_of_the_ray_tracer(scene: dict[str, Any]) -> None:
