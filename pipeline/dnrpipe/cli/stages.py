@@ -154,7 +154,11 @@ def run(scene: Path | None, **options: Any) -> None:
     "--resolution", type=click.IntRange(8, 16384), metavar="PIXELS", help="Square size of the orbit's frames."
 )
 @click.option("--untrained", is_flag=True, help="By the shipped corrector, also where a renderer was trained.")
-@click.option("--alone", is_flag=True, help="No frame remembers those before it: for cameras that are no sequence.")
+@click.option(
+    "--alone",
+    is_flag=True,
+    help="No frame remembers those before it: for cameras that are no sequence. So it is after a training.",
+)
 @common
 def render(
     orbit: int | None,
