@@ -17,6 +17,7 @@ from dnrpipe.studies.frames.pareto_front import frontier
 from dnrtrain.atomic import atomic_path, write_json
 
 from . import equal_time, moving_tables
+from .moving_tables import number
 
 PACKAGES = ("mitsuba", "drjit", "mitsuba-oidn", "torch", "numpy")
 
@@ -106,7 +107,7 @@ def _overview(scenes: list[dict[str, Any]]) -> list[str]:
             end = f"{level:.0f} ms" if level is not None else f"not by {standing['ladder_end_ms']:.0f} ms"
             lines.append(
                 f"| {scene['scene']} | {name} | {row['ms']:.1f} | {row['psnr']:.2f} | {row['ssim']:.4f} |"
-                f" {_number(row.get('lpips_vgg'), 4)} | {at} | {standing['lead_db']:+.2f} | {end} |"
+                f" {number(row.get('lpips_vgg'), 4)} | {at} | {standing['lead_db']:+.2f} | {end} |"
             )
     return lines
 
@@ -130,16 +131,16 @@ def _scene(scene: dict[str, Any]) -> list[str]:
         parts = ", ".join(f"{part} {ms:.1f}" for part, ms in row["parts"].items() if ms > 0)
         label = f"**{name}**" if _own(name) else name
         lines.append(
-            f"| {label} | {row['ms']:.1f} | {parts} | {row['psnr']:.2f} | {_number(row.get('psnr_mask'), 2)} |"
-            f" {row['ssim']:.4f} | {_number(row.get('lpips_vgg'), 4)} |"
+            f"| {label} | {row['ms']:.1f} | {parts} | {row['psnr']:.2f} | {number(row.get('psnr_mask'), 2)} |"
+            f" {row['ssim']:.4f} | {number(row.get('lpips_vgg'), 4)} |"
         )
     lines += ["", "| at most | best rival | dB | neural | base image alone |", "|---|---|---|---|---|"]
     per = {name: standing["classes"] for name, standing in scene["standing"].items()}
     for index, row in enumerate(next(iter(per.values()))):
         mine = [_best(per, index, kind) for kind in (NEURAL, BASE)]
         lines.append(
-            f"| {row['limit_ms']:.0f} ms | {row['rival'] or 'none'} | {_number(row['rival_db'], 2)} |"
-            f" {_number(mine[0], 2)} | {_number(mine[1], 2)} |"
+            f"| {row['limit_ms']:.0f} ms | {row['rival'] or 'none'} | {number(row['rival_db'], 2)} |"
+            f" {number(mine[0], 2)} | {number(mine[1], 2)} |"
         )
     for move, found in scene.get("moving", {}).items():
         lines += ["", *_moving(move, found)]
@@ -183,7 +184,7 @@ def _moving(move: str, found: dict[str, Any]) -> list[str]:
         row = rows[name]
         label = f"**{name}**" if _own(name) else name
         lines.append(
-            f"| {label} | {row['ms']:.1f} | {row['psnr']:.2f} | {_number(row.get('lpips_alex'), 4)} |"
+            f"| {label} | {row['ms']:.1f} | {row['psnr']:.2f} | {number(row.get('lpips_alex'), 4)} |"
             f" {1000 * row['flicker']:.2f} |"
         )
     return lines
@@ -197,7 +198,3 @@ def _best(per: dict[str, list[dict[str, Any]]], index: int, kind: str) -> float 
     """Our best within a class, among all numbers of rays."""
     found = [rows[index]["ours_db"] for name, rows in per.items() if name.startswith(kind)]
     return max((value for value in found if value is not None), default=None)
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"

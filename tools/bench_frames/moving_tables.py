@@ -62,8 +62,8 @@ def lines(scenes: Sequence[Mapping[str, Any]]) -> list[str]:
             for name in pair:
                 row = rows[name] if name else {}
                 shown = "-" if name is None else f"{name.removeprefix(NEURAL + ', ')}, {row['ms']:.0f} ms"
-                cells += [shown, _number(row.get("psnr"), 2), _number(row.get("lpips_alex"), 4)]
-                cells += [_number(1000 * row["flicker"] if row else None, 2)]
+                cells += [shown, number(row.get("psnr"), 2), number(row.get("lpips_alex"), 4)]
+                cells += [number(1000 * row["flicker"] if row else None, 2)]
             mine, rival = pair
             if mine and rival:
                 lead = rows[mine]["psnr"] - rows[rival]["psnr"]
@@ -85,5 +85,6 @@ def _as_standing(scene: Mapping[str, Any]) -> dict[str, Any]:
     return {**kept, "rows": rows, "standing": ours}
 
 
-def _number(value: float | None, digits: int) -> str:
+def number(value: float | None, digits: int) -> str:
+    """A table's cell."""
     return "-" if value is None else f"{value:.{digits}f}"

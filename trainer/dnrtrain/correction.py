@@ -34,6 +34,7 @@ LOG_SCALE = 10.0
 IDENTITY = 4.0
 """What the kernels' middle weight has ahead of the others before the softmax, so it starts with 0.87 of the sum."""
 OWN = -2.0
+"""What g begins from before the sigmoid: 0.12 of the frame's own."""
 LOG_CEILING = 30.0
 """Log values above it (radiance of 2e30) count as it: the exponential would overflow, and its gradient with it."""
 
@@ -63,11 +64,14 @@ def correct(batch: Batch, outputs: Tensor, settings: ModelSettings) -> tuple[Ten
     """
     base, display = require_base(batch)
     added, scaled = outputs[:, :6].chunk(2, dim=1)
-    start = to_log(display.scale * base) if settings.output == "log" else display(base)
-    value, kernels = start, outputs[:, 6 : 6 + settings.filter**2]
+
+    def f(radiance: Tensor) -> Tensor:
+        return to_log(display.scale * radiance) if settings.output == "log" else display(radiance)
+
+    value = start = f(base)
     if batch.fresh is not None and settings.guides == "camera":
-        own = to_log(display.scale * batch.fresh) if settings.output == "log" else display(batch.fresh)
-        value = torch.lerp(start, own, torch.sigmoid(outputs[:, -1:] + OWN))
+        value = torch.lerp(start, f(batch.fresh), torch.sigmoid(outputs[:, -1:] + OWN))
+    kernels = outputs[:, 6 : 6 + settings.filter**2]
     value = filter_by(value, kernels) if settings.filter else value
     value = torch.addcmul(value + added, value, scaled)
     if settings.trust < 1:

@@ -59,6 +59,7 @@ TAKEN = (
 GIVEN = (*COLOURS, "base.A", "noise", "rays")
 """Channels that it changes; it adds FRESH_CHANNELS, the frame's own."""
 LEAST_ALPHA = 1e-3
+"""Of the frame's own base image, where it is brought to the alpha of what is remembered."""
 HALF, TINY = 0.5, 1e-4
 """Pixels: how far a picture goes beyond the centres of its outer ones; what keeps a place off the last."""
 SURFACE, RIM = 1.0, 0.5
