@@ -43,8 +43,11 @@ def test_killed_while_it_trains(server: Server, trained: str) -> None:
         assert job.state == "done" and job.starts == 2 and job.crashes == 0
         events = list(client.events(job.id))
         epochs = [e.data["epoch"] for e in events if e.kind == "epoch" and e.data["stage"] == "finetune"]
-        # The one under way at the kill: trained again (told twice), or saved but not told of yet (not told).
-        assert set(epochs) <= set(range(1, 41)) and len(set(epochs)) >= 39 and epochs[-1] == 40
+        # Those under way at the kill: one trained again (told twice), or some saved but not told of yet (not told: an
+        # epoch takes milliseconds, the server writes down what it was told several times a second).
+        untold = [epoch for epoch in range(1, 41) if epoch not in epochs]
+        assert set(epochs) <= set(range(1, 41)) and epochs[-1] == 40 and epochs[:3] == [1, 2, 3]
+        assert not untold or untold[-1] - untold[0] + 1 == len(untold) <= 8
         assert len(epochs) - len(set(epochs)) <= 1
         states = [e.data["state"] for e in events if e.kind == "state"]
         assert states == ["queued", "running", "queued", "running", "done"]
