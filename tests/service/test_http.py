@@ -78,6 +78,31 @@ def test_what_a_workspace_shows(server: Server, trained: str) -> None:
     assert httpx.get(f"{base}/pictures/none/truth").status_code == 404
 
 
+def test_many_clients_at_one_workspace(server: Server, trained: str) -> None:
+    """300 at once: the answer is made once a second, not 300 times."""
+    started = time.monotonic()
+    with concurrent.futures.ThreadPoolExecutor(60) as pool, httpx.Client(timeout=60) as client:
+        address = f"{server.url}/workspaces/{trained}"
+        codes = list(pool.map(lambda _: client.get(address).status_code, range(300)))
+    assert set(codes) == {200} and time.monotonic() - started < 20
+
+
+def test_settings_of_the_root_count_wherever_the_server_was_started(tmp_path: Path) -> None:
+    (tmp_path / "root").mkdir()
+    (tmp_path / "root" / "dnrpipe.toml").write_text("[cameras]\ntrain = 5\n")
+    server = Server(tmp_path / "root")
+    try:
+        with server.client() as client:
+            scene = client.upload(SCENE, "a.blend")
+            settings = {key: value for key, value in TINY.items() if key != "cameras.train"}
+            job = client.submit(JobRequest(command="prepare", workspace="a", scene=scene.name, settings=settings))
+            _until(client, job.id, "done", seconds=120)
+            states = {stage.stage: stage for stage in client.workspace("a").stages}
+        assert states["prepare"].state == "done" and states["prepare"].present == states["prepare"].wanted
+    finally:
+        server.stop()
+
+
 def test_cancel_in_every_state(server: Server) -> None:
     empty_workspace(server.root, "cancelled")
     with server.client() as client:

@@ -131,6 +131,9 @@ def test_bad_requests_do_no_harm(server: Server, trained: str) -> None:
             json.dumps({"camera": good, "size": 100_000}),
             json.dumps({"camera": good | {"distance": float("nan")}, "size": 64}),
             json.dumps({"camera": good, "size": 64, "mode": "../../etc/passwd"}),
+            json.dumps({"camera": good | {"target": [1e300, 0, 0]}, "size": 64}),
+            json.dumps({"camera": good | {"distance": 1e-300}, "size": 64}),
+            json.dumps({"camera": good | {"distance": 1e-8, "target": [1e6, 0, 0]}, "size": 64}),
         ):
             socket.send(text)
             answer = json.loads(socket.recv(timeout=60))

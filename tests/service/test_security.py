@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -119,6 +121,62 @@ def test_guessing_tokens_is_slowed_down(closed: Server) -> None:
         if codes[-1] == 429:
             break
     assert set(codes) == {401, 429}
+    with closed.client(TOKEN) as client:  # who has the token is not locked out with them
+        assert list(client.jobs()) == []
+
+
+def test_slow_senders_are_hung_up_on(server: Server) -> None:
+    """Half a head and then nothing: the connection ends, and others were answered meanwhile."""
+    place = urlsplit(server.url)
+    slow = [socket.create_connection((place.hostname, place.port or 80), timeout=40) for _ in range(50)]
+    for connection in slow:
+        connection.sendall(b"GET /jobs HTTP/1.1\r\nHost: 127.0.0.1\r\nX-Slow: ")
+    assert httpx.get(f"{server.url}/healthz").status_code == 200
+    for connection in slow:
+        assert connection.recv(1024) == b""
+        connection.close()
+
+
+def test_a_proxy_is_believed_where_it_is_named(tmp_path: Path) -> None:
+    """X-Forwarded-For decides neither the log nor the rate, unless its sender is trusted."""
+    forged = {"X-Forwarded-For": "203.0.113.7"}
+    plain = Server(tmp_path / "plain")
+    public = "https://render.example.org"
+    behind = Server(tmp_path / "behind", "--trusted-proxy", "127.0.0.1", "--public-url", public)
+    try:
+        assert httpx.get(f"{plain.url}/healthz", headers=forged).status_code == 200
+        upstream = f"http://127.0.0.1:{behind.port}"
+        assert httpx.get(f"{upstream}/healthz", headers=forged).status_code == 200
+        assert "203.0.113.7" not in plain.log.read_text() and "203.0.113.7" in behind.log.read_text()
+        for server, headers, status in (
+            (f"http://127.0.0.1:{plain.port}", {"X-Forwarded-Host": "render.example.org"}, 421),
+            (f"http://127.0.0.1:{plain.port}", {"Origin": public}, 403),
+            (upstream, {"X-Forwarded-Host": "render.example.org", "Origin": public}, 200),
+            (upstream, {"Host": "render.example.org", "Origin": public}, 200),
+            (upstream, {"X-Forwarded-Host": "evil.example"}, 421),
+            (upstream, {"Origin": "https://evil.example"}, 403),
+        ):
+            assert httpx.get(f"{server}/jobs", headers=headers).status_code == status, headers
+    finally:
+        plain.stop()
+        behind.stop()
+
+
+def test_a_preview_leads_nowhere(server: Server, tmp_path: Path) -> None:
+    empty_workspace(server.root, "led")
+    (tmp_path / "secret.json").write_text('{"split": "val", "view": "secret", "epoch": 1, "epochs": 1, "files": {}}')
+    preview = server.root / "led.dnr" / "preview"
+    preview.mkdir()
+    (preview / "preview.json").symlink_to(tmp_path / "secret.json")
+    answer = httpx.get(f"{server.url}/workspaces/led/preview")
+    assert answer.status_code == 404 and "secret" not in answer.text
+
+
+def test_nothing_is_announced_before_it_is_there(server: Server, tmp_path: Path) -> None:
+    """A port in use: one error line, and no word of serving."""
+    command = [sys.executable, "-m", "dnrpipe.cli", "serve", "--root", str(tmp_path / "r"), "--port", str(server.port)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2 and "serving" not in done.stdout and "cannot be listened on" in done.stderr
 
 
 @pytest.mark.parametrize(

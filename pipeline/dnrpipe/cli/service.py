@@ -59,6 +59,8 @@ def _client(server: str | None, token_file: Path | None) -> Client:
 @click.option("--job-disk-mb", type=click.IntRange(1), metavar="N", help="Of a job's workspace (default 51200).")
 @click.option("--keep-days", type=float, metavar="D", help="Logs and events of ended jobs (default 30 days).")
 @click.option("--keep-jobs", type=click.IntRange(1), metavar="N", help="Those of the last N ended jobs (default 1000).")
+@click.option("--trusted-proxy", metavar="IP", help="Believe what this proxy says of its clients (default: none).")
+@click.option("--public-url", metavar="URL", help="Address that browsers know the server by, behind a proxy.")
 def serve(
     host: str,
     port: int,
@@ -103,13 +105,21 @@ def serve(
         memory_mb=job_memory_mb or default_memory_mb(),
         disk_mb=job_disk_mb or 50 * 1024,
     )
+    url = options["public_url"]
+    if url is not None and not re.fullmatch(r"https?://[A-Za-z0-9.:\[\]-]+/?", url):
+        raise UserError(f"--public-url {url}: expected an address such as https://render.example.org")
     given = {key: value for key, value in options.items() if value is not None}
     if "rate" in given:
         given["burst"] = max(1, int(4 * given["rate"]))
     config = ServerConfig(root=root, host=host, port=port, devices=chosen, limits=limits, **given)
     console = Console()
-    console.say(f"serving {root.resolve()}, workers: {', '.join(chosen)}; Ctrl-C stops, jobs go on at the next start")
-    run_server(config, token, ready=lambda address: console.say(f"dashboard: {address}"))
+    whole = root.resolve()  # the server works in it
+
+    def ready(address: str) -> None:
+        console.say(f"serving {whole}, workers: {', '.join(chosen)}; Ctrl-C stops, jobs go on at the next start")
+        console.say(f"dashboard: {options['public_url'] or address}")
+
+    run_server(config, token, ready=ready)
 
 
 @click.command()

@@ -3,7 +3,8 @@
 The token comes in a header (`Authorization: Bearer ...`), or as the subprotocol `dnrpipe.token.<token>` of a WebSocket,
 for which browsers send no headers. The comparison takes constant time, and no log shows the token. A server on the
 loopback interface needs no token, but answers only to the names of that interface and to pages of its own origin: web
-pages that the user visits can neither read nor send anything (DNS rebinding, cross-site requests).
+pages that the user visits can neither read nor send anything (DNS rebinding, cross-site requests). Behind a proxy it
+answers to the name of its public address, too; what a proxy says of the client counts where that proxy is trusted.
 """
 
 from __future__ import annotations
@@ -61,10 +62,6 @@ class Buckets:
             self._levels.popitem(last=False)
         return 0.0 if taken else (1 - level) / self.rate
 
-    def empty(self, client: str) -> bool:
-        """Whether the bucket of `client` is empty; takes nothing."""
-        return self._level(client) < 1
-
     def _level(self, client: str) -> float:
         level, updated = self._levels.get(client, (self.size, 0.0))
         if client in self._levels:
@@ -75,13 +72,18 @@ class Buckets:
 class Guard:
     """ASGI middleware around the application.
 
-    hosts: names that the Host header may have, without port; empty: any (then there is a token). token: every request
-    needs it, but for the open paths; None: no token.
+    Args:
+        hosts: names that the Host header may have, without port; empty: any (then there is a token).
+        public: host and port of the address that a proxy in front answers to, or "".
+        token: every request needs it, but for the open paths; None: no token.
     """
 
-    def __init__(self, app: ASGIApp, *, hosts: Iterable[str], token: str | None, rate: float, burst: int) -> None:
+    def __init__(
+        self, app: ASGIApp, *, hosts: Iterable[str], public: str = "", token: str | None, rate: float, burst: int
+    ) -> None:
         self.app = app
-        self.hosts = frozenset(hosts)
+        self.public = public.lower()
+        self.hosts = frozenset(hosts) | ({_name_of(self.public)} if public and hosts else set())
         self.token = token.encode() if token else None
         self.rates = Buckets(rate, burst)
         self.refusals = Buckets(REFUSALS_PER_MINUTE / 60, REFUSALS_PER_MINUTE)
@@ -130,18 +132,22 @@ class Guard:
         host = headers.get("host", "")
         if self.hosts and _name_of(host) not in self.hosts:
             return refused(421, f"this server does not answer to the host name {host[:80]!r}")
+        forwarded = headers.get("x-forwarded-host")  # a proxy that hides the name it was asked by
+        if forwarded is not None and forwarded.lower() not in (host.lower(), self.public):
+            return refused(421, f"this server does not answer to the host name {forwarded[:80]!r} (--public-url)")
         origin = headers.get("origin")
-        if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
+        if origin is not None and urlsplit(origin).netloc.lower() not in {host.lower(), self.public} - {""}:
             return refused(403, "requests of pages from other origins are refused")
         # The dashboard's files hold no data, and the dashboard asks for the token.
         is_open = scope["type"] == "http" and (scope["path"] in OPEN_PATHS or scope["path"].startswith("/static/"))
-        if self.token is not None and not is_open:
-            if self.refusals.empty(client):
+        # The token first: who has it is never locked out by others behind the same address. Tokens are long random strings
+        # (config.TOKEN_PATTERN), so that guesses need no other bound than the one on wrong answers.
+        wanted = None if is_open else self.token
+        if wanted is not None and not hmac.compare_digest(_given_token(scope, headers), wanted):
+            if self.refusals.take(client) > 0:
                 return refused(429, "too many wrong tokens; wait a minute", **{"retry-after": "60"})
-            if not hmac.compare_digest(_given_token(scope, headers), self.token):
-                self.refusals.take(client)
-                reason = "wrong or missing token; send it as Authorization: Bearer TOKEN"
-                return refused(401, reason, **{"www-authenticate": "Bearer"})
+            reason = "wrong or missing token; send it as Authorization: Bearer TOKEN"
+            return refused(401, reason, **{"www-authenticate": "Bearer"})
         wait = self.rates.take(client)
         if wait > 0:
             return refused(429, "too many requests; slow down", **{"retry-after": str(max(1, math.ceil(wait)))})

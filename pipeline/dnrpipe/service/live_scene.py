@@ -6,7 +6,7 @@ import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -28,13 +28,16 @@ STEEPEST = math.radians(89.0)
 Mode = Literal["neural", "base", "reference", "error", "normal", "depth", "uv", "albedo", "coverage", "nearest"]
 
 
+Coordinate = Annotated[float, Field(ge=-1e9, le=1e9)]
+
+
 class Orbit(Strict):
     """A camera that looks at ``target``, upright. Angles in radians, lengths in scene units, Z up."""
 
     azimuth: float = Field(ge=-1e3, le=1e3)
     elevation: float = Field(ge=-STEEPEST, le=STEEPEST)
-    distance: float = Field(gt=0, le=1e9)
-    target: tuple[float, float, float]
+    distance: float = Field(ge=1e-9, le=1e9)
+    target: tuple[Coordinate, Coordinate, Coordinate]
 
 
 class LiveRequest(Strict):
@@ -61,10 +64,12 @@ class LiveScene:
     training: tuple[View, ...]
 
     def view(self, camera: Orbit, size: int) -> View:
-        """The view of ``camera``, ``size``² pixels."""
+        """The view of ``camera``, ``size``² pixels. Raises UserError: it stands in its own target, as numbers go."""
         ce = math.cos(camera.elevation)
         direction = np.array([ce * math.cos(camera.azimuth), ce * math.sin(camera.azimuth), math.sin(camera.elevation)])
         target = np.asarray(camera.target, np.float64)
+        if camera.distance < 1e-6 * float(np.abs(target).max()):
+            raise UserError("camera.distance: too small beside its target; move away, or nearer to the origin")
         settings = self.settings.cameras.model_copy(update={"width": size, "height": size})
         return look_at_view("live", target + camera.distance * direction, target, self.focal * size, settings)
 

@@ -81,7 +81,13 @@ def list_workspaces(service: Shared) -> list[WorkspaceSummary]:
 
 @router.get("/workspaces/{name}", responses=refusals(404, 409))
 def get_workspace(name: NamePath, service: Shared) -> WorkspaceDetail:
-    """Stages, cameras, histories of training, held-out views and costs. 409: a file of it is damaged."""
+    """Stages, cameras, histories of training, held-out views and costs, as of a second ago at most. 409: a file of it is
+    damaged."""
+    service.root.workspace(name)
+    return service.details.get(name, lambda: _detail(name, service))
+
+
+def _detail(name: str, service: State) -> WorkspaceDetail:
     path = service.root.workspace(name)
     try:
         workspace = Workspace.open(path)
@@ -118,7 +124,7 @@ def get_workspace(name: NamePath, service: Shared) -> WorkspaceDetail:
 @router.get("/workspaces/{name}/preview", responses=refusals(404, 409))
 def preview(name: NamePath, service: Shared) -> PreviewState:
     """What the last picture of fine-tuning shows. 409: its file is damaged."""
-    path = service.root.workspace(name) / "preview" / PREVIEW
+    path = service.root.result(name, f"preview/{PREVIEW}", f"{name} has no picture of a training")
     try:
         return read(path, PreviewState)
     except FileNotFoundError:

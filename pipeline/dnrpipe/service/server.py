@@ -13,6 +13,7 @@ from typing import Any
 
 import uvicorn
 from filelock import FileLock, Timeout
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ..core.errors import UserError
 from .app import create_app
@@ -22,6 +23,9 @@ from .queue import Queue
 from .root import ServiceRoot
 from .state import Feed, State
 from .supervisor import Supervisor
+
+HEAD_SECONDS = 20.0
+"""How long a client may take to send its first request's head."""
 
 
 def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], None]) -> None:
@@ -38,6 +42,7 @@ def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], Non
         del os.environ[name]
     root = ServiceRoot(config.root).create()
     config = config.model_copy(update={"root": root.folder})
+    os.chdir(root.folder)  # a dnrpipe.toml there counts for the pages as it does for the jobs, and no other
     _log_as_json()
     try:
         lock = FileLock(root.private / "lock", timeout=10).acquire()  # a killed server may take a moment to end
@@ -59,6 +64,9 @@ def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], Non
             timeout_graceful_shutdown=3,
             ws="websockets-sansio",
             ws_max_size=64 * 1024,
+            http=_Patient,
+            proxy_headers=bool(config.trusted_proxy),
+            forwarded_allow_ips=config.trusted_proxy or "",
             limit_concurrency=config.streams + 1000,
         )
         try:
@@ -74,6 +82,22 @@ def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], Non
         finally:
             supervisor.stop()
             queue.close()
+
+
+class _Patient(H11Protocol):
+    """Closes connections that do not send the head of a request in time; bodies may take as long as they do."""
+
+    def connection_made(self, transport: Any) -> None:
+        super().connection_made(transport)
+        self._late = self.loop.call_later(HEAD_SECONDS, self._close_late)
+
+    def _close_late(self) -> None:
+        if self.cycle is None and not self.transport.is_closing():
+            self.transport.close()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._late.cancel()
+        super().connection_lost(exc)
 
 
 class _Server(uvicorn.Server):

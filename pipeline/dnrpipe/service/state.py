@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import shutil
-from collections.abc import Iterator
-from dataclasses import dataclass
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, TypeVar
 
 from fastapi import Depends, HTTPException
 from starlette.concurrency import run_in_threadpool
@@ -21,6 +24,7 @@ from .root import ServiceRoot
 from .supervisor import Supervisor
 
 POLL = 0.1
+T = TypeVar("T")
 
 
 class Feed:
@@ -51,6 +55,28 @@ class Feed:
         return False
 
 
+class Remembered:
+    """Answers that take long to make, each made by one request at a time and good for all who ask within a second."""
+
+    SECONDS = 1.0
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._locks: dict[str, threading.Lock] = {}
+        self._made: dict[str, tuple[float, Any]] = {}
+
+    def get(self, key: str, make: Callable[[], T]) -> T:
+        """What ``make`` returned for the key, at most a second ago. What it raises is not remembered."""
+        with self._lock:
+            lock = self._locks.setdefault(key, threading.Lock())
+        with lock:
+            when, value = self._made.get(key, (-math.inf, None))
+            if time.monotonic() - when > self.SECONDS:
+                value = make()
+                self._made[key] = (time.monotonic(), value)
+            return value
+
+
 @dataclass
 class State:
     """What the routes share, one per server."""
@@ -62,6 +88,7 @@ class State:
     live: LivePool
     feed: Feed
     streams: int = 0
+    details: Remembered = field(default_factory=Remembered)
 
     def require_space(self, folder: Path) -> None:
         """Raises HTTPException 507: too little of the folder's disk is free."""
