@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import concurrent.futures
+import json
 import sqlite3
 import subprocess
 import sys
@@ -99,6 +100,31 @@ def test_settings_of_the_root_count_wherever_the_server_was_started(tmp_path: Pa
             _until(client, job.id, "done", seconds=120)
             states = {stage.stage: stage for stage in client.workspace("a").stages}
         assert states["prepare"].state == "done" and states["prepare"].present == states["prepare"].wanted
+    finally:
+        server.stop()
+
+
+def test_a_job_keeps_the_scene_that_it_was_submitted_with(tmp_path: Path) -> None:
+    """Another file of that name comes while it waits; which of the two it was is said."""
+    server = Server(tmp_path / "root")
+    other = SCENE.with_name("all_mirror.blend")
+    try:
+        with server.client() as client:
+            first = client.upload(SCENE, "same.blend")
+            assert not first.replaced
+            blocking = client.submit(JobRequest(command="prepare", workspace="b", scene="same.blend", settings=TINY))
+            waiting = client.submit(JobRequest(command="prepare", workspace="w", scene="same.blend", settings=TINY))
+            assert not client.upload(SCENE, "same.blend").replaced  # the same file again
+            second = client.upload(other, "same.blend")
+            assert second.replaced and second.sha256 != first.sha256
+            late = client.submit(JobRequest(command="prepare", workspace="l", scene="same.blend", settings=TINY))
+            assert [client.job(job.id).request.scene_sha256 for job in (waiting, late)] == [first.sha256, second.sha256]
+            for job in (blocking, waiting, late):
+                _until(client, job.id, "done", seconds=180)
+            with pytest.raises(Refused, match="no file of content"):
+                client.submit(JobRequest(command="run", workspace="n", scene="same.blend", scene_sha256="0" * 64))
+        sources = [json.loads((server.root / f"{name}.dnr" / "manifest.json").read_text()) for name in "bwl"]
+        assert [source["source"]["sha256"] for source in sources] == [first.sha256, first.sha256, second.sha256]
     finally:
         server.stop()
 

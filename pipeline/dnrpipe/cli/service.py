@@ -187,7 +187,10 @@ def submit(
     with _client(**server) as client:
         if upload is not None:
             with console.bar(f"uploading {path.name}", path.stat().st_size) as bar:
-                client.upload(path, upload, sent=bar.advance)
+                stored = client.upload(path, upload, sent=bar.advance)
+            request = request.model_copy(update={"scene_sha256": stored.sha256})
+            if stored.replaced:
+                console.warn(f"{upload}: another file of that name was there; jobs submitted with it keep it")
         job = client.submit(request)
         console.say(f"job {job.id}: {command} of {name}")
         if not detach:

@@ -140,8 +140,8 @@ class Guard:
             return refused(403, "requests of pages from other origins are refused")
         # The dashboard's files hold no data, and the dashboard asks for the token.
         is_open = scope["type"] == "http" and (scope["path"] in OPEN_PATHS or scope["path"].startswith("/static/"))
-        # The token first: who has it is never locked out by others behind the same address. Tokens are long random strings
-        # (config.TOKEN_PATTERN), so that guesses need no other bound than the one on wrong answers.
+        # The token first: who has it is never locked out by others behind the same address. Tokens are long and random
+        # (config.TOKEN_PATTERN): guesses need no other bound than the one on wrong answers.
         wanted = None if is_open else self.token
         if wanted is not None and not hmac.compare_digest(_given_token(scope, headers), wanted):
             if self.refusals.take(client) > 0:

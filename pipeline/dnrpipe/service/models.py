@@ -46,13 +46,15 @@ class JobRequest(Strict):
     """A stage, or all of them (``run``), on a workspace of the server.
 
     workspace: its name; the folder is ``<root>/<name>.dnr``. scene: an uploaded scene file, for ``run`` and ``prepare``
-    of a workspace that is not there yet. settings: as ``--set``, by dotted key. priority: larger goes first.
+    of a workspace that is not there yet; scene_sha256: which file of that name, by its content (default: the one there
+    now). settings: as ``--set``, by dotted key. priority: larger goes first.
     retries: how often the queue starts a job again whose process crashed.
     """
 
     command: Command
     workspace: Name
     scene: Annotated[str, Field(pattern=SCENE_PATTERN)] | None = None
+    scene_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
     preset: Literal["draft", "standard", "paper", "vanilla"] | None = None
     settings: dict[Annotated[str, Field(pattern=SETTING_PATTERN)], bool | int | float | str] = Field(
         default_factory=dict, max_length=64
@@ -112,11 +114,12 @@ class LogPage(Strict):
 
 
 class Scene(Strict):
-    """An uploaded scene file. size in bytes."""
+    """An uploaded scene file. size in bytes. replaced: it took the place of another file of that name."""
 
     name: str
     size: int
     sha256: str | None = None
+    replaced: bool = False
 
 
 class StageState(Strict):

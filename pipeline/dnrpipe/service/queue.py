@@ -234,7 +234,7 @@ class Queue:
     def prune(self, root: ServiceRoot, config: ServerConfig, now: float | None = None) -> list[int]:
         """Delete logs and events of jobs that ended more than `config.keep_days` or `config.keep_jobs` jobs ago.
 
-        The jobs and their changes of state stay. Each batch holds the write lock, so that nobody retries one of its
+        The jobs and their changes of state stay; uploads that none of the others was submitted with go. Each batch holds the write lock, so that nobody retries one of its
         jobs meanwhile. Returns the pruned jobs, by number.
         """
         before = (time.time() if now is None else now) - config.keep_days * DAY
@@ -249,6 +249,10 @@ class Queue:
                         for path in (root.log(job), root.events(job)):
                             path.unlink(missing_ok=True)
                         pruned.append(job)
+        with self._writing() as db:  # nobody submits a job meanwhile
+            found = db.execute("SELECT request FROM jobs WHERE finished IS NULL OR finished >= ?", (before,))
+            requests = [JobRequest.model_validate_json(row["request"]) for row in found]
+            root.drop_uploads({request.scene_sha256 for request in requests if request.scene_sha256})
         return pruned
 
     def _prunable_jobs(self, before: float, beyond: int, has_files: Collection[int]) -> list[list[int]]:

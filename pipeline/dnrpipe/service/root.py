@@ -2,19 +2,24 @@
 
 root/
   <name>.dnr/          workspaces
-  scenes/<file>        uploaded scene files
+  scenes/<file>        scene files by name: the last upload of each
   dnrpipe.toml         settings for all jobs, if the operator puts one there
   .service/            queue.sqlite, logs/<job>.log, events/<job>.jsonl, lock
+    uploads/<sha256>/<file>   the same files by content; a job names the one that it was submitted with
 """
 
 from __future__ import annotations
 
 import contextlib
+import os
 import re
+import secrets
+import shutil
+from collections.abc import Collection
 from pathlib import Path
 
 from ..core.errors import UserError
-from ..core.workspace import SUFFIX
+from ..core.workspace import SUFFIX, file_sha256
 from .models import NAME_PATTERN, SCENE_PATTERN
 
 
@@ -30,12 +35,13 @@ class ServiceRoot:
         self.private = self.folder / ".service"
         self.queue = self.private / "queue.sqlite"
         self.scenes = self.folder / "scenes"
+        self.uploads = self.private / "uploads"
 
     def create(self) -> ServiceRoot:
         """Make the folders that are missing; the private one is readable by its owner alone."""
         self.folder.mkdir(parents=True, exist_ok=True)
         self.private.mkdir(mode=0o700, exist_ok=True)
-        for folder in (self.scenes, self.private / "logs", self.private / "events"):
+        for folder in (self.scenes, self.uploads, self.private / "logs", self.private / "events"):
             folder.mkdir(exist_ok=True)
         return self
 
@@ -58,6 +64,44 @@ class ServiceRoot:
         if must_exist and not path.is_file():
             raise UnknownName(f"{name}: no such scene; upload it with PUT /scenes/{name}")
         return path
+
+    def keep_scene(self, file: Path, name: str, sha256: str) -> bool:
+        """Move a file of this content to its places. Returns whether it replaced another of that name."""
+        kept, named = self.uploads / sha256 / name, self.scene(name, must_exist=False)
+        replaced = named.is_file() and not (kept.is_file() and kept.samefile(named)) and file_sha256(named) != sha256
+        kept.parent.mkdir(exist_ok=True)
+        if not kept.is_file():
+            file.replace(kept)
+        _link(kept, named)
+        return replaced
+
+    def submitted_scene(self, name: str, sha256: str | None) -> tuple[str, Path]:
+        """(hash, path) of the file that a job is submitted with: of that hash, or the one of that name now.
+
+        Raises UnknownName: there is none, or none of that name and content.
+        """
+        if sha256 is None:
+            named = self.scene(name)
+            for kept in self.uploads.glob(f"*/{name}"):
+                if kept.samefile(named):
+                    return kept.parent.name, kept
+            sha256 = file_sha256(named)  # put there by hand
+            kept = self.uploads / sha256 / name
+            kept.parent.mkdir(exist_ok=True)
+            _link(named, kept)
+        kept = self._inside(self.uploads / sha256 / name, name, SCENE_PATTERN)
+        if not kept.is_file():
+            raise UnknownName(
+                f"{name}: no file of content {sha256[:12]}… was uploaded under this name; upload it again"
+            )
+        return sha256, kept
+
+    def drop_uploads(self, wanted: Collection[str]) -> None:
+        """Remove uploads that no job wants, by hash, and that no scene is."""
+        for folder in self.uploads.iterdir():
+            files = list(folder.iterdir())
+            if folder.name not in wanted and all(file.stat().st_nlink == 1 for file in files):
+                shutil.rmtree(folder, ignore_errors=True)
 
     def result(self, name: str, file: str, problem: str) -> Path:
         """A file of a workspace. Raises UnknownName with `problem`: it is not there, or leads out of the root."""
@@ -82,3 +126,11 @@ class ServiceRoot:
         if not path.resolve().is_relative_to(self.folder):  # a link that leads out
             raise UnknownName(f"{name}: leads out of the server's folder")
         return path
+
+
+def _link(source: Path, target: Path) -> None:
+    """Make ``target`` the same file, in place of whatever was there."""
+    temporary = target.with_name(f".{secrets.token_hex(8)}.part")
+    os.link(source, temporary)
+    temporary.replace(target)
+    temporary.unlink(missing_ok=True)  # renaming a file to another name of itself does nothing

@@ -65,6 +65,9 @@ def submit(
     """
     check_request(request, service)
     service.require_space(service.root.folder)
+    if request.scene is not None:  # a later upload of that name is no business of this job
+        sha256, _ = service.root.submitted_scene(request.scene, request.scene_sha256)
+        request = request.model_copy(update={"scene_sha256": sha256})
     return service.queue.submit(request, most_queued=service.config.most_queued, token=idempotency_key)
 
 
@@ -182,7 +185,8 @@ def check_request(request: JobRequest, service: Service) -> None:
     if request.scene is not None:
         if request.command not in ("run", "prepare"):
             raise HTTPException(422, f"scene: {request.command} takes none; only run and prepare do")
-        service.root.scene(request.scene)
+        if request.scene_sha256 is None:
+            service.root.scene(request.scene)
     path = service.root.workspace(request.workspace, must_exist=request.scene is None)
     if not path.exists() and len(service.root.workspaces()) >= service.config.most_workspaces:
         raise HTTPException(429, f"there are {service.config.most_workspaces} workspaces already; remove some")

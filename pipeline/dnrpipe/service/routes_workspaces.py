@@ -81,8 +81,7 @@ def list_workspaces(service: Shared) -> list[WorkspaceSummary]:
 
 @router.get("/workspaces/{name}", responses=refusals(404, 409))
 def get_workspace(name: NamePath, service: Shared) -> WorkspaceDetail:
-    """Stages, cameras, histories of training, held-out views and costs, as of a second ago at most. 409: a file of it is
-    damaged."""
+    """Stages, cameras, training, held-out views and costs, at most a second old. 409: a file of it is damaged."""
     service.root.workspace(name)
     return service.details.get(name, lambda: _detail(name, service))
 
@@ -177,7 +176,8 @@ def list_scenes(service: Shared) -> list[Scene]:
 async def upload(name: ScenePath, request: Request, service: Shared) -> Scene:
     """Store a scene file; the body is the file. It appears whole or not at all, and replaces one of the same name.
 
-    Textures must be packed into it. Scripts embedded in it are never run.
+    Jobs that were submitted with a former file of that name keep theirs; `replaced` says that it was another. Textures
+    must be packed into it. Scripts embedded in it are never run.
     """
     target = service.root.scene(name, must_exist=False)
     limit = service.config.upload_mb * 2**20
@@ -199,17 +199,17 @@ async def upload(name: ScenePath, request: Request, service: Shared) -> Scene:
             await run_in_threadpool(os.fsync, file.fileno())
         if size == 0:
             raise HTTPException(422, "the body is empty; it must be the scene file")
-        temporary.replace(target)
+        replaced = await run_in_threadpool(service.root.keep_scene, temporary, name, checksum.hexdigest())
     except ClientDisconnect:
         raise HTTPException(400, "the connection ended before the file did") from None
     finally:
         temporary.unlink(missing_ok=True)
-    return Scene(name=name, size=size, sha256=checksum.hexdigest())
+    return Scene(name=name, size=size, sha256=checksum.hexdigest(), replaced=replaced)
 
 
 @router.delete("/scenes/{name}", status_code=204, responses=refusals(404))
 def remove(name: ScenePath, service: Shared) -> Response:
-    """Remove a scene file. Workspaces made from it stay as they are."""
+    """Remove a scene file. Workspaces made from it stay as they are, and so do jobs submitted with it."""
     service.root.scene(name).unlink(missing_ok=True)
     return Response(status_code=204)
 

@@ -168,7 +168,7 @@ def job_command(job: Job, root: ServiceRoot) -> list[str]:
     workspace = root.workspace(request.workspace, must_exist=False)
     command = [sys.executable, "-m", "dnrpipe.cli", request.command]
     if request.scene is not None:
-        command.append(str(root.scene(request.scene)))
+        command.append(str(root.submitted_scene(request.scene, request.scene_sha256)[1]))
     command += ["-w", str(workspace), "--json"]
     if request.preset is not None:
         command += ["--preset", request.preset]
