@@ -91,9 +91,7 @@ class ServiceRoot:
             _link(named, kept)
         kept = self._inside(self.uploads / sha256 / name, name, SCENE_PATTERN)
         if not kept.is_file():
-            raise UnknownName(
-                f"{name}: no file of content {sha256[:12]}… was uploaded under this name; upload it again"
-            )
+            raise UnknownName(f"{name}: no file of content {sha256[:12]}… was uploaded by this name; upload it again")
         return sha256, kept
 
     def drop_uploads(self, wanted: Collection[str]) -> None:
