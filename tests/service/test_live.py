@@ -313,3 +313,64 @@ def test_a_page_without_the_token_asks_for_it(tmp_path: Path) -> None:
         assert token not in server.log.read_text()
     finally:
         server.stop()
+
+
+@needs_chromium
+def test_the_dashboard_by_keyboard(server: Server, trained: str) -> None:
+    """Rows are buttons and keep the focus while the page refreshes; errors stay until they are dismissed."""
+    empty_workspace(server.root, "keys")
+    with server.client() as client, open_page(server.url, width=1280) as (page, errors):
+        job = client.submit(JobRequest(command="finetune", workspace="keys")).id
+        row = f"document.querySelector('#jobs tr[data-job=\"{job}\"]')"
+        wait_for(page, f"{row}?.children[2].textContent === 'failed'")
+        page.evaluate(f"{row}.querySelector('button').focus()")
+        page.keyboard.press("Enter")
+        wait_for(page, "!document.querySelector('#job').hidden")
+        wait_for(page, "document.querySelector('#job-error').textContent.includes('prepare has not run')")
+        page.wait_for_timeout(3500)  # a refresh later
+        assert page.evaluate(f"document.activeElement === {row}.querySelector('button')")
+        # Tried again: the pane goes on with the job by itself.
+        page.keyboard.press("Tab")
+        assert page.evaluate("document.activeElement.textContent") == "retry"
+        page.keyboard.press("Enter")
+        wait_for(page, f"{row}.children[2].textContent === 'failed' && document.querySelector('#note').textContent")
+        wait_for(page, "document.querySelector('#note').textContent.startsWith('failed')")
+        # A refused action says so in words, and the next refresh does not wipe it.
+        page.evaluate(
+            "document.querySelector('#workspace').append(new Option('a b', 'a b'));"
+            " document.querySelector('#workspace').value = 'a b'; document.querySelector('#submit').requestSubmit()"
+        )
+        wait_for(page, "!document.querySelector('#problem').hidden")
+        assert "a name has letters" in page.inner_text("#problem")
+        page.wait_for_timeout(3500)
+        assert page.evaluate("!document.querySelector('#problem').hidden")
+        page.evaluate("document.querySelector('#dismiss').click()")
+        assert page.evaluate("document.querySelector('#problem').hidden")
+        spent = page.evaluate("[...document.querySelectorAll('#stages tbody tr')].map(r => r.children[3].textContent)")
+        assert spent == [""] * len(spent)
+        assert errors == [] or all("422" in error for error in errors)
+
+
+@needs_chromium
+def test_an_empty_server_says_what_to_do_and_its_viewer_gives_up(tmp_path: Path) -> None:
+    token = "a-token-for-the-browser"
+    file = tmp_path / "token"
+    file.write_text(token)
+    file.chmod(0o600)
+    server = Server(tmp_path / "root", "--token-file", str(file))
+    try:
+        with open_page(f"{server.url}/static/viewer.html?w=none", width=400) as (page, _):
+            wait_for(page, "document.querySelector('#token-form')?.hidden === false")
+            page.fill("#token", token)
+            page.press("#token", "Enter")
+            wait_for(page, "!document.querySelector('#again').hidden")
+            assert "no such workspace" in page.inner_text("#problem")
+            asked = server.log.read_text().count("/workspaces/none")
+            page.wait_for_timeout(4000)
+            assert server.log.read_text().count("/workspaces/none") == asked  # not again by itself
+            page.goto(server.url)
+            wait_for(page, "document.querySelector('#no-jobs')?.hidden === false")
+            assert "Choose a scene file" in page.inner_text("#no-jobs")
+            assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+    finally:
+        server.stop()

@@ -17,6 +17,13 @@ NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
 SCENE_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}\.(blend|obj|gltf|glb|fbx|ply|stl)$"
 SETTING_PATTERN = r"^[a-z0-9_]{1,40}(\.[a-z0-9_]{1,40}){0,4}$"
 
+PLAIN = {
+    NAME_PATTERN: "a name has letters, digits, - and _, begins with a letter or digit, and has 64 at most",
+    SCENE_PATTERN: "a scene file's name has letters, digits, - and _, and ends in .blend, .obj, .gltf, .glb, .fbx, .ply or .stl",
+    SETTING_PATTERN: "no such setting",
+}
+"""What a value that does not match a pattern is told."""
+
 Command = Literal["run", "prepare", "select", "raytrace-selected", "finetune", "evaluate", "render", "report"]
 State = Literal["queued", "running", "done", "failed", "cancelled"]
 STATES: tuple[State, ...] = get_args(State)
@@ -27,7 +34,9 @@ Name = Annotated[str, Field(pattern=NAME_PATTERN)]
 def first_fault(error: ValidationError | RequestValidationError) -> str:
     """Field and fault in one line, without what was sent (it may be anything)."""
     first = error.errors()[0]
-    return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+    where = ".".join(str(part) for part in first["loc"] if part not in ("body", "path", "query"))
+    pattern = first.get("ctx", {}).get("pattern")
+    return f"{where}: {PLAIN.get(pattern, first['msg']) if pattern else first['msg']}"
 
 
 class Limits(Strict):

@@ -234,9 +234,9 @@ class Queue:
     def prune(self, root: ServiceRoot, config: ServerConfig, now: float | None = None) -> list[int]:
         """Delete logs and events of jobs that ended more than `config.keep_days` or `config.keep_jobs` jobs ago.
 
-        The jobs and their changes of state stay; uploads go that no job was submitted with that waits, runs or ended
-        later. Each batch holds the write lock, so that nobody retries one of its jobs meanwhile. Returns the pruned jobs,
-        by number.
+        The jobs and their changes of state stay. Uploads go that no job names which waits, runs or ended later.
+        Each batch holds the write lock, so that nobody retries one of its jobs meanwhile. Returns the pruned jobs by
+        number.
         """
         before = (time.time() if now is None else now) - config.keep_days * DAY
         folders = (root.log(0).parent, root.events(0).parent)

@@ -7,11 +7,19 @@ const api = (function () {
     return Object.assign(token ? { Authorization: "Bearer " + token } : {}, more);
   }
   async function ask(path, options) {
-    const answer = await fetch(path, Object.assign({}, options, { headers: headers(options && options.headers) }));
+    let answer;
+    try {
+      answer = await fetch(path, Object.assign({}, options, { headers: headers(options && options.headers) }));
+    } catch (error) {
+      if (error.name === "AbortError") throw error;
+      throw new Error("The server does not answer. Is it running, and is this machine connected?");
+    }
     if (answer.status === 401) document.dispatchEvent(new CustomEvent("token-wanted"));
     if (!answer.ok) {
       const body = await answer.json().catch(function () { return {}; });
-      throw new Error(body.detail || path + " was answered with " + answer.status);
+      const refused = new Error(body.detail || "The server answered " + answer.status + " to " + path + ".");
+      refused.status = answer.status;  // it did answer: asking again will not help
+      throw refused;
     }
     return answer;
   }
@@ -25,9 +33,9 @@ const api = (function () {
       return (await ask(path, Object.assign({ method: "POST" }, body))).json();
     },
     picture: async function (path) { return URL.createObjectURL(await (await ask(path)).blob()); },
-    /* Events of a job from the id `after` on, until it has ended or `signal` is aborted; takes a broken stream up. */
+    /* Events of a job, until it has ended or `signal` is aborted; takes a broken stream up. Throws what refuses it. */
     events: async function (job, signal, seen) {
-      let last = 0, ended = false;
+      let last = 0, ended = false, pause = 1000;
       while (!ended && !signal.aborted) {
         try {
           const answer = await ask("/jobs/" + job + "/events", { signal: signal, headers: { "Last-Event-ID": String(last) } });
@@ -46,13 +54,15 @@ const api = (function () {
               });
               if (fields.id) last = Number(fields.id);
               if (fields.event === "end") ended = true;
-              else if (fields.event) seen(fields.event, JSON.parse(fields.data));
+              else if (fields.event) pause = 1000, seen(fields.event, JSON.parse(fields.data));
             });
           }
         } catch (error) {
           if (signal.aborted) return;
+          if (error.status >= 400 && error.status < 500 && error.status !== 429) throw error;
+          pause = Math.min(30000, 2 * pause);
         }
-        if (!ended) await new Promise(function (done) { setTimeout(done, 1000); });
+        if (!ended) await new Promise(function (done) { setTimeout(done, pause); });
       }
     },
     socket: function (path) {

@@ -3,21 +3,36 @@
 (function () {
   const $ = function (id) { return document.getElementById(id); };
   const FINAL = ["done", "failed", "cancelled"];
-  let job = null, watching = null, workspace = null, sphere = null;
+  let job = null, watching = null, over = false, workspace = null, sphere = null;
   document.documentElement.classList.add("js");
 
   function clock(seconds) {
     const s = Math.round(seconds);
     return (s >= 3600 ? Math.floor(s / 3600) + ":" + String(Math.floor(s / 60) % 60).padStart(2, "0") : Math.floor(s / 60)) + ":" + String(s % 60).padStart(2, "0");
   }
-  function problem(error) { $("problem").textContent = error.message; $("problem").hidden = false; }
+  /* What an action ran into stays until the next one succeeds, or until it is dismissed. */
+  function problem(error) { $("problem-text").textContent = error.message; $("problem").hidden = false; }
   function settled() { $("problem").hidden = true; }
+  $("dismiss").addEventListener("click", settled);
+  function say(node, text) { if (node.textContent !== text) node.textContent = text; }
   function cell(text, tag) { const node = document.createElement(tag || "td"); node.textContent = text; return node; }
   function button(text, act) {
     const node = document.createElement("button");
     node.type = "button"; node.textContent = text;
-    node.addEventListener("click", function (event) { event.stopPropagation(); Promise.resolve(act()).then(settled).then(refresh).catch(problem); });
+    node.addEventListener("click", function () { Promise.resolve(act()).then(settled).then(refresh).catch(problem); });
     return node;
+  }
+  /* Children of `parent`, one for each entry, in order: those that are there stay, so that focus does. */
+  function update(parent, entries, key, make, change) {
+    const known = new Map(Array.from(parent.children, function (node) { return [node.dataset.key, node]; }));
+    entries.forEach(function (entry, index) {
+      const name = String(key(entry)), node = known.get(name) || make(entry);
+      node.dataset.key = name;
+      known.delete(name);
+      change(node, entry);
+      if (parent.children[index] !== node) parent.insertBefore(node, parent.children[index] || null);
+    });
+    known.forEach(function (node) { node.remove(); });
   }
 
   document.addEventListener("token-wanted", function () { $("token-form").hidden = false; });
@@ -35,30 +50,51 @@
         Object.keys(health.workers).map(function (d) { return d + (health.workers[d] ? "" : " (down)"); }).join(", ");
       showJobs((await api.get("/jobs?limit=30")).jobs);
       showWorkspaces(await api.get("/workspaces"));
-      settled();
-    } catch (error) { problem(error); }
+    } catch (error) { $("health").textContent = error.message; }
   }
   function showJobs(jobs) {
-    const body = $("jobs").tBodies[0];
-    body.replaceChildren.apply(body, jobs.map(function (entry) {
-      const row = document.createElement("tr"), state = cell(entry.state), acts = document.createElement("td");
+    $("no-jobs").hidden = jobs.length > 0;
+    $("jobs").hidden = !jobs.length;
+    update($("jobs").tBodies[0], jobs, function (entry) { return entry.id; }, function (entry) {
+      const row = document.createElement("tr"), name = document.createElement("td");
       row.dataset.job = entry.id;
-      row.classList.toggle("selected", entry.id === job);
-      state.className = "state-" + entry.state;
-      if (entry.error) state.title = entry.error;
-      if (!FINAL.includes(entry.state)) acts.append(button("cancel", function () { return api.post("/jobs/" + entry.id + "/cancel"); }));
-      else if (entry.state !== "done") acts.append(button("retry", function () { return api.post("/jobs/" + entry.id + "/retry"); }));
-      row.append(cell(entry.id), cell(entry.request.command + " " + entry.request.workspace), state, acts);
-      row.addEventListener("click", function () { select(entry); });
+      name.append(button("", function () { select(row.entry); }));
+      name.firstChild.className = "link";
+      row.append(cell(entry.id), name, cell(""), document.createElement("td"));
+      row.addEventListener("click", function (event) { if (!event.target.closest("button")) select(row.entry); });
       return row;
-    }));
+    }, function (row, entry) {
+      const final = FINAL.includes(entry.state), act = final ? (entry.state === "done" ? "" : "retry") : "cancel";
+      const state = row.children[2], acts = row.children[3];
+      row.entry = entry;
+      row.classList.toggle("selected", entry.id === job);
+      say(row.children[1].firstChild, entry.request.command + " " + entry.request.workspace);
+      row.children[1].firstChild.setAttribute("aria-current", entry.id === job ? "true" : "false");
+      say(state, entry.state);
+      state.className = "state-" + entry.state;
+      if (acts.dataset.act !== act) {
+        acts.dataset.act = act;
+        acts.replaceChildren();
+        if (act) {
+          acts.append(button(act, function () { return api.post("/jobs/" + entry.id + "/" + act); }));
+          acts.firstChild.setAttribute("aria-label", act + " job " + entry.id);
+        }
+      }
+      if (entry.id === job && over && !final) select(entry);  // tried again: watched again
+    });
+    const chosen = jobs.find(function (entry) { return entry.id === job; });
+    if (chosen) {
+      $("job-error").hidden = !chosen.error;
+      say($("job-error"), chosen.error || "");
+    }
   }
   function showWorkspaces(found) {
-    $("workspaces").replaceChildren.apply($("workspaces"), found.map(function (entry) {
+    $("no-workspaces").hidden = found.length > 0;
+    update($("workspaces"), found, function (entry) { return entry.name; }, function (entry) {
       const item = document.createElement("li");
-      item.append(button(entry.name, function () { return open(entry.name); }), entry.problem ? " " + entry.problem : "");
+      item.append(button(entry.name, function () { return open(entry.name); }), document.createElement("span"));
       return item;
-    }));
+    }, function (item, entry) { say(item.children[1], entry.problem ? " " + entry.problem : ""); });
     const names = found.map(function (entry) { return entry.name; }), list = $("workspace"), before = list.value;
     if (Array.from(list.options, function (o) { return o.value; }).slice(1).join() !== names.join()) {
       list.replaceChildren.apply(list, [""].concat(names).map(function (name) { return new Option(name || "(the scene's)", name); }));
@@ -69,7 +105,7 @@
   function select(entry) {
     if (watching) watching.abort();
     watching = new AbortController();
-    job = entry.id;
+    job = entry.id; over = false;
     const losses = {}, quality = [];
     $("job").hidden = false;
     $("job-title").textContent = "Job " + entry.id + ": " + entry.request.command + " " + entry.request.workspace;
@@ -114,7 +150,7 @@
           if (workspace === entry.request.workspace) open(workspace).catch(problem);
         }
       }
-    }).catch(problem);
+    }).then(function () { over = mine === watching || over; }).catch(problem);
     open(entry.request.workspace).catch(function () { $("detail").hidden = true; });
     refresh();
   }
@@ -167,14 +203,15 @@
     const body = $("stages").tBodies[0];
     body.replaceChildren.apply(body, found.stages.map(function (stage) {
       const row = document.createElement("tr");
-      row.append(cell(stage.command), cell(stage.state), cell(stage.present + " of " + stage.wanted), cell(stage.seconds === null ? "" : clock(stage.seconds)));
+      const spent = found.costs.spent[stage.stage];
+      row.append(cell(stage.command, "th"), cell(stage.state), cell(stage.present + " of " + stage.wanted), cell(spent ? clock(spent) : ""));
       return row;
     }));
-    const costs = found.costs, spent = Object.keys(costs.spent).map(function (k) { return k + " " + clock(costs.spent[k]); });
-    $("cost").textContent = "Cost so far " + clock(costs.total) + " (" + spent.join(", ") + ")." + (costs.traced_views === null ? "" :
+    const costs = found.costs;
+    $("cost").textContent = "Cost so far " + clock(costs.total) + "." + (costs.traced_views === null ? "" :
       " Ray-traced " + costs.traced_views + " of " + costs.candidates + " candidates in " + clock(costs.tracing_seconds) + "; all would have cost " + clock(costs.tracing_all_seconds) + ".");
     showPlan(found.plan);
-    $("sphere").hidden = !found.sphere;
+    $("sphere-card").hidden = !found.sphere;
     if (found.sphere && found.sphere !== sphere) {  // else it stays as it was turned
       sphere = found.sphere;
       $("sphere").dataset.eye = found.eye.join(" ");
@@ -222,11 +259,14 @@
         request.scene = stem + file.name.slice(dot).toLowerCase();
         request.workspace = request.workspace || stem;
         $("upload").textContent = "uploading " + file.name;
-        await api.ask("/scenes/" + request.scene, { method: "PUT", body: file, headers: { "Content-Type": "application/octet-stream" } });
+        const stored = await (await api.ask("/scenes/" + request.scene, { method: "PUT", body: file, headers: { "Content-Type": "application/octet-stream" } })).json();
+        request.scene_sha256 = stored.sha256;
+        if (stored.replaced) problem(new Error("Another file named " + request.scene + " was there. Jobs that were submitted with it keep it."));
       }
       if (budget) request.settings["select.budget"] = Number(budget);
       const made = await api.post("/jobs", request);
       $("upload").textContent = "job " + made.id;
+      if (!request.scene) settled();
       select(made);
     } catch (error) { $("upload").textContent = ""; problem(error); }
   });

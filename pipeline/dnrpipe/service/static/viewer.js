@@ -7,9 +7,39 @@
   const name = new URLSearchParams(location.search).get("w") || "";
   const canvas = $("picture"), pen = canvas.getContext("2d");
   let socket = null, hello = null, camera = null, waiting = false, wanted = false, moving = false, timer = null, mode = "neural", frames = [];
+  let refused = false, tries = 0;
+  const TRIES = 8;
   $("title").textContent = name;
 
-  function problem(text) { $("problem").textContent = text; $("problem").hidden = !text; }
+  function problem(text) { $("problem-text").textContent = text; $("problem").hidden = !text; }
+  /* Nothing is tried again by itself after a refusal. */
+  function stop(text) { problem(text); $("again").hidden = false; $("status").textContent = "not connected"; }
+  $("again").addEventListener("click", function () { $("again").hidden = true; problem(""); tries = 0; start(); });
+  document.addEventListener("token-wanted", function () { $("token-form").hidden = false; $("token").focus(); });
+  $("token-form").addEventListener("submit", function (event) {
+    event.preventDefault();
+    api.setToken($("token").value.trim());
+    $("token").value = ""; $("token-form").hidden = true;
+    problem(""); $("again").hidden = true;
+    start();
+  });
+  /* Asked over HTTP first: a socket does not say why it was refused. */
+  async function start() {
+    $("status").textContent = "connecting";
+    try {
+      await api.get("/workspaces/" + encodeURIComponent(name));
+    } catch (error) {
+      if (error.status) stop(error.message); else again(error.message);
+      return;
+    }
+    connect();
+  }
+  function again(text) {
+    tries += 1;
+    if (tries > TRIES) { stop(text || "The connection was lost."); return; }
+    $("status").textContent = "not connected; trying again";
+    setTimeout(start, Math.min(30000, 1000 * Math.pow(2, tries - 1)));
+  }
   function home() {
     camera = { azimuth: -Math.PI / 3, elevation: 0.44, distance: hello.distance, target: hello.center.slice() };
     ask(false);
@@ -29,16 +59,17 @@
   }
 
   function connect() {
+    refused = false;
     socket = api.socket("/workspaces/" + encodeURIComponent(name) + "/live");
     socket.binaryType = "arraybuffer";
     socket.onmessage = function (event) {
       if (typeof event.data === "string") {
         const told = JSON.parse(event.data);
         if (told.kind === "hello") {
-          hello = told; problem(""); $("status").textContent = "loading the scene";
+          hello = told; tries = 0; problem(""); $("status").textContent = "loading the scene";
           choices();
           if (camera) ask(false); else home();
-        } else { waiting = false; problem(told.detail); $("status").textContent = ""; }
+        } else { waiting = false; refused = !hello; problem(told.detail); $("status").textContent = ""; }
         return;
       }
       waiting = false;
@@ -47,8 +78,8 @@
       if (wanted) ask(moving);
     };
     socket.onclose = function () {
-      waiting = false; $("status").textContent = "not connected; trying again";
-      setTimeout(connect, 2000);
+      waiting = false;
+      if (refused) stop($("problem-text").textContent); else again("");
     };
   }
   async function show(message) {
@@ -126,5 +157,5 @@
   });
   $("home").addEventListener("click", home);
   $("size").addEventListener("change", function () { ask(false); });
-  connect();
+  start();
 })();
