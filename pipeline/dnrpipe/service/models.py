@@ -19,7 +19,7 @@ SETTING_PATTERN = r"^[a-z0-9_]{1,40}(\.[a-z0-9_]{1,40}){0,4}$"
 
 PLAIN = {
     NAME_PATTERN: "a name has letters, digits, - and _, begins with a letter or digit, and has 64 at most",
-    SCENE_PATTERN: "a scene file's name has letters, digits, - and _, and ends in .blend, .obj, .gltf, .glb, .fbx, .ply or .stl",
+    SCENE_PATTERN: "a scene file's name has letters, digits, - and _, and ends as scene files do (.blend, .glb, ...)",
     SETTING_PATTERN: "no such setting",
 }
 """What a value that does not match a pattern is told."""
