@@ -23,6 +23,7 @@ from dnrpipe.export.browser import find_chromium, open_page
 from dnrpipe.service.live_pool import BUDGET, LEVELS, MIN_FRAMES, START, Pace
 from dnrpipe.service.models import JobRequest
 from dnrpipe.service.routes_live import unpack
+from dnrpipe.service.server import HEAD_SECONDS
 
 needs_chromium = pytest.mark.skipif(find_chromium() is None, reason="no Chromium")
 
@@ -138,6 +139,15 @@ def test_bad_requests_do_no_harm(server: Server, trained: str) -> None:
             socket.send(text)
             answer = json.loads(socket.recv(timeout=60))
             assert answer["kind"] == "problem" and answer["detail"]
+        viewer.ask()
+        assert viewer.frame()[0]["mode"] == "neural"
+
+
+def test_a_viewer_stays_connected(server: Server, trained: str) -> None:
+    """Longer than a slow sender may take: a socket is no request that does not come."""
+    with connect(server.url.replace("http", "ws") + f"/workspaces/{trained}/live", max_size=None) as socket:
+        viewer = Viewer(socket)
+        time.sleep(HEAD_SECONDS + 1)
         viewer.ask()
         assert viewer.frame()[0]["mode"] == "neural"
 
@@ -333,8 +343,14 @@ def test_the_dashboard_by_keyboard(server: Server, trained: str) -> None:
         page.keyboard.press("Tab")
         assert page.evaluate("document.activeElement.textContent") == "retry"
         page.keyboard.press("Enter")
-        wait_for(page, f"{row}.children[2].textContent === 'failed' && document.querySelector('#note').textContent")
+        deadline = time.monotonic() + 60
+        while client.job(job).starts < 2 or client.job(job).state != "failed":
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        assert sum(event.kind == "state" for event in client.events(job)) == 6  # queued, running, failed; and again
+        wait_for(page, f"{row}.children[2].textContent === 'failed'")
         wait_for(page, "document.querySelector('#note').textContent.startsWith('failed')")
+        assert page.evaluate("document.activeElement.textContent") == "retry"  # focus stayed where it was
         # A refused action says so in words, and the next refresh does not wipe it.
         page.evaluate(
             "document.querySelector('#workspace').append(new Option('a b', 'a b'));"
@@ -346,8 +362,17 @@ def test_the_dashboard_by_keyboard(server: Server, trained: str) -> None:
         assert page.evaluate("!document.querySelector('#problem').hidden")
         page.evaluate("document.querySelector('#dismiss').click()")
         assert page.evaluate("document.querySelector('#problem').hidden")
+        page.evaluate(
+            f"[...document.querySelectorAll('#workspaces button')].find(b => b.textContent === '{trained}').click()"
+        )
+        wait_for(page, f"document.querySelector('#detail-title').textContent === '{trained}'")
         spent = page.evaluate("[...document.querySelectorAll('#stages tbody tr')].map(r => r.children[3].textContent)")
-        assert spent == [""] * len(spent)
+        total = page.evaluate("document.querySelector('#cost').textContent").split()[3].rstrip(".")
+        seconds = [
+            60 * int(minutes) + int(rest)
+            for minutes, _, rest in (text.partition(":") for text in (*spent, total) if text)
+        ]
+        assert abs(sum(seconds[:-1]) - seconds[-1]) <= len(seconds)  # each is rounded
         assert errors == [] or all("422" in error for error in errors)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import json
 import os
 import re
@@ -11,6 +12,7 @@ from contextlib import ExitStack
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 import click
 
@@ -105,9 +107,14 @@ def serve(
         memory_mb=job_memory_mb or default_memory_mb(),
         disk_mb=job_disk_mb or 50 * 1024,
     )
-    url = options["public_url"]
-    if url is not None and not re.fullmatch(r"https?://[A-Za-z0-9.:\[\]-]+/?", url):
+    url, proxy = options["public_url"], options["trusted_proxy"]
+    if url is not None and not _is_address(url):
         raise UserError(f"--public-url {url}: expected an address such as https://render.example.org")
+    if proxy is not None:
+        try:
+            ipaddress.ip_address(proxy)
+        except ValueError:
+            raise UserError(f"--trusted-proxy {proxy}: expected the proxy's IP address") from None
     given = {key: value for key, value in options.items() if value is not None}
     if "rate" in given:
         given["burst"] = max(1, int(4 * given["rate"]))
@@ -117,9 +124,22 @@ def serve(
 
     def ready(address: str) -> None:
         console.say(f"serving {whole}, workers: {', '.join(chosen)}; Ctrl-C stops, jobs go on at the next start")
-        console.say(f"dashboard: {options['public_url'] or address}")
+        console.say(f"dashboard: {address}")
+        if url is not None:
+            console.say(f"for browsers: {url}")
 
     run_server(config, token, ready=ready)
+
+
+def _is_address(url: str) -> bool:
+    """Scheme, host and perhaps a port; no path."""
+    try:
+        parts = urlsplit(url)
+        return (
+            parts.scheme in ("http", "https") and bool(parts.hostname) and parts.path in ("", "/") and parts.port != 0
+        )
+    except ValueError:
+        return False
 
 
 @click.command()

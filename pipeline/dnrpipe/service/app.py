@@ -6,7 +6,6 @@ import asyncio
 import contextlib
 import logging
 from collections.abc import AsyncIterator
-from urllib.parse import urlsplit
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -58,7 +57,7 @@ def create_app(state: State, token: str | None) -> FastAPI:
     app.add_middleware(
         Guard,
         hosts=LOOPBACK if state.config.host in LOOPBACK else (),
-        public=urlsplit(state.config.public_url).netloc,
+        public=state.config.public_url,
         token=token,
         rate=state.config.rate,
         burst=state.config.burst,

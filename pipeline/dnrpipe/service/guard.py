@@ -16,6 +16,7 @@ import re
 import time
 from collections import OrderedDict
 from collections.abc import Iterable
+from typing import Any
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -74,7 +75,7 @@ class Guard:
 
     Args:
         hosts: names that the Host header may have, without port; empty: any (then there is a token).
-        public: host and port of the address that a proxy in front answers to, or "".
+        public: the address that a proxy in front answers to, or "".
         token: every request needs it, but for the open paths; None: no token.
     """
 
@@ -82,8 +83,8 @@ class Guard:
         self, app: ASGIApp, *, hosts: Iterable[str], public: str = "", token: str | None, rate: float, burst: int
     ) -> None:
         self.app = app
-        self.public = public.lower()
-        self.hosts = frozenset(hosts) | ({_name_of(self.public)} if public and hosts else set())
+        self.public = _origin(public) if public else None
+        self.hosts = frozenset(hosts) | ({self.public[1]} if self.public and hosts else set())
         self.token = token.encode() if token else None
         self.rates = Buckets(rate, burst)
         self.refusals = Buckets(REFUSALS_PER_MINUTE / 60, REFUSALS_PER_MINUTE)
@@ -133,10 +134,11 @@ class Guard:
         if self.hosts and _name_of(host) not in self.hosts:
             return refused(421, f"this server does not answer to the host name {host[:80]!r}")
         forwarded = headers.get("x-forwarded-host")  # a proxy that hides the name it was asked by
-        if forwarded is not None and forwarded.lower() not in (host.lower(), self.public):
+        if forwarded is not None and _name_of(forwarded) not in {_name_of(host), self.public and self.public[1]}:
             return refused(421, f"this server does not answer to the host name {forwarded[:80]!r} (--public-url)")
         origin = headers.get("origin")
-        if origin is not None and urlsplit(origin).netloc.lower() not in {host.lower(), self.public} - {""}:
+        own = origin is None or urlsplit(origin).netloc.lower() == host.lower()
+        if not own and (self.public is None or _origin(origin or "") != self.public):
             return refused(403, "requests of pages from other origins are refused")
         # The dashboard's files hold no data, and the dashboard asks for the token.
         is_open = scope["type"] == "http" and (scope["path"] in OPEN_PATHS or scope["path"].startswith("/static/"))
@@ -145,20 +147,21 @@ class Guard:
         wanted = None if is_open else self.token
         if wanted is not None and not hmac.compare_digest(_given_token(scope, headers), wanted):
             if self.refusals.take(client) > 0:
-                return refused(429, "too many wrong tokens; wait a minute", **{"retry-after": "60"})
+                more = {"retry-after": "60", "www-authenticate": "Bearer"}
+                return refused(429, "too many wrong tokens; wait a minute", **more)
             reason = "wrong or missing token; send it as Authorization: Bearer TOKEN"
             return refused(401, reason, **{"www-authenticate": "Bearer"})
-        wait = self.rates.take(client)
+        wait = self.rates.take(client if wanted is None else f"{client} with the token")
         if wait > 0:
             return refused(429, "too many requests; slow down", **{"retry-after": str(max(1, math.ceil(wait)))})
         length = headers.get("content-length", "0")
-        if not _is_upload(scope) and length.isascii() and length.isdigit() and int(length) > MAX_BODY:
+        if not is_upload(scope) and length.isascii() and length.isdigit() and int(length) > MAX_BODY:
             return refused(413, f"the request is larger than {MAX_BODY} bytes")
         return None
 
     def _bounded(self, scope: Scope, receive: Receive) -> Receive:
         """Cut a body without a stated length off at the same size; the route then sees a broken request."""
-        if _is_upload(scope) or scope["type"] != "http":
+        if is_upload(scope) or scope["type"] != "http":
             return receive
         seen = 0
 
@@ -171,13 +174,24 @@ class Guard:
         return receiving
 
 
+def _origin(url: str) -> tuple[str, str, int] | None:
+    """(scheme, host name, port) of an address; None: it is none."""
+    try:
+        parts = urlsplit(url.lower())
+        port = parts.port or {"http": 80, "https": 443}[parts.scheme]
+    except (KeyError, ValueError):
+        return None
+    return (parts.scheme, parts.hostname, port) if parts.hostname else None
+
+
 def _name_of(host: str) -> str:
     """``[::1]:8420`` -> ``::1``; empty where it is no host and port."""
     found = re.fullmatch(r"(?:\[([0-9a-f:]+)\]|([a-z0-9.-]+))(?::[0-9]{1,5})?", host.lower())
     return (found[1] or found[2]) if found else ""
 
 
-def _is_upload(scope: Scope) -> bool:
+def is_upload(scope: Any) -> bool:
+    """Whether a request sends a scene file."""
     return scope["type"] == "http" and scope["method"] == "PUT" and scope["path"].startswith("/scenes/")
 
 

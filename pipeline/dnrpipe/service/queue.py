@@ -253,7 +253,8 @@ class Queue:
         with self._writing() as db:  # nobody submits a job meanwhile
             found = db.execute("SELECT request FROM jobs WHERE finished IS NULL OR finished >= ?", (before,))
             requests = [JobRequest.model_validate_json(row["request"]) for row in found]
-            root.drop_uploads({request.scene_sha256 for request in requests if request.scene_sha256})
+            wanted = {request.scene_sha256 for request in requests if request.scene_sha256}
+            root.drop_uploads(wanted, (time.time() if now is None else now) - DAY)
         return pruned
 
     def _prunable_jobs(self, before: float, beyond: int, has_files: Collection[int]) -> list[list[int]]:

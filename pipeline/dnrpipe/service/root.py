@@ -19,7 +19,7 @@ from collections.abc import Collection
 from pathlib import Path
 
 from ..core.errors import UserError
-from ..core.workspace import SUFFIX, file_sha256
+from ..core.workspace import SUFFIX, Workspace, file_sha256
 from .models import NAME_PATTERN, SCENE_PATTERN
 
 
@@ -67,10 +67,10 @@ class ServiceRoot:
 
     def keep_scene(self, file: Path, name: str, sha256: str) -> bool:
         """Move a file of this content to its places. Returns whether it replaced another of that name."""
-        kept, named = self.uploads / sha256 / name, self.scene(name, must_exist=False)
+        kept, named = self._upload(sha256) / name, self.scene(name, must_exist=False)
         replaced = named.is_file() and not (kept.is_file() and kept.samefile(named)) and file_sha256(named) != sha256
-        kept.parent.mkdir(exist_ok=True)
         if not kept.is_file():
+            file.chmod(0o444)  # what was submitted stays what it was
             file.replace(kept)
         _link(kept, named)
         return replaced
@@ -84,22 +84,38 @@ class ServiceRoot:
             named = self.scene(name)
             for kept in self.uploads.glob(f"*/{name}"):
                 if kept.samefile(named):
-                    return kept.parent.name, kept
-            sha256 = file_sha256(named)  # put there by hand
-            kept = self.uploads / sha256 / name
-            kept.parent.mkdir(exist_ok=True)
-            _link(named, kept)
+                    return kept.parent.name, self._upload(kept.parent.name) / name
+            temporary = self.uploads / f".{secrets.token_hex(8)}.part"  # put there by hand
+            try:
+                shutil.copyfile(named, temporary)
+                sha256 = file_sha256(temporary)
+                self.keep_scene(temporary, name, sha256)
+            finally:
+                temporary.unlink(missing_ok=True)
         kept = self._inside(self.uploads / sha256 / name, name, SCENE_PATTERN)
         if not kept.is_file():
             raise UnknownName(f"{name}: no file of content {sha256[:12]}… was uploaded by this name; upload it again")
-        return sha256, kept
+        return sha256, self._upload(sha256) / name
 
-    def drop_uploads(self, wanted: Collection[str]) -> None:
-        """Remove uploads that no job wants, by hash, and that no scene is."""
+    def _upload(self, sha256: str) -> Path:
+        """The folder of a content, which is wanted now: `drop_uploads` leaves it for a day."""
+        folder = self.uploads / sha256
+        folder.mkdir(exist_ok=True)
+        os.utime(folder)
+        return folder
+
+    def drop_uploads(self, wanted: Collection[str], before: float) -> None:
+        """Remove uploads that no job wants and no workspace was made from, by hash, that no scene is, and that nobody
+        named since ``before``, unix seconds."""
+        made_from = set()
+        for path in self.folder.glob(f"*{SUFFIX}/manifest.json"):
+            with contextlib.suppress(UserError):
+                made_from.add(Workspace.open(path.parent).manifest.source.sha256)
         for folder in self.uploads.iterdir():
-            files = list(folder.iterdir())
-            if folder.name not in wanted and all(file.stat().st_nlink == 1 for file in files):
-                shutil.rmtree(folder, ignore_errors=True)
+            if folder.is_dir() and folder.name not in made_from | set(wanted) and folder.stat().st_mtime < before:
+                files = list(folder.iterdir())
+                if all(file.stat().st_nlink == 1 for file in files):
+                    shutil.rmtree(folder, ignore_errors=True)
 
     def result(self, name: str, file: str, problem: str) -> Path:
         """A file of a workspace. Raises UnknownName with `problem`: it is not there, or leads out of the root."""
@@ -127,8 +143,11 @@ class ServiceRoot:
 
 
 def _link(source: Path, target: Path) -> None:
-    """Make ``target`` the same file, in place of whatever was there."""
+    """Make ``target`` the same file, in place of whatever was there; a copy where it lies on another disk."""
     temporary = target.with_name(f".{secrets.token_hex(8)}.part")
-    os.link(source, temporary)
+    try:
+        os.link(source, temporary)
+    except OSError:
+        shutil.copyfile(source, temporary)
     temporary.replace(target)
     temporary.unlink(missing_ok=True)  # renaming a file to another name of itself does nothing

@@ -83,7 +83,7 @@ def list_workspaces(service: Shared) -> list[WorkspaceSummary]:
 def get_workspace(name: NamePath, service: Shared) -> WorkspaceDetail:
     """Stages, cameras, training, held-out views and costs, at most a second old. 409: a file of it is damaged."""
     service.root.workspace(name)
-    return service.details.get(name, lambda: _detail(name, service))
+    return service.details.get(name, service.queue.last_event(), lambda: _detail(name, service))
 
 
 def _detail(name: str, service: State) -> WorkspaceDetail:

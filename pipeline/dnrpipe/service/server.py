@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import logging
@@ -11,6 +12,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+import h11
 import uvicorn
 from filelock import FileLock, Timeout
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -18,14 +20,16 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from ..core.errors import UserError
 from .app import create_app
 from .config import LOOPBACK, ServerConfig
+from .guard import is_upload
 from .live_pool import LivePool
 from .queue import Queue
 from .root import ServiceRoot
 from .state import Feed, State
 from .supervisor import Supervisor
 
-HEAD_SECONDS = 20.0
-"""How long a client may take to send its first request's head."""
+HEAD_SECONDS, BODY_SECONDS = 20.0, 60.0
+"""How long a client may take to send the head of a request, and its body."""
+UPGRADED = ("upgraded", 0)
 
 
 def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], None]) -> None:
@@ -35,6 +39,8 @@ def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], Non
     """
     if config.host not in LOOPBACK and token is None:
         raise UserError(f"--host {config.host}: others can reach it, so a token is needed; give --token-file FILE")
+    if token is None and (config.public_url or config.trusted_proxy):
+        raise UserError("behind a proxy others can reach the server, so a token is needed; give --token-file FILE")
     if not config.root.parent.is_dir():
         raise UserError(f"--root {config.root}: {config.root.parent} does not exist")
     # Jobs and the dashboard see the settings of workspaces, not those of whoever starts the server.
@@ -85,19 +91,48 @@ def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], Non
 
 
 class _Patient(H11Protocol):
-    """Closes connections that do not send the head of a request in time; bodies may take as long as they do."""
+    """Closes connections whose request does not come: its head in time, and its body, uploads of scenes aside."""
+
+    _timer: asyncio.TimerHandle | None = None
+    _awaited: tuple[str, int] | None = None
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
-        self._late = self.loop.call_later(HEAD_SECONDS, self._close_late)
+        self._watch()
 
-    def _close_late(self) -> None:
-        if self.cycle is None and not self.transport.is_closing():
-            self.transport.close()
+    def data_received(self, data: bytes) -> None:
+        super().data_received(data)
+        if self._awaited != UPGRADED:
+            self._watch()
+
+    def handle_websocket_upgrade(self, event: h11.Request) -> None:
+        self._await(UPGRADED, 0.0)
+        super().handle_websocket_upgrade(event)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._late.cancel()
+        self._await(None, 0.0)
         super().connection_lost(exc)
+
+    def _watch(self) -> None:
+        """Look at what is awaited; more bytes of the same are no reason to wait longer."""
+        theirs = self.conn.their_state
+        if theirs is h11.IDLE:
+            self._await(("head", id(self.cycle)), HEAD_SECONDS)
+        elif theirs is h11.SEND_BODY and not is_upload(self.scope):
+            self._await(("body", id(self.cycle)), BODY_SECONDS)
+        else:
+            self._await(None, 0.0)
+
+    def _await(self, what: tuple[str, int] | None, seconds: float) -> None:
+        if what == self._awaited:
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+        self._awaited, self._timer = what, self.loop.call_later(seconds, self._close) if seconds else None
+
+    def _close(self) -> None:
+        if not self.transport.is_closing():
+            self.transport.close()
 
 
 class _Server(uvicorn.Server):

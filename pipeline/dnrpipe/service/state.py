@@ -56,24 +56,27 @@ class Feed:
 
 
 class Remembered:
-    """Answers that take long to make, each made by one request at a time and good for all who ask within a second."""
+    """Answers that take long to make: each made by one request at a time, and good for all who ask within a second, while
+    nothing happens."""
 
     SECONDS = 1.0
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._locks: dict[str, threading.Lock] = {}
-        self._made: dict[str, tuple[float, Any]] = {}
+        self._made: dict[str, tuple[float, int, Any]] = {}
 
-    def get(self, key: str, make: Callable[[], T]) -> T:
-        """What ``make`` returned for the key, at most a second ago. What it raises is not remembered."""
+    def get(self, key: str, version: int, make: Callable[[], T]) -> T:
+        """What ``make`` returned for the key, begun at most a second ago and with this version. What it raises is not
+        remembered."""
         with self._lock:
             lock = self._locks.setdefault(key, threading.Lock())
         with lock:
-            when, value = self._made.get(key, (-math.inf, None))
-            if time.monotonic() - when > self.SECONDS:
+            when, made_with, value = self._made.get(key, (-math.inf, version, None))
+            began = time.monotonic()
+            if began - when > self.SECONDS or made_with != version:
                 value = make()
-                self._made[key] = (time.monotonic(), value)
+                self._made[key] = (began, version, value)
             return value
 
 

@@ -14,7 +14,7 @@ const api = (function () {
       if (error.name === "AbortError") throw error;
       throw new Error("The server does not answer. Is it running, and is this machine connected?");
     }
-    if (answer.status === 401) document.dispatchEvent(new CustomEvent("token-wanted"));
+    if (answer.headers.has("www-authenticate")) document.dispatchEvent(new CustomEvent("token-wanted"));
     if (!answer.ok) {
       const body = await answer.json().catch(function () { return {}; });
       const refused = new Error(body.detail || "The server answered " + answer.status + " to " + path + ".");

@@ -13,7 +13,7 @@
   /* What an action ran into stays until the next one succeeds, or until it is dismissed. */
   function problem(error) { $("problem-text").textContent = error.message; $("problem").hidden = false; }
   function settled() { $("problem").hidden = true; }
-  $("dismiss").addEventListener("click", settled);
+  $("dismiss").addEventListener("click", function () { settled(); $("file").focus(); });
   function say(node, text) { if (node.textContent !== text) node.textContent = text; }
   function cell(text, tag) { const node = document.createElement(tag || "td"); node.textContent = text; return node; }
   function button(text, act) {
@@ -25,21 +25,22 @@
   /* Children of `parent`, one for each entry, in order: those that are there stay, so that focus does. */
   function update(parent, entries, key, make, change) {
     const known = new Map(Array.from(parent.children, function (node) { return [node.dataset.key, node]; }));
+    const names = new Set(entries.map(function (entry) { return String(key(entry)); }));
+    known.forEach(function (node, name) { if (!names.has(name)) node.remove(); });
     entries.forEach(function (entry, index) {
       const name = String(key(entry)), node = known.get(name) || make(entry);
       node.dataset.key = name;
-      known.delete(name);
       change(node, entry);
       if (parent.children[index] !== node) parent.insertBefore(node, parent.children[index] || null);
     });
-    known.forEach(function (node) { node.remove(); });
   }
 
-  document.addEventListener("token-wanted", function () { $("token-form").hidden = false; });
+  let locked = false;  // without the token nothing is asked again and again
+  document.addEventListener("token-wanted", function () { locked = true; $("token-form").hidden = false; });
   $("token-form").addEventListener("submit", function (event) {
     event.preventDefault();
     api.setToken($("token").value.trim());
-    $("token").value = ""; $("token-form").hidden = true;
+    $("token").value = ""; $("token-form").hidden = true; locked = false;
     refresh();
   });
 
@@ -73,12 +74,14 @@
       say(state, entry.state);
       state.className = "state-" + entry.state;
       if (acts.dataset.act !== act) {
+        const focused = acts.contains(document.activeElement);
         acts.dataset.act = act;
         acts.replaceChildren();
         if (act) {
           acts.append(button(act, function () { return api.post("/jobs/" + entry.id + "/" + act); }));
           acts.firstChild.setAttribute("aria-label", act + " job " + entry.id);
         }
+        if (focused) (acts.firstChild || row.children[1].firstChild).focus();
       }
       if (entry.id === job && over && !final) select(entry);  // tried again: watched again
     });
@@ -144,8 +147,8 @@
       } else if (kind === "picture" && workspace === entry.request.workspace) {
         open(workspace, data.view).catch(problem);
       } else if (kind === "state") {
+        $("note").textContent = data.state + (data.why ? ": " + data.why : "");
         if (FINAL.includes(data.state)) {
-          $("note").textContent = data.state + (data.why ? ": " + data.why : "");
           refresh();
           if (workspace === entry.request.workspace) open(workspace).catch(problem);
         }
@@ -201,10 +204,14 @@
     $("open-report").hidden = !found.report;
     $("open-report").href = "/workspaces/" + name + "/report";
     const body = $("stages").tBodies[0];
-    body.replaceChildren.apply(body, found.stages.map(function (stage) {
+    const named = found.stages.map(function (stage) { return stage.stage; });
+    const rows = found.stages.concat(Object.keys(found.costs.spent).filter(function (stage) { return !named.includes(stage); }).map(function (stage) {
+      return { stage: stage, command: stage, state: "", present: null };  // plan, render: no stages, but paid for
+    }));
+    body.replaceChildren.apply(body, rows.map(function (stage) {
       const row = document.createElement("tr");
       const spent = found.costs.spent[stage.stage];
-      row.append(cell(stage.command, "th"), cell(stage.state), cell(stage.present + " of " + stage.wanted), cell(spent ? clock(spent) : ""));
+      row.append(cell(stage.command, "th"), cell(stage.state), cell(stage.present === null ? "" : stage.present + " of " + stage.wanted), cell(spent ? clock(spent) : ""));
       return row;
     }));
     const costs = found.costs;
@@ -252,6 +259,7 @@
 
   $("submit").addEventListener("submit", async function (event) {
     event.preventDefault();
+    settled();
     try {
       const file = $("file").files[0], budget = $("budget").value, request = { command: $("command").value, workspace: $("workspace").value, settings: {} };
       if (file) {
@@ -266,11 +274,10 @@
       if (budget) request.settings["select.budget"] = Number(budget);
       const made = await api.post("/jobs", request);
       $("upload").textContent = "job " + made.id;
-      if (!request.scene) settled();
       select(made);
     } catch (error) { $("upload").textContent = ""; problem(error); }
   });
 
   refresh();
-  setInterval(function () { if (!document.hidden) refresh(); }, 3000);
+  setInterval(function () { if (!document.hidden && !locked) refresh(); }, 3000);
 })();
