@@ -56,7 +56,7 @@ class Feed:
 
 
 class Remembered:
-    """Answers that take long to make: each made by one request at a time, and good for all who ask within a second, while
+    """Answers that take long to make: each made by one request at a time, and good for all who ask within a second while
     nothing happens."""
 
     SECONDS = 1.0
