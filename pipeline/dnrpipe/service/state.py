@@ -56,8 +56,8 @@ class Feed:
 
 
 class Remembered:
-    """Answers that take long to make: each made by one request at a time, and good for all who ask within a second while
-    nothing happens."""
+    """Answers that take long to make: each is made by one request at a time, and good for all who ask within a second
+    while nothing happens."""
 
     SECONDS = 1.0
 
