@@ -27,7 +27,7 @@ system:
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt torch
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[render,train,serve,export,dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[render,train,serve,export,ray,dev]'
 	@touch $@
 
 demo: setup  ## the demo scene from .blend to report, untrained and trained; prints the report's path

@@ -154,6 +154,21 @@ class SelectSettings(Strict):
         return MOST_VIEWS if self.budget == "auto" else self.budget
 
 
+class ExecutorSettings(Strict):
+    """Where lists of tasks run; it decides nothing of what they make."""
+
+    engine: Literal["local", "ray"] = Field(
+        default="local", description="processes of this machine, or a Ray cluster (docs/scaling.md)"
+    )
+    address: str = Field(
+        default="local",
+        description="of the cluster: local (one of this machine's own), auto (the running one), or HOST:PORT",
+    )
+    shared: bool = Field(
+        default=False, description="all nodes see the workspace under the same path: nothing is sent to and fro"
+    )
+
+
 class FinetuneSettings(Strict):
     """Step 2."""
 
@@ -180,6 +195,7 @@ class Settings(Strict):
     raytrace: RaytraceSettings = RaytraceSettings()
     effects: EffectSettings = EffectSettings()
     finetune: FinetuneSettings = FinetuneSettings()
+    executor: ExecutorSettings = ExecutorSettings()
     device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="torch device")
 
     @model_validator(mode="after")

@@ -23,7 +23,8 @@ from filelock import FileLock, Timeout
 from ..core.errors import UserError
 from ..core.event_stream import VARIABLE
 from ..core.workspace import LOCK_FILES
-from ..workers.processes import TIMEOUT_VARIABLE, die_with_parent, how_ended
+from ..workers.processes import die_with_parent, how_ended
+from ..workers.task_list import TIMEOUT_VARIABLE
 from .config import ServerConfig, tightest
 from .models import Job, Limits
 from .queue import MAX_STARTS, Queue

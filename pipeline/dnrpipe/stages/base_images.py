@@ -216,6 +216,7 @@ def bake_light(run: Run, renderer: BaseRenderer) -> dict[str, Any] | None:
             log=run.log,
             console=run.console,
             environment=renderer.environment,
+            place=run.place,
         )
         bar.advance(note=f"{task['size']}² texels, {task['spp']} spp")
     if result["lost"]:

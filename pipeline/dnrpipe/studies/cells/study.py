@@ -26,7 +26,7 @@ from ...core.errors import UserError
 from ...core.settings import Settings
 from ...core.workspace import digest, locked
 from ...stages.trainer import perceptual_weights, torch_device
-from ...workers.processes import run_tasks
+from ...workers.task_list import Placement, run_tasks
 from ...workers.view_tasks import TasksFailed, warn_of_retries, worker_count
 from .cell import CELL_VERSION
 from .results import code_state, made_by
@@ -39,13 +39,14 @@ Place = TypeVar("Place")
 
 @dataclass(frozen=True)
 class WorkerPool:
-    """device: torch's. threads: of each worker, 0 = torch's own choice. log: what workers print."""
+    """device: torch's. threads: of each worker, 0 = torch's own choice. log: what workers print. place: theirs."""
 
     device: str
     threads: int
     workers: int
     log: Path
     console: Console
+    place: Placement
 
     def work(self, label: str, module: str, tasks: Iterable[PoolTask]) -> None:
         """Run the tasks whose ``output`` file is missing on workers of ``module``; of several for one file the first.
@@ -70,6 +71,7 @@ class WorkerPool:
                 log=self.log,
                 retried=lambda retry: warn_of_retries(retry.task["label"], self.console)(retry),
                 environment=threads,
+                place=self.place,
             ):
                 label_of = outcome.task["label"]
                 if outcome.result is None:
@@ -125,7 +127,8 @@ class Study(ABC, Generic[Place]):
         # Cells side by side on a thread each finish more per hour than one after the other on all cores.
         workers = self.jobs or (1 if on_gpu else cores)
         threads = 0 if on_gpu else 1 if self.SINGLE else max(1, cores // workers)
-        self.worker_pool = WorkerPool(device, threads, workers, self.out / "logs" / "cells.log", self.console)
+        place = Placement(self.base.executor, (self.out,))
+        self.worker_pool = WorkerPool(device, threads, workers, self.out / "logs" / "cells.log", self.console, place)
         self.environment = self.device, self.threads = device, threads
 
     def carry_out(self) -> dict[str, Any]:
