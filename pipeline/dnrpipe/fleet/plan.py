@@ -74,8 +74,8 @@ def read_fleet(path: Path) -> Fleet:
 
     A scene file that is missing fails when its turn comes, and stops no other.
 
-    Raises UserError: it is missing, is no such TOML, names a command or setting that does not exist, or has two scenes of
-    one name.
+    Raises UserError: it is missing, is no such TOML, names a command or setting that does not exist, or two scenes
+    of one name.
     """
     try:
         given = FleetFile.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))

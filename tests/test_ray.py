@@ -1,0 +1,211 @@
+"""Task lists on a real Ray cluster of three nodes on this machine: as on local processes, and what a cluster adds."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.service.harness import TINY
+from tests.test_executors import WORKER
+
+from dnrpipe.core.errors import UserError
+from dnrpipe.core.settings import ExecutorSettings
+from dnrpipe.workers import ray_workers
+from dnrpipe.workers.task_list import Placement, Retry, TaskResult, run_tasks
+from dnrtrain.exr import read_exr
+
+Cluster = pytest.importorskip("ray.cluster_utils", reason="the extra 'ray' is not installed").Cluster
+SCENE = Path(__file__).parents[1] / "blender_scenes" / "hard" / "emissive_only.blend"
+NODE = {"num_cpus": 1, "object_store_memory": 100 << 20}
+FILES = """
+import pathlib
+
+class Worker:
+    def __init__(self, common):
+        self.table = pathlib.Path(common["table"]).read_text()
+        self.folder = pathlib.Path(common["folder"])
+    def __call__(self, task):
+        inside = sorted(path.name for path in self.folder.iterdir())
+        output = pathlib.Path(task["output"])
+        output.parent.mkdir(parents=True, exist_ok=True)
+        output.write_text(self.table + task["word"])
+        (output.parent / "beside.txt").write_text("beside")
+        return {"inside": inside, "output": str(output), "here": str(self.folder)}
+"""
+
+
+@pytest.fixture(scope="session")
+def cluster() -> Iterator[Cluster]:
+    found = Cluster(initialize_head=True, head_node_args={**NODE, "include_dashboard": False})
+    for _ in range(2):
+        found.add_node(**NODE)
+    found.wait_for_nodes()
+    yield found
+    import ray
+
+    ray.shutdown()
+    found.shutdown()
+
+
+@pytest.fixture
+def modules(tmp_path: Path) -> Path:
+    """A folder of workers that nodes import from."""
+    folder = tmp_path / "modules"
+    folder.mkdir()
+    (folder / "fragile_worker.py").write_text(WORKER)
+    (folder / "filing_worker.py").write_text(FILES)
+    return folder
+
+
+def _run(cluster: Cluster, modules: Path, kinds: list[str], **options) -> tuple[list[TaskResult], list[Retry], Path]:
+    root = modules.parent / "root"
+    root.mkdir(exist_ok=True)
+    place = Placement(ExecutorSettings(engine="ray", address=cluster.address), (root,))
+    retries: list[Retry] = []
+    outcomes = run_tasks(
+        "fragile_worker",
+        {"folder": str(modules)},
+        [{"kind": kind, "n": n} for n, kind in enumerate(kinds)],
+        workers=2,
+        log=root / "log.txt",
+        retried=retries.append,
+        environment={"PYTHONPATH": str(modules)},
+        place=place,
+        **options,
+    )
+    return sorted(outcomes, key=lambda outcome: outcome.task["n"]), retries, root
+
+
+def test_tasks_and_deaths_as_with_local_processes(cluster: Cluster, modules: Path) -> None:
+    results, retries, root = _run(cluster, modules, ["ok", "crash-once", "sleep", "crash", "refuse", "sleep"])
+    assert [result.error for result in results[:3]] == [None] * 3 and results[5].error is None
+    assert len({result.result["pid"] for result in results if result.result}) >= 2
+    assert [results[1].attempts, results[3].attempts, results[4].attempts] == [2, 2, 1]
+    assert results[3].died and "crashed" in (results[3].error or "")
+    assert results[4].error == "bad input, said on two lines" and not results[4].died
+    assert sorted(retry.task["n"] for retry in retries) == [1, 3]
+    assert all(result.node for result in results if result.result)
+    assert "noise below Python" in (root / "log.txt").read_text()
+
+
+def test_a_task_that_hangs_is_ended(cluster: Cluster, modules: Path) -> None:
+    results, retries, _ = _run(cluster, modules, ["hang", "ok"], timeout=3.0)
+    assert results[0].error == "worker hung for 3 s" and results[0].attempts == 2
+    assert results[1].result is not None and len(retries) == 1
+
+
+def test_a_killed_node_costs_time_only(cluster: Cluster, modules: Path) -> None:
+    node = cluster.add_node(**NODE)
+    cluster.wait_for_nodes()
+    threading.Timer(4.0, lambda: cluster.remove_node(node, allow_graceful=False)).start()
+    results, retries, _ = _run(cluster, modules, ["sleep"] * 40)
+    assert [result.error for result in results] == [None] * 40
+    assert all(result.attempts == 1 for result in results)  # not the task's doing
+    assert any("is gone" in retry.reason for retry in retries)
+
+
+def test_what_a_task_reads_goes_there_and_what_it_wrote_comes_back(cluster: Cluster, modules: Path) -> None:
+    root = modules.parent / "root"
+    (root / "folder").mkdir(parents=True)
+    (root / "table.txt").write_text("table ")
+    (root / "folder" / "a.txt").write_text("a")
+    (root / "unread.txt").write_text("unread")
+    place = Placement(ExecutorSettings(engine="ray", address=cluster.address), (root,))
+    common = {"table": str(root / "table.txt"), "folder": str(root / "folder")}
+    options = {"workers": 2, "log": root / "log.txt", "environment": {"PYTHONPATH": str(modules)}, "place": place}
+    tasks = [{"word": f"word {n}", "output": str(root / f"made-{n}" / "out.txt")} for n in range(3)]
+    results = list(run_tasks("filing_worker", common, tasks, **options))
+    for result in results:
+        assert result.result is not None, result.error
+        number = result.task["word"][-1]
+        assert (root / f"made-{number}" / "out.txt").read_text() == f"table word {number}"
+        assert (root / f"made-{number}" / "beside.txt").read_text() == "beside"
+        assert result.result["inside"] == ["a.txt"]
+        assert result.result["output"] == result.task["output"]  # paths of answers are the driver's
+    sent = len(ray_workers._SENT)
+    list(run_tasks("filing_worker", common, tasks[:1], **options))
+    assert len(ray_workers._SENT) == sent  # nothing new: nothing sent again
+    (root / "folder" / "b.txt").write_text("b")
+    (again,) = run_tasks("filing_worker", common, tasks[:1], **options)
+    assert again.result is not None and again.result["inside"] == ["a.txt", "b.txt"]
+    place = Placement(ExecutorSettings(engine="ray", address=cluster.address, shared=True), (root,))
+    (shared,) = run_tasks("filing_worker", common, tasks[:1], **{**options, "place": place})
+    assert shared.result is not None and shared.result["here"] == str(root / "folder")
+
+
+def test_many_tiny_tasks(cluster: Cluster, modules: Path) -> None:
+    started = time.monotonic()
+    results, _, _ = _run(cluster, modules, ["ok"] * 1000)
+    assert len(results) == 1000 and all(result.error is None for result in results)
+    assert time.monotonic() - started < 60
+
+
+def test_closing_the_iterator_ends_the_actors(cluster: Cluster, modules: Path) -> None:
+    import ray
+
+    place = Placement(ExecutorSettings(engine="ray", address=cluster.address), (modules,))
+    tasks = [{"kind": "ok", "n": 0}, {"kind": "hang", "n": 1}]
+    environment = {"PYTHONPATH": str(modules)}
+    outcomes = run_tasks(
+        "fragile_worker", {}, tasks, workers=2, log=modules / "log.txt", environment=environment, place=place
+    )
+    assert next(outcomes).result is not None
+    outcomes.close()
+    until = time.monotonic() + 20
+    while ray.available_resources().get("CPU", 0) < 3:
+        assert time.monotonic() < until, ray.available_resources()
+        time.sleep(0.1)
+
+
+@pytest.mark.slow
+def test_a_run_gives_the_same_pictures_selection_and_weights(cluster: Cluster, tmp_path: Path) -> None:
+    """The whole pipeline, here and on the cluster; its nodes see no workspace but what is sent to them."""
+    made = {}
+    for engine in ("local", "ray"):
+        root = tmp_path / engine / "scene.dnr"
+        root.parent.mkdir()
+        words = [str(SCENE), "-w", str(root), "-q", "--executor", engine]
+        words += ["--address", cluster.address] if engine == "ray" else []
+        words += [f"--set={key}={json.dumps(value)}" for key, value in TINY.items()]
+        done = subprocess.run(
+            [sys.executable, "-m", "dnrpipe.cli", "run", *words], capture_output=True, text=True, env=os.environ
+        )
+        assert done.returncode == 0, done.stderr
+        made[engine] = root
+    here, there = made["local"], made["ray"]
+    pictures = sorted(path.relative_to(here) for path in here.rglob("*.exr"))
+    assert len(pictures) > 10
+    for picture in pictures:
+        channels = read_exr(here / picture)[0], read_exr(there / picture)[0]
+        for name, values in channels[0].items():
+            np.testing.assert_array_equal(values, channels[1][name], err_msg=f"{picture} {name}")
+    assert (here / "selection.json").read_text() == (there / "selection.json").read_text()
+    weights = [(root / "checkpoints" / "step2" / "model.safetensors").read_bytes() for root in (here, there)]
+    assert weights[0] == weights[1]
+    ledger = [json.loads(line) for line in (there / "costs.jsonl").read_text().splitlines()]
+    assert any("node" in record.get("detail", {}) for record in ledger)
+
+
+def test_without_ray_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(UserError, match=r"pip install 'dnrpipe\[ray\]'"):
+        ray_workers.connect(ExecutorSettings(engine="ray"))
+
+
+def test_a_node_with_other_packages_is_refused(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    executor = ExecutorSettings(engine="ray", address=cluster.address)
+    ray_workers.connect(executor)
+    found = ray_workers.installed() | {"mitsuba": "0.0.1"}
+    answers = iter([found])
+    original = ray_workers.installed
+    monkeypatch.setattr(ray_workers, "installed", lambda: next(answers, None) or original())
+    with pytest.raises(UserError, match=r"node \S+ has mitsuba .* \(here 0\.0\.1\)"):
+        ray_workers.refuse_other_versions(executor)
