@@ -115,7 +115,7 @@ def test_a_broken_scene_stops_no_other_and_a_second_run_goes_on(tmp_path: Path) 
     assert second.returncode == 1, errors
     rows = {row["name"]: row for row in json.loads(out)["rows"]}
     assert [rows[name]["state"] for name in ("broken", "missing", "good")] == ["failed", "failed", "done"]
-    assert "could not open it" in rows["broken"]["error"] and "missing.blend" in rows["missing"]["error"]
+    assert "damaged or truncated" in rows["broken"]["error"] and "missing.blend" in rows["missing"]["error"]
     assert errors.splitlines()[-1].startswith("dnrpipe: error: batch: broken, missing failed")
     assert rows["good"]["psnr"] > 10
     folder = tmp_path / "fleet"

@@ -9,9 +9,6 @@ import click
 
 from .options import EXECUTOR_OPTIONS, OUTPUT_OPTIONS, executor_assignments, options
 
-FAILED = 1
-"""Exit code where a scene failed."""
-
 
 @click.command()
 @click.argument("fleet", type=click.Path(path_type=Path))
@@ -39,6 +36,7 @@ def batch(fleet: Path, jobs: int | None, resume: bool, as_json: bool, quiet: boo
     from ..fleet.page import table, told
     from ..fleet.plan import read_fleet
     from ..fleet.run import run_fleet
+    from ..workers.view_tasks import TasksFailed
 
     console = Console(json_mode=as_json, quiet=quiet)
     plan = read_fleet(fleet)
@@ -50,5 +48,4 @@ def batch(fleet: Path, jobs: int | None, resume: bool, as_json: bool, quiet: boo
     console.result(summary.model_dump(mode="json"))
     if summary.failed:
         names = ", ".join(row.name for row in summary.failed)
-        click.echo(f"dnrpipe: error: batch: {names} failed; see {plan.out / 'logs'}", err=True)
-        raise click.exceptions.Exit(FAILED)
+        raise TasksFailed(f"batch: {names} failed; see {plan.out / 'logs'}")
