@@ -23,7 +23,30 @@ from dnrpipe.workers.task_list import Placement, Retry, TaskResult, run_tasks
 from dnrtrain.exr import read_exr
 
 Cluster = pytest.importorskip("ray.cluster_utils", reason="the extra 'ray' is not installed").Cluster
-SCENE = Path(__file__).parents[1] / "blender_scenes" / "hard" / "emissive_only.blend"
+BUILD = """
+import sys
+import bpy
+
+bpy.ops.wm.read_factory_settings(use_empty=True)
+image = bpy.data.images.new("squares", 8, 8)
+image.pixels = [float(i % 8 > 3) for i in range(256)]
+image.filepath_raw, image.file_format = sys.argv[1] + "/textures/squares.png", "PNG"
+image.save()
+for number, kind in enumerate(("TexNoise", "TexImage")):  # one value to bake, one file beside the scene
+    bpy.ops.mesh.primitive_uv_sphere_add(location=(1.2 * number, 0, 0), segments=12, ring_count=6)
+    material = bpy.data.materials.new(kind)
+    material.use_nodes = True
+    texture = material.node_tree.nodes.new("ShaderNode" + kind)
+    if kind == "TexImage":
+        texture.image = image
+    surface = material.node_tree.nodes["Principled BSDF"].inputs["Base Color"]
+    material.node_tree.links.new(texture.outputs["Color"], surface)
+    bpy.context.object.data.materials.append(material)
+bpy.ops.object.light_add(type="POINT", location=(2, -3, 4))
+bpy.context.object.data.energy = 500
+bpy.ops.wm.save_as_mainfile(filepath=sys.argv[1] + "/scene.blend", relative_remap=True)
+"""
+"""Writes a scene, and a picture that it refers to."""
 NODE = {"num_cpus": 1, "object_store_memory": 100 << 20}
 FILES = """
 import pathlib
@@ -168,21 +191,25 @@ def test_closing_the_iterator_ends_the_actors(cluster: Cluster, modules: Path) -
 @pytest.mark.slow
 def test_a_run_gives_the_same_pictures_selection_and_weights(cluster: Cluster, tmp_path: Path) -> None:
     """The whole pipeline, here and on the cluster; its nodes see no workspace but what is sent to them."""
+    (tmp_path / "textures").mkdir()
+    subprocess.run([sys.executable, "-c", BUILD, str(tmp_path)], check=True, capture_output=True)
     made = {}
     for engine in ("local", "ray"):
         root = tmp_path / engine / "scene.dnr"
         root.parent.mkdir()
-        words = [str(SCENE), "-w", str(root), "-q", "--executor", engine]
+        words = [str(tmp_path / "scene.blend"), "-w", str(root), "-q", "--executor", engine]
         words += ["--address", cluster.address] if engine == "ray" else []
         words += [f"--set={key}={json.dumps(value)}" for key, value in TINY.items()]
         done = subprocess.run(
             [sys.executable, "-m", "dnrpipe.cli", "run", *words], capture_output=True, text=True, env=os.environ
         )
-        assert done.returncode == 0, done.stderr
+        assert done.returncode == 0 and "baked here" not in done.stderr, done.stderr
         made[engine] = root
     here, there = made["local"], made["ray"]
     pictures = sorted(path.relative_to(here) for path in here.rglob("*.exr"))
     assert len(pictures) > 10
+    baked = [{path.name: path.read_bytes() for path in (root / "bakes").glob("*.npy")} for root in (here, there)]
+    assert baked[0] and baked[0] == baked[1]
     for picture in pictures:
         channels = read_exr(here / picture)[0], read_exr(there / picture)[0]
         for name, values in channels[0].items():

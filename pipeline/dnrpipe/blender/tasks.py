@@ -59,10 +59,14 @@ class MaterialTaps(Task):
 
 
 class PendingBakes(Task):
-    """What has to be baked before a scene can be exported. layers: of one bake each. frame: the scene's current one."""
+    """What has to be baked before a scene can be exported.
+
+    layers: of one bake each. frame: the scene's current one. external: other files that the scene file refers to.
+    """
 
     layers: tuple[tuple[MaterialTaps, ...], ...]
     frame: int
+    external: tuple[Path, ...] = ()
 
 
 class PrepareAnswer(Task):
@@ -97,9 +101,11 @@ class BakeCommon(Task):
         folder: for results: ``KEY.npy``, float16 or float32 [N, C], a row per texel of the material's region.
         size: texels of the atlas' side.
         threads: of Cycles; 0 for all cores.
+        external: other files that the scene file refers to.
     """
 
     source: Path
+    external: tuple[Path, ...] = ()
     frame: int
     geometry: Path
     folder: Path

@@ -41,6 +41,11 @@ def batch(fleet: Path, jobs: int | None, resume: bool, as_json: bool, quiet: boo
     console = Console(json_mode=as_json, quiet=quiet)
     plan = read_fleet(fleet)
     on_ray = more["executor"] == "ray"
+    if on_ray:  # one cluster for all commands
+        from ..core.settings import ExecutorSettings
+        from ..workers.ray_workers import address_of
+
+        more["address"] = address_of(ExecutorSettings(engine="ray", address=more["address"] or "local"))
     flags = [word for setting in executor_assignments(more) for word in ("--set", setting)]
     summary = run_fleet(plan, jobs=jobs or (8 if on_ray else 1), more=flags, force=not resume, console=console)
     console.say(table(summary))

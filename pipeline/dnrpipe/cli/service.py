@@ -16,6 +16,7 @@ import click
 
 from ..core.console import Bar, Console
 from ..core.errors import UserError
+from .options import EXECUTOR_OPTIONS, executor_assignments
 from .options import options as with_options
 
 if TYPE_CHECKING:
@@ -59,6 +60,7 @@ def _client(server: str | None, token_file: Path | None) -> Client:
 @click.option("--job-disk-mb", type=click.IntRange(1), metavar="N", help="Of a job's workspace (default 51200).")
 @click.option("--keep-days", type=float, metavar="D", help="Logs and events of ended jobs (default 30 days).")
 @click.option("--keep-jobs", type=click.IntRange(1), metavar="N", help="Those of the last N ended jobs (default 1000).")
+@with_options(EXECUTOR_OPTIONS)
 def serve(
     host: str,
     port: int,
@@ -103,10 +105,13 @@ def serve(
         memory_mb=job_memory_mb or default_memory_mb(),
         disk_mb=job_disk_mb or 50 * 1024,
     )
+    if options["executor"] == "ray" and (options["address"] or "local") == "local":
+        raise UserError("--executor ray: name the cluster that all jobs share: --address auto, or HOST:PORT")
+    executor = tuple(executor_assignments(options))
     given = {key: value for key, value in options.items() if value is not None}
     if "rate" in given:
         given["burst"] = max(1, int(4 * given["rate"]))
-    config = ServerConfig(root=root, host=host, port=port, devices=chosen, limits=limits, **given)
+    config = ServerConfig(root=root, host=host, port=port, devices=chosen, limits=limits, executor=executor, **given)
     console = Console()
     console.say(f"serving {root.resolve()}, workers: {', '.join(chosen)}; Ctrl-C stops, jobs go on at the next start")
     run_server(config, token, ready=lambda address: console.say(f"dashboard: {address}"))

@@ -69,7 +69,7 @@ class Worker:
 
     def _run_job(self, job: Job) -> None:
         workspace = self.root.workspace(job.request.workspace, must_exist=False)
-        command = job_command(job, self.root)
+        command = job_command(job, self.root, self.config.executor)
         if workspace.is_dir():  # if somebody else holds it, the command says so
             with contextlib.suppress(Timeout), FileLock(workspace / LOCK_FILES[0], timeout=UNLOCK_SECONDS):
                 pass
@@ -163,7 +163,7 @@ class EventReader:
         return found
 
 
-def job_command(job: Job, root: ServiceRoot) -> list[str]:
+def job_command(job: Job, root: ServiceRoot, executor: tuple[str, ...] = ()) -> list[str]:
     """The command line of a job. Only the first start gets `--force`; later ones resume."""
     request = job.request
     workspace = root.workspace(request.workspace, must_exist=False)
@@ -175,6 +175,8 @@ def job_command(job: Job, root: ServiceRoot) -> list[str]:
         command += ["--preset", request.preset]
     for key, value in request.settings.items():
         command += ["--set", f"{key}={value if isinstance(value, str) else json.dumps(value)}"]
+    for setting in executor:  # the operator's word, after the job's
+        command += ["--set", setting]
     if request.force and job.starts == 1:
         command.append("--force")
     return command

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -40,7 +41,7 @@ from ..core.scene_records import Conversion, RasterChoice, SceneSummary
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest, file_sha256
 from ..effects.store import keep_plan
-from ..workers.task_list import Retry, run_tasks
+from ..workers.task_list import HERE, Placement, Retry, run_tasks
 from ..workers.view_tasks import warn_of_repairs, warn_of_retries, worker_count
 from .base_images import RENDERED
 from .stage import Outcome, Run
@@ -267,6 +268,7 @@ def bake(run: Run, source: Path, geometry: Path, pending: PendingBakes) -> list[
     folder.mkdir(parents=True, exist_ok=True)
     common = BakeCommon(
         source=source,
+        external=pending.external,
         frame=pending.frame,
         geometry=geometry,
         folder=folder,
@@ -283,6 +285,7 @@ def bake(run: Run, source: Path, geometry: Path, pending: PendingBakes) -> list[
             workers=count,
             log=run.log,
             retried=warn_of_retries("bake", console),
+            place=_place_of_bakes(run, source, pending.external),
         ):
             if outcome.result is None:
                 layer = BakeTask.model_validate(outcome.task).layer
@@ -296,6 +299,18 @@ def bake(run: Run, source: Path, geometry: Path, pending: PendingBakes) -> list[
                     )
             bar.advance()
     return refused
+
+
+def _place_of_bakes(run: Run, source: Path, external: Sequence[Path]) -> Placement:
+    """Where textures are baked: here where the scene refers to files by paths that a node would not find them at."""
+    place = run.place
+    if place.is_local or place.executor.shared:
+        return place
+    elsewhere = [path for path in external if not path.resolve().is_relative_to(source.resolve().parent)]
+    if elsewhere:
+        run.console.warn(f"bakes: {elsewhere[0]} is not below the scene file's folder; textures are baked here")
+        return HERE
+    return replace(place, roots=(*place.roots, source, *external))
 
 
 def _refuse_if_strict(source: Path, scene_dir: Path, settings: Settings) -> None:

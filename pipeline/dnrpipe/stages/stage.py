@@ -57,8 +57,12 @@ class Run:
 
     @property
     def place(self) -> Placement:
-        """Where task lists run. Workers read and write in the workspace."""
-        return Placement(self.settings.executor, (self.workspace.root,))
+        """Where task lists run. Workers read and write in the workspace; what they took of memory the ledger knows."""
+        executor, root = self.settings.executor, self.workspace.root
+        if executor.engine == "local":
+            return Placement(executor, (root,))
+        peaks = [record.peak_mb for record in self.workspace.ledger.read() if record.stage == self.stage]
+        return Placement(executor, (root,), max((peak for peak in peaks if peak), default=None))
 
     @property
     def log(self) -> Path:

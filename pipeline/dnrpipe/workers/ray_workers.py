@@ -64,7 +64,11 @@ def ray_workers(
 
     cores = os.cpu_count() or 1
     on_gpu = GPU_VARIANT in str(common.get("variant", "")) or GPU_VARIANT in str(common.get("device", ""))
-    resources = {"num_cpus": max(1, cores // max(1, side_by_side)), "num_gpus": 1 if on_gpu else 0}
+    resources: dict[str, float] = {
+        "num_cpus": max(1, cores // max(1, side_by_side)),
+        "num_gpus": 1 if on_gpu else 0,
+        "memory": int((place.memory_mb or 0) * 2**20),
+    }
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     biggest = max((node.get("CPU", 0) for node in nodes), default=0)
     resources["num_cpus"] = max(1, min(resources["num_cpus"], int(biggest)))
@@ -106,6 +110,15 @@ def connect(executor: ExecutorSettings) -> None:
     refuse_other_versions(executor)
 
 
+def address_of(executor: ExecutorSettings) -> str:
+    """HOST:PORT of the cluster that the settings name, for other processes to join; with ``local`` it lives as long as
+    this one. Raises UserError: see `ray_workers`."""
+    connect(executor)
+    import ray
+
+    return ray.get_runtime_context().gcs_address
+
+
 def refuse_other_versions(executor: ExecutorSettings) -> None:
     """Raises UserError: a node has other packages than this machine, which would give other pictures."""
     import ray
@@ -115,7 +128,7 @@ def refuse_other_versions(executor: ExecutorSettings) -> None:
     here = installed()
     for node in [node for node in ray.nodes() if node["Alive"]]:
         strategy = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
-        there = ray.get(ask.options(scheduling_strategy=strategy).remote(), timeout=STATE_WAIT)
+        there: Any = ray.get(ask.options(scheduling_strategy=strategy).remote(), timeout=STATE_WAIT)
         other = [f"{name} {there.get(name)} (here {here[name]})" for name in here if here[name] != there.get(name)]
         if other:
             name = node["NodeManagerHostname"]
@@ -174,7 +187,7 @@ class RayWorker:
         if not ray.wait([self._started], timeout=READY_POLL)[0] or self._closed:
             return False
         try:
-            self._node = ray.get(self._started)
+            self._node = str(ray.get(self._started))
         except ray.exceptions.RayError:
             self.close()  # its node went before it began: ask for another
             return False
@@ -189,7 +202,7 @@ class RayWorker:
         sent = [(pack, [reference(pack)]) for pack in packs]  # in a list: fetched by the node that lacks it
         call = self._actor.answer.remote(task, sent)
         try:
-            reply = ray.get(call, timeout=timeout)
+            reply: Any = ray.get(call, timeout=timeout)
         except ray.exceptions.GetTimeoutError:
             self.close()
             raise WorkerDied(f"worker hung for {timeout:.0f} s{why}") from None

@@ -101,10 +101,12 @@ class Placement:
     Args:
         executor: this machine's processes, or a Ray cluster.
         roots: files and folders that workers may read and write; what else tasks name stays as it is.
+        memory_mb: what a worker takes, as far as it is known; a cluster puts no more on a node than it has.
     """
 
     executor: ExecutorSettings = field(default_factory=ExecutorSettings)
     roots: tuple[Path, ...] = ()
+    memory_mb: float | None = None
 
     @property
     def is_local(self) -> bool:
