@@ -61,7 +61,8 @@ class Run:
         executor, root = self.settings.executor, self.workspace.root
         if executor.engine == "local":
             return Placement(executor, (root,))
-        peaks = [record.peak_mb for record in self.workspace.ledger.read() if record.stage == self.stage]
+        records = self.workspace.ledger.read()
+        peaks = [record.peak_mb for record in records if record.stage == self.stage and record.unit == "view"]
         return Placement(executor, (root,), max((peak for peak in peaks if peak), default=None))
 
     @property

@@ -63,7 +63,10 @@ def ray_workers(
     import ray
 
     cores = os.cpu_count() or 1
-    on_gpu = GPU_VARIANT in str(common.get("variant", "")) or GPU_VARIANT in str(common.get("device", ""))
+    device = str(common.get("device", ""))
+    on_gpu = GPU_VARIANT in str(common.get("variant", "")) or GPU_VARIANT in device
+    if device == "auto":
+        on_gpu = any(node["Resources"].get("GPU", 0) for node in ray.nodes() if node["Alive"])
     resources: dict[str, float] = {
         "num_cpus": max(1, cores // max(1, side_by_side)),
         "num_gpus": 1 if on_gpu else 0,
@@ -218,7 +221,7 @@ class RayWorker:
             self.log.parent.mkdir(parents=True, exist_ok=True)
             with self.log.open("a") as sink:
                 sink.write(reply["log"])
-        receive(reply["files"], self.place.roots)
+        receive(reply["written"], reply["removed"], self.place.roots)
         return {**reply["answer"], "node": self._node.partition(" ")[0]}
 
     def kill(self) -> None:
@@ -315,18 +318,19 @@ class RemoteWorker:
         return f"{socket.gethostname()} {ray.get_runtime_context().get_node_id()}"
 
     def answer(self, task: dict[str, Any], sent: list[tuple[Pack, list[Any]]]) -> dict[str, Any]:
-        """-> the worker's answer, the files that it wrote, and what it printed."""
+        """-> the worker's answer, the files that it wrote and removed, and what it printed."""
         import ray
 
         if self.mirror is None:
-            return {"answer": self.answerer(task), "files": {}, "log": self._printed()}
+            return {"answer": self.answerer(task), "written": {}, "removed": [], "log": self._printed()}
         for pack, (content,) in sent:
             self.mirror.place(pack, lambda content=content: ray.get(content))
         before = self.mirror.state()
         answer = self.answerer(self._there(task))
-        files = self.mirror.written(before)
+        written, removed = self.mirror.changes(before)
         root = str(self.mirror.root)
-        return {"answer": moved(answer, lambda text: text.replace(root, "")), "files": files, "log": self._printed()}
+        answer = moved(answer, lambda text: text.replace(root, ""))
+        return {"answer": answer, "written": written, "removed": removed, "log": self._printed()}
 
     def _there(self, values: Any) -> Any:
         """With the driver's paths as they are here."""

@@ -29,8 +29,8 @@ from dnrtrain.atomic import atomic_path
 
 from ..core.workspace import file_sha256
 
-LEFT_BEHIND = ("logs", "checkpoints", "preview", "renders")
-"""Folders of a workspace that no task on a list reads."""
+LEFT_BEHIND = ("logs", "preview", "renders", "report", "evaluation")
+"""Folders of a workspace that no task reads."""
 
 
 @dataclass(frozen=True)
@@ -193,15 +193,17 @@ class Mirror:
                 found[str(path)[len(str(self.root)) :]] = (stat.st_ino, stat.st_mtime_ns, stat.st_size)
         return found
 
-    def written(self, before: dict[str, tuple[int, int, int]]) -> dict[str, bytes]:
-        """What a task wrote since ``before``, by the driver's path; it does not stay here."""
-        found = {}
-        for path, state in self.state().items():
+    def changes(self, before: dict[str, tuple[int, int, int]]) -> tuple[dict[str, bytes], list[str]]:
+        """(what a task wrote since ``before``, what it removed), by the driver's paths; neither stays here."""
+        written, after = {}, self.state()
+        for path, state in after.items():
             if before.get(path) != state and not Path(path).name.startswith("."):
-                found[path] = self.here(path).read_bytes()
+                written[path] = self.here(path).read_bytes()
                 self.here(path).unlink()
-                self._forget(path)
-        return found
+        removed = [path for path in before if path not in after]
+        for path in (*written, *removed):
+            self._forget(path)
+        return written, removed
 
     def _forget(self, path: str) -> None:
         """What was placed there, or around it, is no longer what its digest says."""
@@ -219,10 +221,16 @@ def _link(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
-def receive(files: dict[str, bytes], roots: Sequence[Path]) -> None:
-    """Write what came back, each file whole or not at all. Raises ValueError: outside of the roots."""
-    for path, content in files.items():
+def receive(written: dict[str, bytes], removed: Sequence[str], roots: Sequence[Path]) -> None:
+    """Write what came back, each file whole or not at all, and remove what was removed there.
+
+    Raises ValueError: outside of the roots.
+    """
+    for path in (*written, *removed):
         if not under(path, roots):
-            raise ValueError(f"{path}: a worker wrote outside of what it was given")
+            raise ValueError(f"{path}: a worker changed what it was not given")
+    for path, content in written.items():
         with atomic_path(path) as temporary:
             temporary.write_bytes(content)
+    for path in removed:
+        Path(path).unlink(missing_ok=True)
