@@ -1,0 +1,135 @@
+"""What a Ray cluster costs and brings on this machine: overhead per task, tiny tasks, tracing on one node and on two.
+
+python -m tools.bench_ray WORKSPACE.dnr [--out docs/results/scaling.json]
+
+WORKSPACE: prepared, its views selected; they are traced anew in copies. Nodes have one processor each.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from dnrpipe.core.settings import ExecutorSettings
+from dnrpipe.studies.cells.results import made_by
+from dnrpipe.workers.task_list import Placement, run_tasks
+from dnrtrain.atomic import write_json
+
+OUT = Path(__file__).resolve().parents[1] / "docs" / "results" / "scaling.json"
+NODE: dict[str, Any] = {"num_cpus": 1, "object_store_memory": 200 << 20}
+SECONDS, LONG, TINY = 1.0, 40, 10_000
+WORKER = """
+import time
+
+class Worker:
+    def __init__(self, common):
+        pass
+    def __call__(self, task):
+        time.sleep(task["seconds"])
+        return {}
+"""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("workspace", type=Path)
+    parser.add_argument("--out", type=Path, default=OUT)
+    options = parser.parse_args()
+    found: dict[str, Any] = {**made_by(), "tasks": [], "tracing": []}
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "sleeping_worker.py").write_text(WORKER)
+        from ray.cluster_utils import Cluster
+
+        cluster = Cluster(initialize_head=True, head_node_args={**NODE, "include_dashboard": False})
+        for nodes in (1, 2):
+            if nodes == 2:
+                cluster.add_node(**NODE)
+                cluster.wait_for_nodes()
+            for name, place in (("local", Placement()), ("ray", _ray(cluster, Path(folder)))):
+                found["tracing"].append(_traced(options.workspace.resolve(), Path(folder), name, nodes, place))
+                if nodes == 2:
+                    for count, seconds in ((LONG, SECONDS), (TINY, 0.0)):
+                        found["tasks"].append(_slept(Path(folder), name, count, seconds, place))
+                print(json.dumps({key: found[key][-1:] for key in ("tracing", "tasks")}), flush=True)
+                write_json(options.out, found)
+        cluster.shutdown()
+    print(markdown(found))
+
+
+def _ray(cluster: Any, *roots: Path) -> Placement:
+    return Placement(ExecutorSettings(engine="ray", address=cluster.address), roots)
+
+
+def _slept(folder: Path, engine: str, count: int, seconds: float, place: Placement) -> dict[str, Any]:
+    """Tasks that sleep, on two workers."""
+    environment = {"PYTHONPATH": f"{folder}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"}
+    options: dict[str, Any] = {"workers": 2, "log": folder / "log.txt", "environment": environment, "place": place}
+    warm = list(run_tasks("sleeping_worker", {}, [{"seconds": 0.0, "n": n} for n in range(2)], **options))
+    assert all(outcome.error is None for outcome in warm), warm
+    tasks = [{"seconds": seconds, "n": n} for n in range(count)]
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    started = first = time.perf_counter()
+    for number, outcome in enumerate(run_tasks("sleeping_worker", {}, tasks, **options)):
+        assert outcome.error is None, outcome.error
+        if number == 1:
+            first = time.perf_counter()
+    ended = time.perf_counter()
+    return {
+        "engine": engine,
+        "tasks": count,
+        "task_seconds": seconds,
+        "start_seconds": round(first - started - seconds, 3),
+        "seconds": round(ended - first, 3),
+        "per_task_ms": round(1000 * (2 * (ended - first) / (count - 2) - seconds), 3),
+        "driver_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+        "driver_mb_before": round(before / 1024, 1),
+    }
+
+
+def _traced(workspace: Path, folder: Path, engine: str, workers: int, place: Placement) -> dict[str, Any]:
+    """All selected views of a copy of the workspace, traced by `dnrpipe raytrace-selected`."""
+    import subprocess
+
+    copy = folder / f"{engine}-{workers}.dnr"
+    shutil.copytree(workspace, copy)
+    words = ["raytrace-selected", "--force", "-w", str(copy), "-q", "--set", f"raytrace.workers={workers}"]
+    words += [] if place.is_local else ["--executor", "ray", "--address", place.executor.address]
+    started = time.perf_counter()
+    subprocess.run([sys.executable, "-m", "dnrpipe.cli", *words], check=True)
+    seconds = time.perf_counter() - started
+    views = len(list((copy / "raytraced" / "train").glob("*.exr")))
+    shutil.rmtree(copy)
+    return {"engine": engine, "workers": workers, "views": views, "seconds": round(seconds, 2)}
+
+
+def markdown(found: dict[str, Any]) -> str:
+    """Two tables."""
+    machine = found["machine"]
+    lines = [
+        f"{machine['processor']}, {machine['cores']} cores, {found['date'][:10]}, commit {found['commit'][:12]}.",
+        "",
+        "| engine | tasks | of seconds each | first answers after | the rest | a task, above its own time | driver's memory |",
+        "| --- | ---: | ---: | ---: | ---: | ---: | ---: |",
+    ]
+    for row in found["tasks"]:
+        lines.append(
+            f"| {row['engine']} | {row['tasks']:,} | {row['task_seconds']:g} | {row['start_seconds']:.1f} s"
+            f" | {row['seconds']:.1f} s | {row['per_task_ms']:.1f} ms"
+            f" | {row['driver_mb_before']:.0f} → {row['driver_mb']:.0f} MiB |"
+        )
+    lines += ["", "| engine | workers | views | seconds in all |", "| --- | ---: | ---: | ---: |"]
+    for row in sorted(found["tracing"], key=lambda row: (row["engine"], row["workers"])):
+        lines.append(f"| {row['engine']} | {row['workers']} | {row['views']} | {row['seconds']:.1f} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
