@@ -94,6 +94,13 @@ def _batch(fleet: Path, *more: str) -> subprocess.Popen[str]:
     )
 
 
+def test_a_forecast_wants_something_to_go_by(tmp_path: Path) -> None:
+    (tmp_path / "a.blend").touch()
+    process = _batch(_file(tmp_path, 'scenes = ["a.blend"]'), "--forecast", "1,8")
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 2 and "no scene of" in errors and "is done yet" in errors
+
+
 @pytest.mark.slow
 def test_a_broken_scene_stops_no_other_and_a_second_run_goes_on(tmp_path: Path) -> None:
     (tmp_path / "broken.blend").write_bytes(b"BLENDER-v300 and then nothing")
@@ -122,3 +129,22 @@ def test_a_broken_scene_stops_no_other_and_a_second_run_goes_on(tmp_path: Path) 
     assert (folder / rows["good"]["report"]).is_file() and (folder / rows["good"]["log"]).is_file()
     assert rows["good"]["report"] in (folder / "index.html").read_text()
     assert json.loads((folder / "fleet.json").read_text())["rows"] == json.loads(out)["rows"]
+    forecast = _batch(fleet, "--forecast", "1,8")
+    told, errors = forecast.communicate(timeout=30)
+    seconds = json.loads(told)["seconds"]
+    assert forecast.returncode == 0 and 0 < seconds["8"] <= seconds["1"], errors
+
+
+@pytest.mark.robustness
+def test_ten_scenes_and_a_broken_one_run_unattended(tmp_path: Path) -> None:
+    scenes = sorted(SCENES.glob("*.blend"))
+    assert len(scenes) == 11  # the ten and the demo
+    (tmp_path / "broken.blend").write_bytes(b"no scene at all")
+    settings = "\n".join(f"{key} = {json.dumps(value)}" for key, value in TINY.items())
+    listed = json.dumps(["broken.blend", *map(str, scenes)])
+    process = _batch(_file(tmp_path, f"scenes = {listed}\n[settings]\n{settings}\n"), "--jobs", "2")
+    out, errors = process.communicate(timeout=1800)
+    assert process.returncode == 1, errors
+    states = {row["name"]: row["state"] for row in json.loads(out)["rows"]}
+    assert [name for name, state in states.items() if state != "done"] == ["broken"]
+    assert "batch: broken failed" in errors

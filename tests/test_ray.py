@@ -47,6 +47,7 @@ bpy.context.object.data.energy = 500
 bpy.ops.wm.save_as_mainfile(filepath=sys.argv[1] + "/scene.blend", relative_remap=True)
 """
 """Writes a scene, and a picture that it refers to."""
+SCENES = Path(__file__).parents[1] / "blender_scenes" / "hard"
 NODE = {"num_cpus": 1, "object_store_memory": 100 << 20}
 FILES = """
 import pathlib
@@ -188,6 +189,19 @@ def test_closing_the_iterator_ends_the_actors(cluster: Cluster, modules: Path) -
         time.sleep(0.1)
 
 
+def _require_the_same(here: Path, there: Path) -> None:
+    """Pictures, selection and weights of two workspaces."""
+    pictures = sorted(path.relative_to(here) for path in here.rglob("*.exr"))
+    assert len(pictures) > 10
+    for picture in pictures:
+        channels = read_exr(here / picture)[0], read_exr(there / picture)[0]
+        for name, values in channels[0].items():
+            np.testing.assert_array_equal(values, channels[1][name], err_msg=f"{picture} {name}")
+    assert (here / "selection.json").read_text() == (there / "selection.json").read_text()
+    weights = [(root / "checkpoints" / "step2" / "model.safetensors").read_bytes() for root in (here, there)]
+    assert weights[0] == weights[1]
+
+
 @pytest.mark.slow
 def test_a_run_gives_the_same_pictures_selection_and_weights(cluster: Cluster, tmp_path: Path) -> None:
     """The whole pipeline, here and on the cluster; its nodes see no workspace but what is sent to them."""
@@ -201,24 +215,52 @@ def test_a_run_gives_the_same_pictures_selection_and_weights(cluster: Cluster, t
         words += ["--address", cluster.address] if engine == "ray" else []
         words += [f"--set={key}={json.dumps(value)}" for key, value in TINY.items()]
         done = subprocess.run(
-            [sys.executable, "-m", "dnrpipe.cli", "run", *words], capture_output=True, text=True, env=os.environ
+            [sys.executable, "-m", "dnrpipe.cli", "run", *words],
+            capture_output=True,
+            text=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},  # as many as a node of the cluster has
         )
         assert done.returncode == 0 and "baked here" not in done.stderr, done.stderr
         made[engine] = root
     here, there = made["local"], made["ray"]
-    pictures = sorted(path.relative_to(here) for path in here.rglob("*.exr"))
-    assert len(pictures) > 10
     baked = [{path.name: path.read_bytes() for path in (root / "bakes").glob("*.npy")} for root in (here, there)]
     assert baked[0] and baked[0] == baked[1]
-    for picture in pictures:
-        channels = read_exr(here / picture)[0], read_exr(there / picture)[0]
-        for name, values in channels[0].items():
-            np.testing.assert_array_equal(values, channels[1][name], err_msg=f"{picture} {name}")
-    assert (here / "selection.json").read_text() == (there / "selection.json").read_text()
-    weights = [(root / "checkpoints" / "step2" / "model.safetensors").read_bytes() for root in (here, there)]
-    assert weights[0] == weights[1]
+    _require_the_same(here, there)
     ledger = [json.loads(line) for line in (there / "costs.jsonl").read_text().splitlines()]
     assert any("node" in record.get("detail", {}) for record in ledger)
+
+
+@pytest.mark.robustness
+def test_a_node_killed_amid_a_batch_costs_time_only(cluster: Cluster, tmp_path: Path) -> None:
+    """Three scenes, here and on the cluster, one of whose nodes is killed when the first of them traces."""
+    scenes = ["emissive_only", "all_mirror", "all_glass"]
+    settings = "\n".join(f"{key} = {json.dumps(value)}" for key, value in TINY.items())
+    listed = json.dumps([str(SCENES / f"{name}.blend") for name in scenes])
+    for engine in ("local", "ray"):
+        (tmp_path / engine).mkdir()
+        fleet = tmp_path / engine / "fleet.toml"
+        fleet.write_text(f"scenes = {listed}\n[settings]\n{settings}\n")
+        words = ["--executor", "ray", "--address", cluster.address, "--jobs", "3"] if engine == "ray" else []
+        node = cluster.add_node(**NODE) if engine == "ray" else None
+        process = subprocess.Popen(
+            [sys.executable, "-m", "dnrpipe.cli", "batch", str(fleet), "--json", *words],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},  # as many as a node of the cluster has
+        )
+        if node is not None:
+            until = time.monotonic() + 120
+            while not list((tmp_path / engine).rglob("raytraced/train/*.exr")):
+                assert time.monotonic() < until and process.poll() is None, process.communicate()
+                time.sleep(0.1)
+            cluster.remove_node(node, allow_graceful=False)
+        out, errors = process.communicate(timeout=600)
+        assert process.returncode == 0, errors
+        assert [row["state"] for row in json.loads(out)["rows"]] == ["done"] * 3
+    for name in scenes:
+        here, there = (tmp_path / engine / "fleet" / f"{name}.dnr" for engine in ("local", "ray"))
+        _require_the_same(here, there)
 
 
 def test_without_ray_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

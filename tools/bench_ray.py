@@ -116,7 +116,7 @@ def markdown(found: dict[str, Any]) -> str:
     lines = [
         f"{machine['processor']}, {machine['cores']} cores, {found['date'][:10]}, commit {found['commit'][:12]}.",
         "",
-        "| engine | tasks | of seconds each | first answers after | the rest | a task, above its own time | driver's memory |",
+        "| engine | tasks | seconds each | first answers | the rest | a task, beyond its seconds | driver's memory |",
         "| --- | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]
     for row in found["tasks"]:

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
+from ..core.errors import UserError
 from .options import EXECUTOR_OPTIONS, OUTPUT_OPTIONS, executor_assignments, options
+
+if TYPE_CHECKING:
+    from ..core.console import Console
+    from ..fleet.plan import Fleet
 
 
 @click.command()
@@ -19,8 +24,15 @@ from .options import EXECUTOR_OPTIONS, OUTPUT_OPTIONS, executor_assignments, opt
     help="Scenes side by side (default 1; on a Ray cluster 8). Each uses all cores that it finds free.",
 )
 @click.option("--resume/--no-resume", default=True, help="Go on where it stopped (default), or do all again.")
+@click.option(
+    "--forecast",
+    metavar="N,M",
+    help="Only say what the fleet would take on so many nodes like this machine, by what its finished scenes took.",
+)
 @options([*EXECUTOR_OPTIONS, *OUTPUT_OPTIONS])
-def batch(fleet: Path, jobs: int | None, resume: bool, as_json: bool, quiet: bool, **more: Any) -> None:
+def batch(
+    fleet: Path, jobs: int | None, resume: bool, forecast: str | None, as_json: bool, quiet: bool, **more: Any
+) -> None:
     """Run many scenes, each with each variant of the settings, as fleet.toml says (docs/scaling.md).
 
     A scene that fails stops no other. Exit code 1 where one did; its line says which command, and why. The folder of
@@ -31,6 +43,7 @@ def batch(fleet: Path, jobs: int | None, resume: bool, as_json: bool, quiet: boo
       dnrpipe batch fleet.toml
       dnrpipe batch fleet.toml --jobs 2 --json
       dnrpipe batch fleet.toml --executor ray --address auto
+      dnrpipe batch fleet.toml --forecast 1,8,64       # once some of its scenes are done
     """
     from ..core.console import Console
     from ..fleet.page import table, told
@@ -40,6 +53,9 @@ def batch(fleet: Path, jobs: int | None, resume: bool, as_json: bool, quiet: boo
 
     console = Console(json_mode=as_json, quiet=quiet)
     plan = read_fleet(fleet)
+    if forecast is not None:
+        _tell_forecast(plan, forecast, console)
+        return
     on_ray = more["executor"] == "ray"
     if on_ray:  # one cluster for all commands
         from ..core.settings import ExecutorSettings
@@ -54,3 +70,28 @@ def batch(fleet: Path, jobs: int | None, resume: bool, as_json: bool, quiet: boo
     if summary.failed:
         names = ", ".join(row.name for row in summary.failed)
         raise TasksFailed(f"batch: {names} failed; see {plan.out / 'logs'}")
+
+
+def _tell_forecast(plan: Fleet, nodes: str, console: Console) -> None:
+    from ..core.ledger import Ledger
+    from ..core.units import duration
+    from ..fleet.forecast import forecast
+    from ..fleet.records import read_rows
+    from ..workers.view_tasks import worker_count
+
+    try:
+        counts = sorted({int(part) for part in nodes.split(",")})
+    except ValueError:
+        counts = []
+    if not counts or counts[0] < 1:
+        raise UserError(f"--forecast {nodes}: name numbers of nodes, for example 1,8,64")
+    finished = {row.name for row in read_rows(plan.out) if row.state == "done"}
+    ledgers = [Ledger(job.workspace / "costs.jsonl").read() for job in plan.jobs if job.name in finished]
+    if not ledgers:
+        raise UserError(f"--forecast: no scene of {plan.out} is done yet; run some of them first")
+    slots = worker_count(0)
+    found = forecast(ledgers, len(plan.jobs), [slots * count for count in counts])
+    console.say(f"{len(plan.jobs)} scenes, by the costs of {len(ledgers)}; nodes of {slots} tasks side by side:")
+    for count in counts:
+        console.say(f"  {count:>4} nodes  {duration(found[slots * count])}")
+    console.result({"scenes": len(plan.jobs), "known": len(ledgers), "seconds": {n: found[slots * n] for n in counts}})

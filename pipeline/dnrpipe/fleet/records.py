@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
+
+from ..core.errors import UserError
 
 
 class FleetRow(BaseModel, frozen=True):
@@ -37,3 +40,14 @@ class FleetSummary(BaseModel, frozen=True):
     @property
     def failed(self) -> list[FleetRow]:
         return [row for row in self.rows if row.state != "done"]
+
+
+def read_rows(out: Path) -> list[FleetRow]:
+    """Rows of the summary in a fleet's folder; [] where there is none. Raises UserError: it is damaged."""
+    path = out / "fleet.json"
+    try:
+        return FleetSummary.model_validate_json(path.read_bytes()).rows
+    except FileNotFoundError:
+        return []
+    except ValidationError:
+        raise UserError(f"{path}: is damaged; run the fleet again") from None
