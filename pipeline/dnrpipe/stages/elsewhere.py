@@ -23,6 +23,8 @@ def make_elsewhere(run: Run) -> Outcome:
 
     Raises UserError: it failed twice, or was refused.
     """
+    ledger = run.workspace.ledger
+    booked = len(ledger.read())
     with run.console.bar(f"{run.stage} on the cluster", 1) as bar:
         answer = only_answer(
             run.stage,
@@ -40,4 +42,5 @@ def make_elsewhere(run: Run) -> Outcome:
             place=run.place,
         )
         bar.advance()
+    ledger.booked += sum(record.wall_seconds for record in ledger.read()[booked:])  # there, into the same file
     return Outcome(answer["output"], answer["detail"])

@@ -14,6 +14,7 @@ import platform
 import socket
 import sys
 import tempfile
+import threading
 import time
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -36,6 +37,9 @@ BEFORE_IMPORT = {
 }
 """Ray reads these when it is imported."""
 READY_POLL = 0.1
+MOST_FAILURES = 3
+"""So often an actor may fail to start, one after the other."""
+CLOSE_WAIT = 10.0
 STATE_WAIT = 60.0
 """Seconds to wait for word whether a node is alive; Ray itself takes up to half a minute to notice."""
 LOG_TAIL = 1 << 16
@@ -73,8 +77,9 @@ def ray_workers(
         "memory": int((place.memory_mb or 0) * 2**20),
     }
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-    biggest = max((node.get("CPU", 0) for node in nodes), default=0)
-    resources["num_cpus"] = max(1, min(resources["num_cpus"], int(biggest)))
+    for name, kind in (("num_cpus", "CPU"), ("memory", "memory")):  # no more than some node has
+        resources[name] = min(resources[name], int(max((node.get(kind, 0) for node in nodes), default=0)))
+    resources["num_cpus"] = max(1, resources["num_cpus"])
     room = sum(
         int(min(node.get("CPU", 0) // resources["num_cpus"], node.get("GPU", 0) if on_gpu else float("inf")))
         for node in nodes
@@ -173,6 +178,8 @@ class RayWorker:
         self._actor: Any = None
         self._started: Any = None
         self._node = ""
+        self._refused = ""
+        self._failures = 0
         self._closed = False
 
     def ready(self) -> bool:
@@ -191,15 +198,20 @@ class RayWorker:
             return False
         try:
             self._node = str(ray.get(self._started))
-        except ray.exceptions.RayError:
-            self.close()  # its node went before it began: ask for another
-            return False
+        except ray.exceptions.RayError as error:  # its node went before it began, or it cannot begin anywhere
+            self.close()
+            self._failures += 1
+            self._refused = _reason(error) if self._failures >= MOST_FAILURES else ""
+            return bool(self._refused)
+        self._failures = 0
         return True
 
     def answer(self, task: dict[str, Any], timeout: float, why: str = "") -> dict[str, Any]:
         """As `task_list.Worker`; what the task wrote is written here."""
         import ray
 
+        if self._refused:
+            raise WorkerDied(self._refused)
         task = absolute(task, self.place.roots)
         packs = [] if self.place.executor.shared else packs_of([self.common, task], self.place.roots)
         sent = [(pack, [reference(pack)]) for pack in packs]  # in a list: fetched by the node that lacks it
@@ -214,14 +226,17 @@ class RayWorker:
         except ray.exceptions.RayError as error:
             node = self._node
             self.close()
-            if _node_is_gone(node):
+            if not self._closed and _node_is_gone(node):
                 raise WorkerLost(f"node {node.partition(' ')[0]} is gone") from None
             raise WorkerDied(_reason(error)) from None
         if reply["log"]:
             self.log.parent.mkdir(parents=True, exist_ok=True)
             with self.log.open("a") as sink:
                 sink.write(reply["log"])
-        receive(reply["written"], reply["removed"], self.place.roots)
+        try:
+            receive(reply["written"], reply["removed"], self.place.roots)
+        except OSError as error:
+            return {"error": f"{error.strerror}: {error.filename}", "retry": False, "errno": error.errno}
         return {**reply["answer"], "node": self._node.partition(" ")[0]}
 
     def kill(self) -> None:
@@ -229,7 +244,11 @@ class RayWorker:
         self._end()
 
     def close(self, *, force: bool = True) -> None:
-        del force  # all that it wrote is here
+        import ray
+
+        if not force and self._node and ray.is_initialized():
+            with contextlib.suppress(ray.exceptions.RayError):
+                ray.get(self._actor.close.remote(), timeout=CLOSE_WAIT)
         self._end()
         self._actor = self._started = None
         self._node = ""
@@ -244,16 +263,20 @@ class RayWorker:
 
 
 def reference(pack: Pack) -> Any:
-    """The pack in the object store, put there once while this process lives."""
+    """The pack in the object store, put there once as long as it stays what it is."""
     import ray
 
-    if pack.digest not in _SENT:
-        _SENT[pack.digest] = ray.put(packed(pack))
-    return _SENT[pack.digest]
+    with _SENDING:
+        digest, sent = _SENT.get(pack.path, ("", None))
+        if digest != pack.digest:
+            sent = ray.put(packed(pack))
+            _SENT[pack.path] = pack.digest, sent
+        return sent
 
 
-_SENT: dict[str, Any] = {}
-"""By digest: objects live as long as their references."""
+_SENT: dict[str, tuple[str, Any]] = {}
+"""(digest, reference) by path: an object lives as long as its references."""
+_SENDING = threading.Lock()
 
 
 def _node_is_gone(node: str) -> bool:
@@ -287,11 +310,12 @@ def _answers(number: str) -> bool:
 
 def _reason(error: Exception) -> str:
     """How an actor ended, in a line, out of Ray's paragraphs."""
+    import ray
+
+    if isinstance(error, ray.exceptions.OutOfMemoryError):
+        return "worker was ended for want of memory on its node"
     text = " ".join(str(error).split())
-    if "SIGSEGV" in text or "SYSTEM_ERROR" in text:
-        guess = " (out of memory?)" if "OOM" in text and "memory usage" not in text else ""
-        return f"worker crashed{guess}"
-    return f"worker ended: {text[:200]}"
+    return "worker crashed" if "SYSTEM_ERROR" in text else f"worker ended: {text[:200]}"
 
 
 class RemoteWorker:
@@ -300,7 +324,7 @@ class RemoteWorker:
     def __init__(self, module: str, common: dict[str, Any], roots: list[str], shared: bool) -> None:
         self.roots = [Path(root) for root in roots]
         self.mirror = None if shared else Mirror(cache_root() / "packs")
-        temporary = tempfile.mkdtemp(prefix="dnrpipe-workers-")
+        temporary = tempfile.mkdtemp(prefix="dnrpipe-workers-", dir=self.mirror and self.mirror.folder)
         os.environ |= dict.fromkeys(("TMPDIR", "TEMP", "TMP"), temporary)
         tempfile.tempdir = None
         self.answerer = Answerer(module, self._there(common))
@@ -328,9 +352,17 @@ class RemoteWorker:
         before = self.mirror.state()
         answer = self.answerer(self._there(task))
         written, removed = self.mirror.changes(before)
+        for path in [path for path in written if "logs" in Path(path).parts]:  # the driver appends to its own
+            sys.stdout.write(written.pop(path).decode(errors="replace"))
+        sys.stdout.flush()
         root = str(self.mirror.root)
         answer = moved(answer, lambda text: text.replace(root, ""))
         return {"answer": answer, "written": written, "removed": removed, "log": self._printed()}
+
+    def close(self) -> None:
+        """Leave nothing behind."""
+        if self.mirror is not None:
+            self.mirror.close()
 
     def _there(self, values: Any) -> Any:
         """With the driver's paths as they are here."""

@@ -11,6 +11,7 @@ of workers there: it is unpacked into the node's cache, and mirrors hold hard li
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import io
@@ -18,6 +19,7 @@ import os
 import shutil
 import tarfile
 import tempfile
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,6 +33,8 @@ from ..core.workspace import file_sha256
 
 LEFT_BEHIND = ("logs", "preview", "renders", "report", "evaluation")
 """Folders of a workspace that no task reads."""
+KEEP_SECONDS = 2 * 86400.0
+"""How long a node keeps a pack that nobody asks for."""
 
 
 @dataclass(frozen=True)
@@ -139,12 +143,30 @@ def _sha256(path: Path, modified_ns: int, size: int) -> str:
 
 @dataclass
 class Mirror:
-    """One worker's. cache: of the node. root: the folder below which the driver's paths lie."""
+    """One worker's.
+
+    Args:
+        cache: packs of the node.
+        folder: its own, removed by `close`, or by another worker's once its process is gone.
+        placed: digest of what lies at each path.
+    """
 
     cache: Path
-    root: Path = field(default_factory=lambda: Path(tempfile.mkdtemp(prefix="dnrpipe-mirror-")))
+    folder: Path = field(init=False)
     placed: dict[str, str] = field(default_factory=dict)
-    """Digest of what lies at each path."""
+
+    def __post_init__(self) -> None:
+        mirrors = self.cache.parent / "mirrors"
+        mirrors.mkdir(parents=True, exist_ok=True)
+        for left in mirrors.iterdir():
+            if not Path("/proc", left.name.partition("-")[0]).exists():
+                shutil.rmtree(left, ignore_errors=True)
+        self.folder = Path(tempfile.mkdtemp(prefix=f"{os.getpid()}-", dir=mirrors))
+
+    @property
+    def root(self) -> Path:
+        """The driver's paths lie below it."""
+        return self.folder / "files"
 
     def here(self, text: str) -> Path:
         """Where a path of the driver's lies."""
@@ -171,6 +193,7 @@ class Mirror:
         """The unpacked archive in the node's cache."""
         folder = self.cache / digest
         if folder.exists():
+            os.utime(folder)
             return folder
         self.cache.mkdir(parents=True, exist_ok=True)
         with FileLock(self.cache / f"{digest}.lock"):
@@ -181,7 +204,15 @@ class Mirror:
                 with tarfile.open(fileobj=io.BytesIO(fetch())) as archive:
                     archive.extractall(fresh, filter="data")
                 fresh.rename(folder)
+        self._drop_old()
         return folder
+
+    def _drop_old(self) -> None:
+        """Packs that nobody asked for in a while; mirrors hold links of their own to what they use."""
+        for folder in self.cache.iterdir():
+            with contextlib.suppress(OSError):
+                if time.time() - folder.stat().st_mtime > KEEP_SECONDS:
+                    shutil.rmtree(folder) if folder.is_dir() else folder.unlink()
 
     def state(self) -> dict[str, tuple[int, int, int]]:
         """What lies in the mirror: (inode, modified ns, size) by the driver's path."""
@@ -211,7 +242,7 @@ class Mirror:
             del self.placed[placed]
 
     def close(self) -> None:
-        shutil.rmtree(self.root, ignore_errors=True)
+        shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def _link(source: Path, target: Path) -> None:
