@@ -28,7 +28,8 @@ def test_a_chain_is_read_from_a_ledger() -> None:
         _record("finetune", "epoch", "epoch 1", 4),
         _record("finetune", "epoch", "epoch 2", 6),
     ]
-    assert chain_of(records) == [Step((5,), driver=True), Step((1, 2)), Step((3,)), Step((10,))]
+    records[1:3] = [record.model_copy(update={"workers": 2}) for record in records[1:3]]
+    assert chain_of(records) == [Step((5,), driver=True), Step((1, 2)), Step((3,)), Step((10,), whole=True)]
 
 
 def test_by_hand() -> None:
@@ -40,6 +41,8 @@ def test_by_hand() -> None:
     assert makespan([list_of_four], 2, start=1.0, per_task=0.5) == 2 + 1 + 2 * 0.5
     assert makespan([[Step((3.0,), driver=True)]] * 4, 1, drivers=2, **FREE) == 6
     assert makespan([], 3) == 0
+    assert makespan([[Step((2.0,), whole=True)]] * 3, 1, slots=2, **FREE) == 6  # each has the node to itself
+    assert makespan([[Step((2.0,))] * 1] * 3, 1, slots=2, **FREE) == 4
 
 
 @given(

@@ -101,11 +101,9 @@ class BakeCommon(Task):
         folder: for results: ``KEY.npy``, float16 or float32 [N, C], a row per texel of the material's region.
         size: texels of the atlas' side.
         threads: of Cycles; 0 for all cores.
-        external: other files that the scene file refers to.
     """
 
     source: Path
-    external: tuple[Path, ...] = ()
     frame: int
     geometry: Path
     folder: Path

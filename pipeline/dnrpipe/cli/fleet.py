@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from ..fleet.plan import Fleet
 
 
+ON_RAY = 8
+"""Scenes side by side on a cluster: the driver converts them and waits for the rest."""
+
+
 @click.command()
 @click.argument("fleet", type=click.Path(path_type=Path))
 @click.option(
@@ -62,8 +66,11 @@ def batch(
         from ..workers.ray_workers import address_of
 
         more["address"] = address_of(ExecutorSettings(engine="ray", address=more["address"] or "local"))
-    flags = [word for setting in executor_assignments(more) for word in ("--set", setting)]
-    summary = run_fleet(plan, jobs=jobs or (8 if on_ray else 1), more=flags, force=not resume, console=console)
+    # By the environment: a cluster's address is this run's, not the workspaces'.
+    given = (setting.partition("=") for setting in executor_assignments(more))
+    environment = {f"DNRPIPE_{key.upper().replace('.', '__')}": value for key, _, value in given}
+    at_once = jobs or (ON_RAY if on_ray else 1)
+    summary = run_fleet(plan, jobs=at_once, environment=environment, force=not resume, console=console)
     console.say(table(summary))
     console.say(f"{told(summary, len(plan.jobs))}: {plan.out / 'index.html'}")
     console.result(summary.model_dump(mode="json"))
@@ -90,8 +97,8 @@ def _tell_forecast(plan: Fleet, nodes: str, console: Console) -> None:
     if not ledgers:
         raise UserError(f"--forecast: no scene of {plan.out} is done yet; run some of them first")
     slots = worker_count(0)
-    found = forecast(ledgers, len(plan.jobs), [slots * count for count in counts])
+    found = forecast(ledgers, len(plan.jobs), counts, slots=slots, drivers=ON_RAY)
     console.say(f"{len(plan.jobs)} scenes, by the costs of {len(ledgers)}; nodes of {slots} tasks side by side:")
-    for count in counts:
-        console.say(f"  {count:>4} nodes  {duration(found[slots * count])}")
-    console.result({"scenes": len(plan.jobs), "known": len(ledgers), "seconds": {n: found[slots * n] for n in counts}})
+    for count, seconds in found.items():
+        console.say(f"  {count:>4} nodes  {duration(seconds)}")
+    console.result({"scenes": len(plan.jobs), "known": len(ledgers), "seconds": found})

@@ -164,6 +164,12 @@ class ExecutorSettings(Strict):
         default="local",
         description="of the cluster: local (one of this machine's own), auto (the running one), or HOST:PORT",
     )
+    workers: int = Field(
+        default=0,
+        ge=0,
+        description="workers to ask the cluster for at once; 0: as many as it has room for now. More than fit make an"
+        " autoscaler add nodes",
+    )
     shared: bool = Field(
         default=False, description="all nodes see the workspace under the same path: nothing is sent to and fro"
     )

@@ -1,12 +1,14 @@
 """How long a fleet would take on so many nodes, reckoned from what its scenes have cost so far.
 
 Notation
-    slot    what one task occupies on a node: the share of its cores that a task had when it was measured
+    slot    what one of several tasks side by side occupies on a node; a node has as many as the machine of the ledgers
     step    tasks of one scene that may run side by side; the next step begins when all of them have ended
     chain   the steps of one scene
 
-Tasks are taken first come, first served, by whatever slot is free, as the executor does. Steps that the driving machine
-makes itself (conversion) wait for one of its own places. Sending files is not modelled beyond a constant per task.
+Tasks are taken first come, first served, by whatever node has room for them, as the executor does. A task that had the
+machine for itself when it was measured (light, base images, training) takes a whole node. Steps that the driving
+machine makes itself (conversion) wait for one of its own places. Sending files is not modelled beyond a constant per
+task.
 """
 
 from __future__ import annotations
@@ -27,10 +29,11 @@ PER_TASK = 0.02
 
 @dataclass(frozen=True)
 class Step:
-    """seconds: of each task. driver: made by the driving machine, one task after the other."""
+    """seconds: of each task. driver: made by the driving machine. whole: each task takes a node, not a slot."""
 
     seconds: tuple[float, ...]
     driver: bool = False
+    whole: bool = False
 
 
 def chain_of(records: Sequence[CostRecord]) -> list[Step]:
@@ -42,9 +45,10 @@ def chain_of(records: Sequence[CostRecord]) -> list[Step]:
         found = list(group)
         driver = found[0].stage == "prepare" and found[0].unit == "scene"
         if found[0].unit == "view":
-            steps.append(Step(tuple(record.seconds for record in found)))
+            alone = max(record.workers for record in found) == 1 and len(found) > 1
+            steps.append(Step(tuple(record.seconds for record in found), whole=alone))
         else:
-            steps.append(Step((sum(record.seconds for record in found),), driver))
+            steps.append(Step((sum(record.seconds for record in found),), driver, not driver))
     return steps
 
 
@@ -55,8 +59,9 @@ def _kind(record: CostRecord) -> tuple[str, str, str]:
 
 def makespan(
     chains: Sequence[Sequence[Step]],
-    slots: int,
+    nodes: int,
     *,
+    slots: int = 1,
     drivers: int = 8,
     start: float = START,
     per_task: float = PER_TASK,
@@ -64,16 +69,16 @@ def makespan(
     """Seconds until the last chain has ended.
 
     Args:
-        slots: of all nodes together.
+        slots: of each node.
         drivers: chains under way at once.
-        start: seconds before the first task of a step on each slot that it gets.
+        start: seconds before the first task of a step on each slot that it may get.
     """
     waiting: deque[int] = deque(range(len(chains)))  # chains that have not begun
-    ready: dict[bool, deque[tuple[int, float]]] = {False: deque(), True: deque()}  # by whether the driver makes them
-    free = {False: slots, True: drivers}
-    left = [0] * len(chains)
-    next_step = [0] * len(chains)
-    events: list[tuple[float, int, int, bool]] = []  # (time, tie, chain, driver)
+    ready: deque[tuple[int, float, int]] = deque()  # (chain, seconds, slots that it takes; 0: the driver's)
+    free = [slots] * nodes
+    places = drivers
+    left, next_step = [0] * len(chains), [0] * len(chains)
+    events: list[tuple[float, int, int, int, int]] = []  # (time, tie, chain, node, slots)
     tie = itertools.count()
     clock, under_way = 0.0, 0
 
@@ -83,33 +88,52 @@ def makespan(
             step = chains[chain][next_step[chain]]
             next_step[chain] += 1
             if step.seconds:
+                width = 0 if step.driver else slots if step.whole else 1
+                starting = 0 if step.driver else nodes * slots // width
                 left[chain] = len(step.seconds)
-                starting = 0 if step.driver else min(slots, len(step.seconds))
                 for number, seconds in enumerate(step.seconds):
                     extra = 0.0 if step.driver else per_task + (start if number < starting else 0.0)
-                    ready[step.driver].append((chain, seconds + extra))
+                    ready.append((chain, seconds + extra, width))
                 return True
         return False
+
+    def place(width: int) -> int | None:
+        """The node that a task begins on now: the fullest that has room. None: there is none."""
+        if not width:
+            return -1 if places else None
+        fitting = [node for node in range(nodes) if free[node] >= width]
+        return min(fitting, key=free.__getitem__) if fitting else None
 
     while True:
         while waiting and under_way < drivers:
             under_way += advance(waiting.popleft())
-        for driver in (False, True):
-            while free[driver] and ready[driver]:
-                chain, seconds = ready[driver].popleft()
-                free[driver] -= 1
-                heapq.heappush(events, (clock + seconds, next(tie), chain, driver))
+        for _ in range(len(ready)):
+            chain, seconds, width = ready.popleft()
+            node = place(width)
+            if node is None:
+                ready.append((chain, seconds, width))
+                continue
+            if width:
+                free[node] -= width
+            else:
+                places -= 1
+            heapq.heappush(events, (clock + seconds, next(tie), chain, node, width))
         if not events:
             return clock
-        clock, _, chain, driver = heapq.heappop(events)
-        free[driver] += 1
+        clock, _, chain, node, width = heapq.heappop(events)
+        if width:
+            free[node] += width
+        else:
+            places += 1
         left[chain] -= 1
         if not left[chain] and not advance(chain):
             under_way -= 1
 
 
-def forecast(ledgers: Sequence[Sequence[CostRecord]], scenes: int, slots: Sequence[int]) -> dict[int, float]:
-    """Seconds by number of slots, for so many scenes of the kind that the ledgers are of."""
+def forecast(
+    ledgers: Sequence[Sequence[CostRecord]], scenes: int, nodes: Sequence[int], *, slots: int, drivers: int
+) -> dict[int, float]:
+    """Seconds by number of nodes, for so many scenes of the kind that the ledgers are of."""
     known = [chain_of(records) for records in ledgers]
     chains = [known[number % len(known)] for number in range(scenes)]
-    return {count: makespan(chains, count, drivers=max(8, count)) for count in slots}
+    return {count: makespan(chains, count, slots=slots, drivers=drivers) for count in nodes}

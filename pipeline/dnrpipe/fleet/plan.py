@@ -22,7 +22,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import Field, ValidationError
 
@@ -32,10 +32,11 @@ from ..core.errors import UserError
 from ..core.settings import merge, resolve
 
 TAKES_SCENE = ("run", "prepare")
+TAKES_NO_FORCE = ("export-nerf", "export-onnx", "export-gltf", "export-web")
 COMMANDS = (
     *TAKES_SCENE,
     *("select", "raytrace-selected", "finetune", "evaluate", "render", "report"),
-    *("export-nerf", "export-onnx", "export-gltf", "export-web"),
+    *TAKES_NO_FORCE,
 )
 """What a fleet may ask of a scene."""
 
@@ -48,7 +49,7 @@ class FleetFile(Strict):
     preset: str | None = None
     scenes: list[str] = Field(min_length=1)
     settings: dict[str, Any] = Field(default={})
-    variants: dict[str, dict[str, Any]] = Field(default={})
+    variants: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")], dict[str, Any]] = Field(default={})
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,8 @@ from ..core.console import Console
 from ..core.workspace import locked
 from ..workers.processes import die_with_parent, how_ended
 from .page import page
-from .plan import Fleet, FleetJob
-from .records import FleetRow, FleetSummary
+from .plan import TAKES_NO_FORCE, Fleet, FleetJob
+from .records import FleetRow, FleetSummary, read_rows
 
 GRACE = 20.0
 """Seconds between SIGTERM and SIGKILL, in which a command stops its workers and writes what it has."""
@@ -37,11 +37,11 @@ TAIL = 20_000
 ERROR = "dnrpipe: error: "
 
 
-def run_fleet(fleet: Fleet, *, jobs: int, more: list[str], force: bool, console: Console) -> FleetSummary:
+def run_fleet(fleet: Fleet, *, jobs: int, environment: dict[str, str], force: bool, console: Console) -> FleetSummary:
     """Run all jobs, at most ``jobs`` at once, and write the summary after each of them.
 
     Args:
-        more: flags of every command, after its own.
+        environment: variables of every command, beside this process's own.
         force: do everything again; else each goes on where it stopped.
 
     Raises UserError: another command works in the folder. KeyboardInterrupt is passed on once all commands have ended.
@@ -49,6 +49,7 @@ def run_fleet(fleet: Fleet, *, jobs: int, more: list[str], force: bool, console:
     pending: queue.SimpleQueue[FleetJob] = queue.SimpleQueue()
     for job in fleet.jobs:
         pending.put(job)
+    ended_before = {row.name: row for row in read_rows(fleet.out)}  # told until they end again
     rows: dict[str, FleetRow] = {}
     ended: queue.SimpleQueue[FleetRow] = queue.SimpleQueue()
     running: set[subprocess.Popen[bytes]] = set()
@@ -61,7 +62,12 @@ def run_fleet(fleet: Fleet, *, jobs: int, more: list[str], force: bool, console:
                 job = pending.get_nowait()
             except queue.Empty:
                 return
-            ended.put(_run(job, more, force, fleet.out, running, stopping))
+            try:
+                row = _run(job, environment, force, fleet.out, running, stopping)
+            except Exception as error:  # a full disk, a log that cannot be written: this scene's, not the fleet's
+                reason = " ".join(str(error).split())
+                row = FleetRow(name=job.name, scene=str(job.scene), state="failed", error=reason, seconds=0, log="")
+            ended.put(row)
 
     with locked(fleet.out, "batch"):
         threads = [threading.Thread(target=serve, daemon=True) for _ in range(min(jobs, len(fleet.jobs)))]
@@ -75,7 +81,7 @@ def run_fleet(fleet: Fleet, *, jobs: int, more: list[str], force: bool, console:
                     if row.state == "failed":
                         console.warn(f"{row.name}: {row.failed_at} failed: {row.error}")
                     bar.advance(note=row.name)
-                    _write(fleet, rows)
+                    _write(fleet, ended_before | rows)
         except BaseException:
             stopping.set()
             _end(running)
@@ -83,7 +89,10 @@ def run_fleet(fleet: Fleet, *, jobs: int, more: list[str], force: bool, console:
         finally:
             for thread in threads:
                 thread.join(timeout=GRACE)
-            summary = _write(fleet, rows)
+            while not ended.empty():  # those that were interrupted
+                row = ended.get_nowait()
+                rows[row.name] = row
+            summary = _write(fleet, ended_before | rows)
     return summary
 
 
@@ -98,7 +107,7 @@ def _next(ended: queue.SimpleQueue[FleetRow]) -> FleetRow:
 
 def _run(
     job: FleetJob,
-    more: list[str],
+    environment: dict[str, str],
     force: bool,
     out: Path,
     running: set[subprocess.Popen[bytes]],
@@ -108,7 +117,7 @@ def _run(
     log, started, failed, error = out / "logs" / f"{job.name}.log", time.monotonic(), "", ""
     with log.open("ab") as sink:
         for words in job.commands:
-            line = [*words, *more, *(["--force"] if force else [])]
+            line = [*words, *(["--force"] if force and words[0] not in TAKES_NO_FORCE else [])]
             sink.write(f"--- {time.strftime('%F %T')} dnrpipe {' '.join(line)}\n".encode())
             sink.flush()
             process = subprocess.Popen(
@@ -116,6 +125,7 @@ def _run(
                 stdin=subprocess.DEVNULL,
                 stdout=sink,
                 stderr=subprocess.STDOUT,
+                env={**os.environ, **environment},
                 start_new_session=True,  # Ctrl-C is ours to pass on
                 preexec_fn=partial(die_with_parent, os.getpid()),
             )

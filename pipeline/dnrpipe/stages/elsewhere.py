@@ -5,6 +5,8 @@ Lists of tasks are spread by `Run.place`; training is one task, which reads and 
 
 from __future__ import annotations
 
+import threading
+
 from ..core.ledger import StageName
 from ..core.settings import Settings
 from ..workers.view_tasks import only_answer
@@ -40,6 +42,7 @@ def make_elsewhere(run: Run) -> Outcome:
             log=run.log,
             console=run.console,
             place=run.place,
+            timeout=threading.TIMEOUT_MAX,  # as here, training has none
         )
         bar.advance()
     ledger.booked += sum(record.wall_seconds for record in ledger.read()[booked:])  # there, into the same file

@@ -267,8 +267,7 @@ def bake(run: Run, source: Path, geometry: Path, pending: PendingBakes) -> list[
     folder = run.workspace.root / BAKES
     folder.mkdir(parents=True, exist_ok=True)
     common = BakeCommon(
-        source=source,
-        external=pending.external,
+        source=source.resolve(),
         frame=pending.frame,
         geometry=geometry,
         folder=folder,
@@ -302,15 +301,16 @@ def bake(run: Run, source: Path, geometry: Path, pending: PendingBakes) -> list[
 
 
 def _place_of_bakes(run: Run, source: Path, external: Sequence[Path]) -> Placement:
-    """Where textures are baked: here where the scene refers to files by paths that a node would not find them at."""
+    """Where textures are baked: here where the scene file refers to others, which a node would have to find."""
     place = run.place
     if place.is_local or place.executor.shared:
         return place
-    elsewhere = [path for path in external if not path.resolve().is_relative_to(source.resolve().parent)]
-    if elsewhere:
-        run.console.warn(f"bakes: {elsewhere[0]} is not below the scene file's folder; textures are baked here")
+    if external:
+        run.console.say(
+            f"  textures are baked here: the scene refers to {external[0].name}, which is not packed into it"
+        )
         return HERE
-    return replace(place, roots=(*place.roots, source, *external))
+    return replace(place, roots=(*place.roots, source.resolve()))
 
 
 def _refuse_if_strict(source: Path, scene_dir: Path, settings: Settings) -> None:

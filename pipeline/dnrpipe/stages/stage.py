@@ -134,11 +134,13 @@ class Run:
         workers: int,
         book: Book,
         environment: dict[str, str] | None = None,
+        place: Placement | None = None,
     ) -> None:
         """Run the tasks whose files are missing or out of date.
 
         Args:
-            module, common, environment: of `processes.run_tasks`.
+            module, common, environment: of `task_list.run_tasks`.
+            place: where they run, instead of where the settings say.
 
         Raises TasksFailed after all other tasks are done when some failed twice. Raises OSError: the disk is full.
         """
@@ -155,7 +157,7 @@ class Run:
             log=self.log,
             retried=failures.retried,
             environment=environment,
-            place=self.place,
+            place=place or self.place,
         )
         with self.timed(f"{label}: processes"), self.console.bar(label, len(tasks), len(tasks) - len(due)) as bar:
             for outcome in failures.noted(outcomes):

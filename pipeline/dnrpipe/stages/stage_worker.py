@@ -20,7 +20,8 @@ class Worker:
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
         settings = Settings.model_validate(task["settings"])
-        here = settings.model_copy(update={"executor": ExecutorSettings()})
+        device = "cuda" if settings.device.startswith("cuda") else settings.device  # it sees the one that it got
+        here = settings.model_copy(update={"executor": ExecutorSettings(), "device": device})
         run = Run(
             Workspace.open(Path(task["workspace"])),
             here,

@@ -11,6 +11,7 @@ import contextlib
 import logging
 import os
 import platform
+import signal
 import socket
 import sys
 import tempfile
@@ -25,7 +26,7 @@ from ..core.errors import UserError
 from ..core.machine import cache_root
 from ..core.settings import ExecutorSettings
 from .processes import Answerer, WorkerDied
-from .shipping import Mirror, Pack, absolute, moved, packed, packs_of, receive, under
+from .shipping import Mirror, Pack, moved, packed, packs_of, receive, under
 from .task_list import Placement, WorkerLost
 
 PACKAGES = ("ray", "numpy", "bpy", "mitsuba", "drjit", "torch", "OpenEXR")
@@ -84,10 +85,12 @@ def ray_workers(
         int(min(node.get("CPU", 0) // resources["num_cpus"], node.get("GPU", 0) if on_gpu else float("inf")))
         for node in nodes
     )
+    room = place.executor.workers or room  # more than fit make an autoscaler add nodes
     if room < 1:
         raise UserError(
             f"executor.address={place.executor.address}: no node has {resources['num_cpus']} processors"
-            f"{' and a GPU' if on_gpu else ''} (docs/scaling.md)"
+            f"{' and a GPU' if on_gpu else ''}; where nodes are added on demand, say how many workers to ask for"
+            " (executor.workers)"
         )
     return [RayWorker(module, common, log, environment, place, resources) for _ in range(max(1, min(room, tasks)))]
 
@@ -106,16 +109,23 @@ def connect(executor: ExecutorSettings) -> None:
     if ray.is_initialized():
         return
     quiet: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False}
+    before = signal.getsignal(signal.SIGTERM)
     try:
         if executor.address == "local":
             ray.init(address="local", include_dashboard=False, **quiet)
         else:
             ray.init(address=executor.address, **quiet)
-    except (ConnectionError, RuntimeError, ValueError) as error:
+    except (ray.exceptions.RayError, ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
         reason = " ".join(str(error).split())
         raise UserError(f"executor.address={executor.address}: cannot join this Ray cluster ({reason})") from None
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, before)  # Ray takes it for itself
     logging.getLogger("ray").setLevel(logging.CRITICAL)  # a dead actor is told once, by us
-    refuse_other_versions(executor)
+    try:
+        refuse_other_versions(executor)
+    except (ray.exceptions.RayError, TimeoutError) as error:
+        reason = " ".join(str(error).split())[-300:]
+        raise UserError(f"executor.address={executor.address}: a node does not run dnrpipe ({reason})") from None
 
 
 def address_of(executor: ExecutorSettings) -> str:
@@ -133,16 +143,19 @@ def refuse_other_versions(executor: ExecutorSettings) -> None:
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
     ask = ray.remote(num_cpus=0, max_retries=0)(installed)
-    here = installed()
     for node in [node for node in ray.nodes() if node["Alive"]]:
         strategy = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
         there: Any = ray.get(ask.options(scheduling_strategy=strategy).remote(), timeout=STATE_WAIT)
-        other = [f"{name} {there.get(name)} (here {here[name]})" for name in here if here[name] != there.get(name)]
-        if other:
+        if other := differences(there):
             name = node["NodeManagerHostname"]
-            raise UserError(
-                f"executor.address={executor.address}: node {name} has {', '.join(other)}; install the same there"
-            )
+            raise UserError(f"executor.address={executor.address}: node {name} has {other}; install the same there")
+
+
+def differences(there: dict[str, str]) -> str:
+    """What a node has that this machine has not, in words; "" where they agree."""
+    here = installed()
+    names = [name for name in here | there if here.get(name) != there.get(name)]
+    return ", ".join(f"{name} {there.get(name, 'missing')} (here {here.get(name, 'missing')})" for name in names)
 
 
 def installed() -> dict[str, str]:
@@ -167,8 +180,7 @@ class RayWorker:
         place: Placement,
         resources: dict[str, float],
     ) -> None:
-        self.module, self.log, self.place = module, log, place
-        self.common = absolute(common, place.roots)
+        self.module, self.common, self.log, self.place = module, common, log, place
         threads = str(int(resources["num_cpus"]))
         # Ray sets OMP_NUM_THREADS to the actor's processors where nobody did; our workers were told by the stage.
         self.environment = {"OMP_NUM_THREADS": threads, "PYTHONUNBUFFERED": "1", **environment}
@@ -188,7 +200,7 @@ class RayWorker:
 
         if self._actor is None:
             kind = ray.remote(max_restarts=0, max_task_retries=0)(RemoteWorker)
-            roots = [str(root.resolve()) for root in self.place.roots]
+            roots = [str(root) for root in self.place.roots]
             options = {**self.resources, "runtime_env": {"env_vars": self.environment}}
             self._actor = kind.options(**options).remote(self.module, self.common, roots, self.place.executor.shared)
             self._started = self._actor.node.remote()
@@ -197,13 +209,19 @@ class RayWorker:
         if not ray.wait([self._started], timeout=READY_POLL)[0] or self._closed:
             return False
         try:
-            self._node = str(ray.get(self._started))
+            started: Any = ray.get(self._started)
+            self._node, there = started
+            if other := differences(there):  # a node that joined later
+                name = self._node.partition(" ")[0]
+                self.close()
+                self._refused = f"node {name} has {other}; install the same there"
+                return True
         except ray.exceptions.RayError as error:  # its node went before it began, or it cannot begin anywhere
             self.close()
             self._failures += 1
             self._refused = _reason(error) if self._failures >= MOST_FAILURES else ""
             return bool(self._refused)
-        self._failures = 0
+        self._failures, self._refused = 0, ""
         return True
 
     def answer(self, task: dict[str, Any], timeout: float, why: str = "") -> dict[str, Any]:
@@ -212,8 +230,7 @@ class RayWorker:
 
         if self._refused:
             raise WorkerDied(self._refused)
-        task = absolute(task, self.place.roots)
-        packs = [] if self.place.executor.shared else packs_of([self.common, task], self.place.roots)
+        packs = [] if self.place.executor.shared else packs_of(self.common, task, self.place.roots)
         sent = [(pack, [reference(pack)]) for pack in packs]  # in a list: fetched by the node that lacks it
         call = self._actor.answer.remote(task, sent)
         try:
@@ -266,6 +283,8 @@ def reference(pack: Pack) -> Any:
     """The pack in the object store, put there once as long as it stays what it is."""
     import ray
 
+    if not pack.kept:
+        return ray.put(packed(pack))
     with _SENDING:
         digest, sent = _SENT.get(pack.path, ("", None))
         if digest != pack.digest:
@@ -335,11 +354,11 @@ class RemoteWorker:
         os.dup2(self.output.fileno(), 1)
         os.dup2(self.output.fileno(), 2)
 
-    def node(self) -> str:
-        """Name and number of the node."""
+    def node(self) -> tuple[str, dict[str, str]]:
+        """(name and number of the node, what is installed there)."""
         import ray
 
-        return f"{socket.gethostname()} {ray.get_runtime_context().get_node_id()}"
+        return f"{socket.gethostname()} {ray.get_runtime_context().get_node_id()}", installed()
 
     def answer(self, task: dict[str, Any], sent: list[tuple[Pack, list[Any]]]) -> dict[str, Any]:
         """-> the worker's answer, the files that it wrote and removed, and what it printed."""
@@ -352,7 +371,8 @@ class RemoteWorker:
         before = self.mirror.state()
         answer = self.answerer(self._there(task))
         written, removed = self.mirror.changes(before)
-        for path in [path for path in written if "logs" in Path(path).parts]:  # the driver appends to its own
+        logs = {root / "logs" for root in self.roots}  # the driver appends to its own
+        for path in [path for path in written if Path(path).parent in logs]:
             sys.stdout.write(written.pop(path).decode(errors="replace"))
         sys.stdout.flush()
         root = str(self.mirror.root)

@@ -17,6 +17,7 @@ import hashlib
 import io
 import os
 import shutil
+import socket
 import tarfile
 import tempfile
 import time
@@ -25,40 +26,50 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock
+from filelock import FileLock, Timeout
 
 from dnrtrain.atomic import atomic_path
 
 from ..core.workspace import file_sha256
 
-LEFT_BEHIND = ("logs", "preview", "renders", "report", "evaluation")
-"""Folders of a workspace that no task reads."""
-KEEP_SECONDS = 2 * 86400.0
-"""How long a node keeps a pack that nobody asks for."""
+LEFT_BEHIND = ("logs", "preview", "renders", "report", "evaluation", "samples")
+"""Folders of a workspace of which no task reads all."""
+KEEP_SECONDS, KEEP_BYTES = 2 * 86400.0, 32 << 30
+"""How long a node keeps a pack that nobody asks for, and how much of them in all."""
+SMALL = 1 << 20
 
 
 @dataclass(frozen=True)
 class Pack:
-    """digest: of all names and contents. path: where it lies on the driver. folder: whether it is one."""
+    """digest: of all names and contents. path: where it lies on the driver. folder: whether it is one. kept: by the
+    node, for further tasks; files of one task alone are not."""
 
     digest: str
     path: str
     folder: bool
+    kept: bool
 
 
 # -- driver ------------------------------------------------------------------------------------------------
 
 
-def packs_of(values: Any, roots: Sequence[Path]) -> list[Pack]:
-    """What a task, or what all tasks of a worker share, names of existing files under the roots.
+def packs_of(common: Any, task: Any, roots: Sequence[Path]) -> list[Pack]:
+    """What a task, and what all tasks of a worker share, name of existing files under the roots.
 
     A scene description stands for the folder of its meshes and textures. What lies in a folder that is named, too, is
     not told twice. ``output`` is not read.
     """
-    named = {Path(text) for key, text in strings(values) if key != "output" and under(text, roots)}
-    named = {path.parent if path.name == "scene.xml" else path for path in named if path.exists()}
+    shared = {Path(text) for _, text in strings(common)}
+    own = {Path(text) for key, text in strings(task) if key != "output"}
+    named = {path for path in shared | own if under(str(path), roots)}
+    named = {path.parent if _is_bundle(path) else path for path in named if path.exists()}
     outermost = [path for path in sorted(named) if not any(other in path.parents for other in named)]
-    return [Pack(_digest(path), str(path), path.is_dir()) for path in outermost]
+    return [Pack(_digest(path), str(path), path.is_dir(), path.is_dir() or path in shared) for path in outermost]
+
+
+def _is_bundle(path: Path) -> bool:
+    """``scene.xml``, or one without what is left out (``scene-<hash>.xml``): its meshes and textures lie beside it."""
+    return path.suffix == ".xml" and path.name.startswith("scene") and path.parent.name == "scene"
 
 
 def packed(pack: Pack) -> bytes:
@@ -82,22 +93,9 @@ def strings(values: Any, key: str = "") -> Iterator[tuple[str, str]]:
             yield from strings(value, key)
 
 
-def absolute(values: Any, roots: Sequence[Path]) -> Any:
-    """JSON-able values in which what lies in a root, named as the root is, is named by its absolute path."""
-    known = [(str(root), str(root.resolve())) for root in roots]
-
-    def change(text: str) -> str:
-        for given, whole in known:
-            if text == given or text.startswith(f"{given}/"):
-                return whole + text[len(given) :]
-        return text
-
-    return moved(values, change)
-
-
 def under(text: str, roots: Sequence[Path]) -> bool:
     """Whether the string is the absolute path of a root or of something in one."""
-    return text.startswith("/") and any(Path(text).is_relative_to(root.resolve()) for root in roots)
+    return text.startswith("/") and any(Path(text).is_relative_to(root) for root in roots)
 
 
 def moved(values: Any, change: Callable[[str], str]) -> Any:
@@ -118,8 +116,7 @@ def members(path: Path) -> list[tuple[str, Path]]:
     found = []
     for folder, names, files in os.walk(path):
         inside = Path(folder)
-        if inside == path:
-            names[:] = [name for name in names if name not in LEFT_BEHIND]
+        names[:] = [name for name in names if name not in LEFT_BEHIND]
         found += [inside / name for name in files if not name.startswith(".") and not name.endswith(".lock")]
     return [(str(file.relative_to(path)), file) for file in sorted(found)]
 
@@ -147,21 +144,26 @@ class Mirror:
 
     Args:
         cache: packs of the node.
-        folder: its own, removed by `close`, or by another worker's once its process is gone.
+        folder: its own, removed by `close`, or by another worker's once nobody holds its lock.
         placed: digest of what lies at each path.
     """
 
     cache: Path
     folder: Path = field(init=False)
     placed: dict[str, str] = field(default_factory=dict)
+    lock: FileLock = field(init=False)
 
     def __post_init__(self) -> None:
         mirrors = self.cache.parent / "mirrors"
         mirrors.mkdir(parents=True, exist_ok=True)
-        for left in mirrors.iterdir():
-            if not Path("/proc", left.name.partition("-")[0]).exists():
-                shutil.rmtree(left, ignore_errors=True)
-        self.folder = Path(tempfile.mkdtemp(prefix=f"{os.getpid()}-", dir=mirrors))
+        self.folder = Path(tempfile.mkdtemp(prefix=f"{socket.gethostname()}-", dir=mirrors))
+        self.lock = FileLock(f"{self.folder}.lock")
+        self.lock.acquire()
+        for left in mirrors.glob(f"{socket.gethostname()}-*.lock"):
+            if left != Path(self.lock.lock_file):
+                with contextlib.suppress(Timeout, OSError), FileLock(left, timeout=0):
+                    shutil.rmtree(left.with_suffix(""), ignore_errors=True)
+                    left.unlink(missing_ok=True)
 
     @property
     def root(self) -> Path:
@@ -176,7 +178,7 @@ class Mirror:
         """Make the pack's files lie where they do on the driver. fetch: called where the node does not have them."""
         if self.placed.get(pack.path) == pack.digest:
             return
-        kept = self._kept(pack.digest, fetch)
+        kept = self._kept(pack.digest, fetch) if pack.kept else None
         target = self.here(pack.path)
         if pack.folder:
             shutil.rmtree(target, ignore_errors=True)
@@ -184,9 +186,13 @@ class Mirror:
         else:
             target.unlink(missing_ok=True)
             target = target.parent
-        for name, file in members(kept):
-            (target / name).parent.mkdir(parents=True, exist_ok=True)
-            _link(file, target / name)
+        target.mkdir(parents=True, exist_ok=True)
+        if kept is None:
+            _unpack(fetch(), target)
+        else:
+            for name, file in members(kept):
+                (target / name).parent.mkdir(parents=True, exist_ok=True)
+                _link(file, target / name)
         self.placed[pack.path] = pack.digest
 
     def _kept(self, digest: str, fetch: Callable[[], bytes]) -> Path:
@@ -201,18 +207,24 @@ class Mirror:
                 fresh = self.cache / f"{digest}.fresh"
                 shutil.rmtree(fresh, ignore_errors=True)
                 fresh.mkdir()
-                with tarfile.open(fileobj=io.BytesIO(fetch())) as archive:
-                    archive.extractall(fresh, filter="data")
+                _unpack(fetch(), fresh)
                 fresh.rename(folder)
         self._drop_old()
         return folder
 
     def _drop_old(self) -> None:
-        """Packs that nobody asked for in a while; mirrors hold links of their own to what they use."""
+        """Packs that nobody asked for in a while, and the oldest beyond a size; mirrors have what they use."""
+        found = []
         for folder in self.cache.iterdir():
             with contextlib.suppress(OSError):
-                if time.time() - folder.stat().st_mtime > KEEP_SECONDS:
-                    shutil.rmtree(folder) if folder.is_dir() else folder.unlink()
+                if folder.is_dir():
+                    size = sum(file.stat().st_size for _, file in members(folder))
+                    found.append((folder.stat().st_mtime, size, folder))
+        total = 0
+        for modified, size, folder in sorted(found, reverse=True):  # the newest first
+            total += size
+            if time.time() - modified > KEEP_SECONDS or total > KEEP_BYTES:
+                shutil.rmtree(folder, ignore_errors=True)
 
     def state(self) -> dict[str, tuple[int, int, int]]:
         """What lies in the mirror: (inode, modified ns, size) by the driver's path."""
@@ -243,13 +255,22 @@ class Mirror:
 
     def close(self) -> None:
         shutil.rmtree(self.folder, ignore_errors=True)
+        self.lock.release()
+
+
+def _unpack(archive: bytes, folder: Path) -> None:
+    with tarfile.open(fileobj=io.BytesIO(archive)) as opened:
+        opened.extractall(folder, filter="data")
 
 
 def _link(source: Path, target: Path) -> None:
+    """A file of a pack in a mirror. Small ones are copied: some of them (the ledger) are appended to in place."""
     try:
+        if source.stat().st_size < SMALL:
+            raise OSError
         os.link(source, target)
-    except OSError:  # another file system
-        shutil.copyfile(source, target)
+    except OSError:  # also: another file system
+        shutil.copy2(source, target)
 
 
 def receive(written: dict[str, bytes], removed: Sequence[str], roots: Sequence[Path]) -> None:

@@ -21,9 +21,9 @@ from typing import Any, Protocol
 from ..core.errors import UserError
 from ..core.settings import ExecutorSettings
 from ..core.units import parse_seconds
-from .processes import LocalWorker, WorkerDied
+from .processes import LocalWorker
 
-MAX_ATTEMPTS = 2
+MAX_ATTEMPTS, MOST_LOSSES = 2, 3
 TIMEOUT_VARIABLE = "DNRPIPE_TASK_TIMEOUT"
 FIRST_LIMIT = 6 * 3600.0
 """Seconds that a task may take while none has ended yet: paper-sized light on two cores is well within."""
@@ -171,9 +171,9 @@ def run_tasks(
     Raises UserError: see `TaskTimeout`; no such cluster. Raises OSError: the disk is full.
     """
     task_timeout = TaskTimeout(timeout)
-    pending: queue.SimpleQueue[tuple[dict[str, Any], int]] = queue.SimpleQueue()
+    pending: queue.SimpleQueue[tuple[dict[str, Any], int, int]] = queue.SimpleQueue()
     for task in tasks:
-        pending.put((task, 1))
+        pending.put((task, 1, 0))  # the how-manieth try; nodes that were lost with it
     outcomes: queue.SimpleQueue[TaskResult | Retry] = queue.SimpleQueue()
     stopping = threading.Event()
     open_tasks = len(tasks)  # not answered for yet: written by the consumer alone, read by the workers' threads
@@ -193,20 +193,22 @@ def run_tasks(
         # The thread lives as long as its worker: PR_SET_PDEATHSIG follows the spawning thread.
         try:
             while not stopping.is_set() and open_tasks > 0:
-                if not worker.ready():
-                    continue
                 try:
-                    task, attempt = pending.get(timeout=0.05)
+                    if not worker.ready():
+                        continue
+                    task, attempt, losses = pending.get(timeout=0.05)
                 except queue.Empty:
                     continue
                 started = time.monotonic()
                 try:
                     answer = worker.answer(task, task_timeout.limit(attempt), task_timeout.reason())
                 except WorkerLost as loss:
-                    outcomes.put(Retry(task, str(loss)))
-                    pending.put((task, attempt))
-                    continue
-                except (WorkerDied, OSError, ValueError) as death:  # also: cannot be started, truncated answer
+                    if losses + 1 < MOST_LOSSES:
+                        outcomes.put(Retry(task, str(loss)))
+                        pending.put((task, attempt, losses + 1))
+                        continue
+                    answer = {"error": f"{loss}, as were those that had it before", "retry": False, "died": True}
+                except Exception as death:  # cannot be started, truncated answer, no room for what it reads
                     answer = {"error": " ".join(str(death).split()), "retry": True, "died": True}
                 if stopping.is_set():
                     return
@@ -222,7 +224,7 @@ def run_tasks(
                     )
                 elif attempt < MAX_ATTEMPTS and answer.get("retry", True):
                     outcomes.put(Retry(task, answer["error"]))
-                    pending.put((task, attempt + 1))
+                    pending.put((task, attempt + 1, losses))
                 else:
                     died, number = answer.get("died", False), answer.get("errno")
                     outcomes.put(TaskResult(task, None, answer["error"], attempt, seconds, died, number, node))
@@ -240,7 +242,7 @@ def run_tasks(
                 continue
             more = next_tasks(outcome) if next_tasks is not None else ()
             for task in more:
-                pending.put((task, 1))
+                pending.put((task, 1, 0))
             open_tasks += len(more) - 1
             if outcome.errno == errno.ENOSPC:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), outcome.task.get("output", str(log.parent)))

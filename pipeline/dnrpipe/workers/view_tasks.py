@@ -50,11 +50,20 @@ def only_answer(
     console: Console,
     environment: dict[str, str] | None = None,
     place: Placement = HERE,
+    timeout: float | None = None,
 ) -> dict[str, Any]:
     """The result of one task on a worker of its own. Raises UserError: it failed twice."""
     retried = warn_of_retries(label, console)
     (outcome,) = run_tasks(
-        module, common, [task], workers=1, log=log, retried=retried, environment=environment, place=place
+        module,
+        common,
+        [task],
+        workers=1,
+        log=log,
+        retried=retried,
+        environment=environment,
+        place=place,
+        timeout=timeout,
     )
     if outcome.result is None:
         raise UserError(f"{label} failed twice: {outcome.error}; see {log}")
