@@ -31,7 +31,8 @@ ON_RAY = 8
 @click.option(
     "--forecast",
     metavar="N,M",
-    help="Only say what the fleet would take on so many nodes like this machine, by what its finished scenes took.",
+    help="Only say what the fleet would take on so many nodes like this machine (and --jobs), by what its finished"
+    " scenes took.",
 )
 @options([*EXECUTOR_OPTIONS, *OUTPUT_OPTIONS])
 def batch(
@@ -58,7 +59,7 @@ def batch(
     console = Console(json_mode=as_json, quiet=quiet)
     plan = read_fleet(fleet)
     if forecast is not None:
-        _tell_forecast(plan, forecast, console)
+        _tell_forecast(plan, forecast, jobs or ON_RAY, console)
         return
     on_ray = more["executor"] == "ray"
     if on_ray:  # one cluster for all commands
@@ -79,10 +80,10 @@ def batch(
         raise TasksFailed(f"batch: {names} failed; see {plan.out / 'logs'}")
 
 
-def _tell_forecast(plan: Fleet, nodes: str, console: Console) -> None:
+def _tell_forecast(plan: Fleet, nodes: str, jobs: int, console: Console) -> None:
     from ..core.ledger import Ledger
     from ..core.units import duration
-    from ..fleet.forecast import forecast
+    from ..fleet.forecast import chain_of, forecast
     from ..fleet.records import read_rows
     from ..workers.view_tasks import worker_count
 
@@ -93,12 +94,15 @@ def _tell_forecast(plan: Fleet, nodes: str, console: Console) -> None:
     if not counts or counts[0] < 1:
         raise UserError(f"--forecast {nodes}: name numbers of nodes, for example 1,8,64")
     finished = {row.name for row in read_rows(plan.out) if row.state == "done"}
-    ledgers = [Ledger(job.workspace / "costs.jsonl").read() for job in plan.jobs if job.name in finished]
+    ledgers = [Ledger(job.workspace / "costs.jsonl") for job in plan.jobs if job.name in finished]
     if not ledgers:
         raise UserError(f"--forecast: no scene of {plan.out} is done yet; run some of them first")
     slots = worker_count(0)
-    found = forecast(ledgers, len(plan.jobs), counts, slots=slots, drivers=ON_RAY)
-    console.say(f"{len(plan.jobs)} scenes, by the costs of {len(ledgers)}; nodes of {slots} tasks side by side:")
+    chains = [chain_of(ledger.read()) for ledger in ledgers]
+    found = {count: forecast(chains, len(plan.jobs), count, slots=slots, drivers=jobs) for count in counts}
+    console.say(
+        f"{len(plan.jobs)} scenes, {jobs} at once, by the costs of {len(ledgers)}; nodes of {slots} tasks side by side:"
+    )
     for count, seconds in found.items():
         console.say(f"  {count:>4} nodes  {duration(seconds)}")
     console.result({"scenes": len(plan.jobs), "known": len(ledgers), "seconds": found})

@@ -21,10 +21,13 @@ from dataclasses import dataclass
 
 from ..core.ledger import CostRecord
 
-START = 4.0
-"""Seconds until a worker has imported Blender or Mitsuba and read a scene; `tools.bench_ray` measures it."""
+START = 2.3
+"""Seconds until a node's worker has imported Blender or Mitsuba and read a scene, and its files are there. Tracing on
+one node takes 4.1 s more in its three lists than here (`tools.bench_ray`), where a worker takes 1 s."""
 PER_TASK = 0.02
-"""Seconds that a task takes on top, files included; as measured there."""
+"""Seconds that a task takes on top, its files included; as measured there."""
+DRIVEN = {("prepare", "convert"), ("select", "selection"), ("evaluate", "neural")}
+"""(stage, what) that the driving machine makes itself."""
 
 
 @dataclass(frozen=True)
@@ -37,24 +40,35 @@ class Step:
 
 
 def chain_of(records: Sequence[CostRecord]) -> list[Step]:
-    """The steps of a scene, by its ledger. Views are lists of tasks; the rest is one task each; overhead of starting
-    processes is left out, since a cluster has its own."""
+    """The steps of a scene, by its ledger. Views are lists of tasks; the rest is one task each. What the driver did
+    between them ("everything else") is its own step; overhead of starting processes is left out, since a cluster has
+    its own."""
     steps: list[Step] = []
-    work = [record for record in records if record.unit != "overhead" and not record.cache_hit]
-    for _, group in itertools.groupby(work, key=_kind):
+    for kind, group in itertools.groupby((record for record in records if not record.cache_hit), key=_kind):
         found = list(group)
-        driver = found[0].stage == "prepare" and found[0].unit == "scene"
-        if found[0].unit == "view":
+        if kind == STARTS:
+            continue
+        driver = kind in DRIVEN or found[0].unit == "overhead"
+        if found[0].unit == "view" and kind[1] != TRAINING:
             alone = max(record.workers for record in found) == 1 and len(found) > 1
-            steps.append(Step(tuple(record.seconds for record in found), whole=alone))
+            steps.append(Step(tuple(record.seconds for record in found), driver, whole=alone and not driver))
         else:
             steps.append(Step((sum(record.seconds for record in found),), driver, not driver))
     return steps
 
 
-def _kind(record: CostRecord) -> tuple[str, str, str]:
-    name = record.name.partition("/")[0] if record.unit == "view" else "" if record.unit == "epoch" else record.name
-    return record.stage, record.unit, name
+TRAINING = "training"
+STARTS = ("", "")
+
+
+def _kind(record: CostRecord) -> tuple[str, str]:
+    """(stage, what); records of the same kind after one another are one step."""
+    what = record.name.partition("/")[0] if record.unit == "view" else record.name
+    if record.unit == "epoch" or what == "preview":
+        return record.stage, TRAINING
+    if record.unit == "overhead" and what != "everything else":
+        return STARTS
+    return record.stage, what
 
 
 def makespan(
@@ -63,6 +77,7 @@ def makespan(
     *,
     slots: int = 1,
     drivers: int = 8,
+    cores: int | None = None,
     start: float = START,
     per_task: float = PER_TASK,
 ) -> float:
@@ -71,12 +86,13 @@ def makespan(
     Args:
         slots: of each node.
         drivers: chains under way at once.
+        cores: of the driving machine, one for each step that it makes itself; None: as many as drivers.
         start: seconds before the first task of a step on each slot that it may get.
     """
     waiting: deque[int] = deque(range(len(chains)))  # chains that have not begun
     ready: deque[tuple[int, float, int]] = deque()  # (chain, seconds, slots that it takes; 0: the driver's)
     free = [slots] * nodes
-    places = drivers
+    places = drivers if cores is None else min(drivers, cores)
     left, next_step = [0] * len(chains), [0] * len(chains)
     events: list[tuple[float, int, int, int, int]] = []  # (time, tie, chain, node, slots)
     tie = itertools.count()
@@ -130,10 +146,7 @@ def makespan(
             under_way -= 1
 
 
-def forecast(
-    ledgers: Sequence[Sequence[CostRecord]], scenes: int, nodes: Sequence[int], *, slots: int, drivers: int
-) -> dict[int, float]:
-    """Seconds by number of nodes, for so many scenes of the kind that the ledgers are of."""
-    known = [chain_of(records) for records in ledgers]
-    chains = [known[number % len(known)] for number in range(scenes)]
-    return {count: makespan(chains, count, slots=slots, drivers=drivers) for count in nodes}
+def forecast(chains: Sequence[Sequence[Step]], scenes: int, nodes: int, *, slots: int, drivers: int) -> float:
+    """Seconds for so many scenes like those of the chains. The driver is one more machine like a node."""
+    like = [chains[number % len(chains)] for number in range(scenes)]
+    return makespan(like, nodes, slots=slots, drivers=drivers, cores=slots)
