@@ -10,7 +10,7 @@ APT_DEV := chromium
 PYTEST  := $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 
 # Pages with tables made from docs/results.
-RESULTS := $(addprefix docs/,ablation.md bench-select.md cost.md frames.md noise.md)
+RESULTS := $(addprefix docs/,ablation.md bench-select.md cost.md frames.md noise.md scaling.md)
 
 .DEFAULT_GOAL := help
 .PHONY: help setup system browser demo test lint types imports docs docs-check audit robustness bench bench-effects bench-frames pretrain fidelity scenes clean
@@ -27,7 +27,7 @@ system:
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt torch
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[render,train,serve,export,dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[render,train,serve,export,ray,dev]'
 	@touch $@
 
 demo: setup  ## the demo scene from .blend to report, untrained and trained; prints the report's path

@@ -14,7 +14,7 @@ from dnrpipe.core.cameras import make_cameras
 from dnrpipe.core.settings import CameraSettings
 from dnrpipe.effects.bundle import write_without
 from dnrpipe.raytrace.variants import choose_variant
-from dnrpipe.workers.processes import TaskResult, run_tasks
+from dnrpipe.workers.task_list import TaskResult, run_tasks
 
 SUMMARY = sphere_summary((0.0, 0.0, 0.3), 1.5)
 SIZE, SPP = 48, 64

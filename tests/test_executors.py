@@ -14,8 +14,9 @@ from pathlib import Path
 import pytest
 
 from dnrpipe.core.errors import UserError
-from dnrpipe.workers import processes as processes_module
-from dnrpipe.workers.processes import LocalWorker, Retry, TaskFailed, TaskResult, WorkerDied, run_tasks
+from dnrpipe.workers import task_list as task_list_module
+from dnrpipe.workers.processes import LocalWorker, TaskFailed, WorkerDied
+from dnrpipe.workers.task_list import Retry, TaskResult, run_tasks
 
 WORKER = """
 import os, pathlib, resource, signal, sys, tempfile, time
@@ -126,14 +127,14 @@ def test_a_time_limit_from_the_environment(module: str, tmp_path: Path, monkeypa
 
 def test_a_time_limit_from_what_tasks_took(module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Hours before anything is known, then a multiple of the longest, and twice that for the second try."""
-    timeout = processes_module.TaskTimeout()
+    timeout = task_list_module.TaskTimeout()
     assert (timeout.limit(1), timeout.reason()) == (6 * 3600, "")
     for seconds in (4.0, 100.0, 50.0):
         timeout.took(seconds)
     assert (timeout.limit(1), timeout.limit(2)) == (3000, 6000)
     assert timeout.reason() == "; the longest so far took 100 s"
-    monkeypatch.setattr(processes_module, "LEAST_LIMIT", 0.5)
-    monkeypatch.setattr(processes_module, "SLOWEST", 1.0)
+    monkeypatch.setattr(task_list_module, "LEAST_LIMIT", 0.5)
+    monkeypatch.setattr(task_list_module, "SLOWEST", 1.0)
     results, retries = _run(module, tmp_path, ["sleep", "hang"], workers=1)
     assert results[0].error is None
     assert "hung" in retries[0].reason and "the longest so far took" in retries[0].reason
@@ -175,7 +176,7 @@ def test_closing_the_iterator_kills_the_workers(module: str, tmp_path: Path) -> 
 @pytest.mark.skipif(sys.platform != "linux", reason="PR_SET_PDEATHSIG is Linux's")
 def test_workers_die_with_their_parent(module: str, tmp_path: Path) -> None:
     script = (
-        "from dnrpipe.workers.processes import run_tasks; from pathlib import Path;"
+        "from dnrpipe.workers.task_list import run_tasks; from pathlib import Path;"
         f"list(run_tasks('{module}', {{'folder': '.'}}, [{{'kind': 'hang', 'n': 0}}], workers=1,"
         f" log=Path('{tmp_path}/log.txt')))"
     )

@@ -18,7 +18,7 @@ from dnrpipe.core.cameras import make_cameras  # noqa: E402
 from dnrpipe.core.scene_files import read_census, read_summary  # noqa: E402
 from dnrpipe.core.settings import CameraSettings  # noqa: E402
 from dnrpipe.raytrace.variants import choose_variant  # noqa: E402
-from dnrpipe.workers.processes import TaskResult, run_tasks  # noqa: E402
+from dnrpipe.workers.task_list import TaskResult, run_tasks  # noqa: E402
 from dnrtrain.contract import GBUFFER_CHANNELS, View  # noqa: E402
 from dnrtrain.exr import read_exr  # noqa: E402
 

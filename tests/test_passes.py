@@ -16,7 +16,7 @@ from dnrpipe.raytrace.grouped import launch_sizes
 from dnrpipe.raytrace.pictures import repair
 from dnrpipe.raytrace.samples import read_samples
 from dnrpipe.raytrace.variants import choose_variant
-from dnrpipe.workers.processes import TaskResult, run_tasks
+from dnrpipe.workers.task_list import TaskResult, run_tasks
 from dnrtrain.exr import read_exr
 
 SUMMARY = sphere_summary((0.0, 0.0, 0.0), 1.2)

@@ -17,7 +17,7 @@ from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import CameraSettings
 from dnrpipe.raytrace.noise import half_noise
 from dnrpipe.raytrace.variants import choose_variant, llvm_libraries
-from dnrpipe.workers.processes import TaskResult, run_tasks
+from dnrpipe.workers.task_list import TaskResult, run_tasks
 from dnrtrain.exr import read_exr, write_exr
 
 SUMMARY = sphere_summary((0.0, 0.0, 0.0), 1.2)

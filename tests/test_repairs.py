@@ -19,7 +19,7 @@ from dnrpipe.stages.base_images import BaseRenderer, bake_light
 from dnrpipe.stages.effect_plan import run_pilots
 from dnrpipe.stages.stage import Run
 from dnrpipe.workers import view_tasks
-from dnrpipe.workers.processes import TaskResult
+from dnrpipe.workers.task_list import TaskResult
 from dnrpipe.workers.view_tasks import warn_of_repairs
 from dnrtrain.contract import ContractError, View
 from dnrtrain.exr import read_exr, write_exr

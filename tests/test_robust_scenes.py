@@ -19,7 +19,7 @@ bpy = pytest.importorskip("bpy")
 from dnrpipe.core.cameras import depth_range, make_cameras  # noqa: E402
 from dnrpipe.core.scene_files import read_summary  # noqa: E402
 from dnrpipe.core.settings import CameraSettings  # noqa: E402
-from dnrpipe.workers.processes import TaskResult, run_tasks  # noqa: E402
+from dnrpipe.workers.task_list import TaskResult, run_tasks  # noqa: E402
 from dnrtrain.exr import read_exr  # noqa: E402
 
 pytestmark = pytest.mark.slow

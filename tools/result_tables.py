@@ -5,7 +5,7 @@ Kinds: results (of `dnrpipe ablate`), frames (of tools.bench_frames),
 frames-overview (its tables over all scenes), noise (of tools.bench_noise),
 frontier (of `dnrpipe frontier`), plan-check (of tools.plan_check), selection (of `dnrpipe bench-select`),
 selections (of several of its runs together: FILE,FILE), plan-equal (of tools.plan_equal),
-untrained (of tools.bench_untrained).
+untrained (of tools.bench_untrained), scaling (of tools.bench_ray).
 
 python -m tools.result_tables [--check] docs/ablation.md docs/*.md
 """
@@ -20,6 +20,7 @@ from pathlib import Path
 from tools.bench_frames.document import markdown as frames_markdown
 from tools.bench_frames.document import overview as frames_overview
 from tools.bench_noise.document import markdown as noise_markdown
+from tools.bench_ray import markdown as scaling_markdown
 from tools.bench_untrained import markdown as untrained_markdown
 from tools.plan_check import markdown as check_markdown
 from tools.plan_equal import markdown as equal_markdown
@@ -32,7 +33,7 @@ from dnrpipe.studies.selectbench.bench_tables import markdown as selection_markd
 from dnrpipe.studies.selectbench.bench_tables import read_results as selection_results
 from dnrpipe.studies.selectbench.bench_tables import together as selections_markdown
 
-KINDS = "rows|results|frames(?:-overview)?|noise|frontier|plan-check|plan-equal|selections?|untrained"
+KINDS = "rows|results|frames(?:-overview)?|noise|frontier|plan-check|plan-equal|selections?|untrained|scaling"
 PART = re.compile(rf"(<!-- ({KINDS})(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -59,6 +60,8 @@ def generate(text: str, folder: Path) -> str:
             body = "\n".join(frames_overview(json.loads((folder / match[3]).read_text(encoding="utf-8"))))
         elif match[2] == "untrained":
             body = untrained_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
+        elif match[2] == "scaling":
+            body = scaling_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
         elif match[2] == "frontier":
             body = lowered(frontier_markdown(read_frontier(folder / match[3])))
         elif match[2] == "selection":

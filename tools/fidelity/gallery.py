@@ -19,7 +19,7 @@ from PIL import Image
 
 from dnrpipe.core.console import Console
 from dnrpipe.core.workspace import file_sha256
-from dnrpipe.workers.processes import run_tasks
+from dnrpipe.workers.task_list import run_tasks
 from dnrtrain.atomic import atomic_path, write_json, write_text
 
 from . import ours

@@ -19,7 +19,7 @@ from dnrpipe.core.workspace import Source, Workspace, file_sha256
 from dnrpipe.raytrace.variants import choose_variant
 from dnrpipe.stages.prepare import convert_scene
 from dnrpipe.stages.stage import Run
-from dnrpipe.workers.processes import TaskResult, run_tasks
+from dnrpipe.workers.task_list import TaskResult, run_tasks
 from dnrtrain.exr import read_exr
 
 from .reference_settings import PATH_DEPTH

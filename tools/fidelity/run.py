@@ -17,7 +17,7 @@ from typing import Any
 
 from dnrpipe.core.console import Console
 from dnrpipe.raytrace.variants import choose_variant
-from dnrpipe.workers.processes import run_tasks
+from dnrpipe.workers.task_list import run_tasks
 from dnrtrain.atomic import write_json
 
 from . import ours, reference_settings

@@ -56,7 +56,7 @@ def prepare(
     converter = convert_materials(frozen.meshes, scene_dir, findings, bakes)
     pending = missing_bakes(converter, frozen.meshes, atlas, scene_dir, scene.frame_current)
     if pending is not None:
-        return pending
+        return pending.model_copy(update={"external": tuple(loaded.external)})
     materials = export_bundle(frozen.meshes, converter)
     census = census.model_copy(update={"findings": list(findings)})
     radius = loaded.bounds.radius

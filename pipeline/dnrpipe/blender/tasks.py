@@ -59,10 +59,14 @@ class MaterialTaps(Task):
 
 
 class PendingBakes(Task):
-    """What has to be baked before a scene can be exported. layers: of one bake each. frame: the scene's current one."""
+    """What has to be baked before a scene can be exported.
+
+    layers: of one bake each. frame: the scene's current one. external: other files that the scene file refers to.
+    """
 
     layers: tuple[tuple[MaterialTaps, ...], ...]
     frame: int
+    external: tuple[Path, ...] = ()
 
 
 class PrepareAnswer(Task):

@@ -17,6 +17,7 @@ from .. import __version__
 from ..core.errors import UserError
 from . import information, stages
 from .export import export_gltf, export_nerf, export_onnx, export_web
+from .fleet import batch
 from .plan import frontier, plan
 from .service import cancel, jobs, logs, retry, serve, submit
 from .studies import ablate, bench_select
@@ -25,6 +26,7 @@ _EXTRAS = {
     "train": ("torch",),
     "render": ("bpy", "mitsuba", "drjit", "flip_evaluator", "imageio_ffmpeg", "PIL", "jinja2", "matplotlib"),
     "export": ("onnx", "onnxruntime", "playwright"),
+    "ray": ("ray",),
     "serve": ("fastapi", "uvicorn", "websockets", "httpx"),
 }
 """What an optional dependency belongs to."""
@@ -71,6 +73,7 @@ for _command in (
     export_gltf,
     export_web,
     stages.run,
+    batch,
     plan,
     frontier,
     ablate,

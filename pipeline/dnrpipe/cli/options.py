@@ -42,6 +42,12 @@ OUTPUT_OPTIONS = [
     click.option("--json", "as_json", is_flag=True, help="Print one JSON value; messages to stderr."),
     click.option("-q", "--quiet", is_flag=True, help="Warnings and errors only."),
 ]
+EXECUTOR_OPTIONS = [
+    click.option("--executor", type=click.Choice(["local", "ray"]), help="Where task lists run (default local)."),
+    click.option("--address", metavar="WHERE", help="Ray cluster: local (default), auto or HOST:PORT."),
+    click.option("--shared", is_flag=True, help="All nodes of it see the workspace under the same path."),
+]
+"""What `executor_assignments` reads."""
 common = options(
     [
         click.option("-w", "--workspace", metavar="DIR", help="The workspace folder (scene.dnr)."),
@@ -54,6 +60,7 @@ common = options(
             help="Any setting, e.g. --set finetune.step2.epochs=20. Repeatable; remembered.",
         ),
         click.option("--force", is_flag=True, help="Do it again, reusing nothing."),
+        *EXECUTOR_OPTIONS,
         *OUTPUT_OPTIONS,
     ]
 )
@@ -98,7 +105,16 @@ def open_session(
     """The command's hold on its workspace. ``late``: overrides that depend on the settings as they are."""
     from ..stages.session import Session
 
+    options["assignments"] = (*executor_assignments(options), *options["assignments"])
     return Session(command, options, scene, overrides or {}, late)
+
+
+def executor_assignments(options: dict[str, Any]) -> list[str]:
+    """The flags as settings; they are taken out of the options."""
+    engine, address, shared = (options.pop(name, None) for name in ("executor", "address", "shared"))
+    given = [] if engine is None else [f"executor.engine={engine}"]
+    given += [] if address is None else [f'executor.address="{address}"']
+    return [*given, "executor.shared=true"] if shared else given
 
 
 @contextmanager

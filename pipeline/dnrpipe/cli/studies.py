@@ -7,6 +7,8 @@ from typing import Any
 
 import click
 
+from .options import EXECUTOR_OPTIONS, executor_assignments, options
+
 SCENES = click.option(
     "--scenes", metavar="A,B", help="Scene files, or names of blender_scenes/ (default: its ten scenes)."
 )
@@ -15,6 +17,7 @@ JOBS = click.option(
     "--jobs", type=int, default=0, metavar="N", help="Cells side by side (default: one per core; 1 on a GPU)."
 )
 JSON = click.option("--json", "as_json", is_flag=True, help="Print results.json; messages to stderr.")
+EXECUTOR = options(EXECUTOR_OPTIONS)
 QUIET = click.option("-q", "--quiet", is_flag=True, help="Warnings and errors only.")
 
 
@@ -38,9 +41,10 @@ QUIET = click.option("-q", "--quiet", is_flag=True, help="Warnings and errors on
     help="Workspaces, cells, results.json, tables.md, plot.png and pictures/ go here.",
 )  # fmt: skip
 @click.option("--smoke", is_flag=True, help="One small scene, two rows, few epochs: shows that it works.")
+@EXECUTOR
 @JSON
 @QUIET
-def ablate(as_json: bool, quiet: bool, out: Path, **options: Any) -> None:
+def ablate(as_json: bool, quiet: bool, out: Path, **given: Any) -> None:
     """Train variants of the neural renderer on the same scenes and views, and tabulate them.
 
     Scenes are prepared and their views ray-traced once. A cell (scene, row, seed) that is done is not done again:
@@ -56,7 +60,8 @@ def ablate(as_json: bool, quiet: bool, out: Path, **options: Any) -> None:
     from ..studies.ablation.ablate import run_ablation
 
     console = Console(json_mode=as_json, quiet=quiet)
-    results = run_ablation(out=out, console=console, **options)
+    given["assignments"] = (*executor_assignments(given), *given["assignments"])
+    results = run_ablation(out=out, console=console, **given)
     console.say(f"{len(results['cells'])} cells: {out / 'tables.md'}, {out / 'plot.png'}, {out / 'pictures'}")
     console.result(results)
 
@@ -82,9 +87,10 @@ def ablate(as_json: bool, quiet: bool, out: Path, **options: Any) -> None:
     help="Workspaces, selections, cells, results.json, report.md, views.png and seconds.png go here.",
 )  # fmt: skip
 @click.option("--smoke", is_flag=True, help="One small scene, two pools, few epochs: shows that it works.")
+@EXECUTOR
 @JSON
 @QUIET
-def bench_select(as_json: bool, quiet: bool, out: Path, **options: Any) -> None:
+def bench_select(as_json: bool, quiet: bool, out: Path, **given: Any) -> None:
     """Let policies choose views from the same candidates, train the same model on them, and compare.
 
     Pools are prepared once, views are ray-traced once, when some policy chooses them. A cell (scene, pool, budget,
@@ -101,6 +107,7 @@ def bench_select(as_json: bool, quiet: bool, out: Path, **options: Any) -> None:
     from ..studies.selectbench.bench_select import run_bench
 
     console = Console(json_mode=as_json, quiet=quiet)
-    results = run_bench(out=out, console=console, **options)
+    given["assignments"] = (*executor_assignments(given), *given["assignments"])
+    results = run_bench(out=out, console=console, **given)
     console.say(f"{len(results['cells'])} cells: {out / 'report.md'}, {out / 'views.png'}, {out / 'seconds.png'}")
     console.result(results)

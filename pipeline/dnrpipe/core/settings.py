@@ -154,6 +154,27 @@ class SelectSettings(Strict):
         return MOST_VIEWS if self.budget == "auto" else self.budget
 
 
+class ExecutorSettings(Strict):
+    """Where lists of tasks run; it decides nothing of what they make."""
+
+    engine: Literal["local", "ray"] = Field(
+        default="local", description="processes of this machine, or a Ray cluster (docs/scaling.md)"
+    )
+    address: str = Field(
+        default="local",
+        description="of the cluster: local (one of this machine's own), auto (the running one), or HOST:PORT",
+    )
+    workers: int = Field(
+        default=0,
+        ge=0,
+        description="workers to ask the cluster for at once; 0: as many as it has room for now. More than fit make an"
+        " autoscaler add nodes",
+    )
+    shared: bool = Field(
+        default=False, description="all nodes see the workspace under the same path: nothing is sent to and fro"
+    )
+
+
 class FinetuneSettings(Strict):
     """Step 2."""
 
@@ -180,6 +201,7 @@ class Settings(Strict):
     raytrace: RaytraceSettings = RaytraceSettings()
     effects: EffectSettings = EffectSettings()
     finetune: FinetuneSettings = FinetuneSettings()
+    executor: ExecutorSettings = ExecutorSettings()
     device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="torch device")
 
     @model_validator(mode="after")

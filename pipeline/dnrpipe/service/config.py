@@ -23,9 +23,9 @@ class ServerConfig(BaseModel, extra="forbid", frozen=True):
     devices: one worker each, "cpu" or "cuda:<n>". rate, burst: requests per second and at once, per client address.
     streams: event streams and viewers open at once. viewers: workspaces viewed live at once. idle_seconds: after so
     long without a viewer a frame process ends. keep_days, keep_jobs: the server deletes logs and events of jobs that
-    ended longer ago, or before so many others. limits: upper bounds for every job.
-    trusted_proxy: address of a proxy whose X-Forwarded-For and -Proto are believed, "" believes none. public_url: the
-    address that browsers know the server by, where that is another.
+    ended longer ago, or before so many others. limits: upper bounds for every job. executor: settings of where jobs'
+    task lists run. trusted_proxy: address of a proxy whose X-Forwarded-For and -Proto are believed, "" believes none.
+    public_url: the address that browsers know the server by, where that is another.
     """
 
     root: Path
@@ -44,6 +44,7 @@ class ServerConfig(BaseModel, extra="forbid", frozen=True):
     keep_days: float = Field(default=30.0, gt=0, le=36_500)
     keep_jobs: int = Field(default=1000, ge=1)
     free_disk_mb: int = Field(default=1024, ge=0, description="the server refuses uploads and jobs below this")
+    executor: tuple[str, ...] = ()
     trusted_proxy: str = ""
     public_url: str = ""
     limits: Limits = Limits(seconds=24 * 3600.0, disk_mb=50 * 1024)

@@ -14,7 +14,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ..core.errors import UserError
-from ..workers.processes import MAX_ATTEMPTS, LocalWorker, TaskFailed, WorkerDied
+from ..workers.processes import LocalWorker, TaskFailed, WorkerDied
+from ..workers.task_list import MAX_ATTEMPTS
 from .config import ServerConfig
 from .live_scene import LiveRequest, LiveScene, open_scene
 from .root import ServiceRoot

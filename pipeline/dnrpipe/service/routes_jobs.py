@@ -18,7 +18,7 @@ from .state import State as Service
 
 KEEP_ALIVE = 15.0
 LOG_CHUNK = 256 * 1024
-SERVER_SETTINGS = ("device", "strict")
+SERVER_SETTINGS = ("device", "strict", "executor")
 """Settings that the server decides."""
 STATUSES = {
     400: "The request is not what HTTP wants",

@@ -23,7 +23,8 @@ from filelock import FileLock, Timeout
 from ..core.errors import UserError
 from ..core.event_stream import VARIABLE
 from ..core.workspace import LOCK_FILES
-from ..workers.processes import TIMEOUT_VARIABLE, die_with_parent, how_ended
+from ..workers.processes import die_with_parent, how_ended
+from ..workers.task_list import TIMEOUT_VARIABLE
 from .config import ServerConfig, tightest
 from .models import Job, Limits
 from .queue import MAX_STARTS, Queue
@@ -68,7 +69,7 @@ class Worker:
 
     def _run_job(self, job: Job) -> None:
         workspace = self.root.workspace(job.request.workspace, must_exist=False)
-        command = job_command(job, self.root)
+        command = job_command(job, self.root, self.config.executor)
         if workspace.is_dir():  # if somebody else holds it, the command says so
             with contextlib.suppress(Timeout), FileLock(workspace / LOCK_FILES[0], timeout=UNLOCK_SECONDS):
                 pass
@@ -162,7 +163,7 @@ class EventReader:
         return found
 
 
-def job_command(job: Job, root: ServiceRoot) -> list[str]:
+def job_command(job: Job, root: ServiceRoot, executor: tuple[str, ...] = ()) -> list[str]:
     """The command line of a job. Only the first start gets `--force`; later ones resume."""
     request = job.request
     workspace = root.workspace(request.workspace, must_exist=False)
@@ -174,6 +175,8 @@ def job_command(job: Job, root: ServiceRoot) -> list[str]:
         command += ["--preset", request.preset]
     for key, value in request.settings.items():
         command += ["--set", f"{key}={value if isinstance(value, str) else json.dumps(value)}"]
+    for setting in executor:  # the operator's word, after the job's
+        command += ["--set", setting]
     if request.force and job.starts == 1:
         command.append("--force")
     return command

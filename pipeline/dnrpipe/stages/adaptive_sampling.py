@@ -12,7 +12,7 @@ from dnrtrain.exr import read_metadata
 from ..core.console import Console
 from ..raytrace.sample_schedule import Goal, Schedule, Step, ViewProgress
 from ..raytrace.samples import read_facts
-from ..workers.processes import TaskResult, run_tasks
+from ..workers.task_list import TaskResult, run_tasks
 from ..workers.view_tasks import Book, Failures, is_made, task_name
 from .stage import Run
 
@@ -65,6 +65,7 @@ def sample_adaptively(
         retried=failures.retried,
         environment=environment,
         next_tasks=next_tasks,
+        place=run.place,
     )
     if goal.seconds is not None:
         bar = run.console.bar(f"{label}, seconds", math.ceil(schedule.deadline - schedule.clock()))
@@ -76,7 +77,7 @@ def sample_adaptively(
             written = outcome.result is not None and not outcome.task["add"]
             if written:
                 assert outcome.result is not None
-                book(outcome.task, outcome.result, count)
+                book(outcome.task, outcome.result, outcome.side_by_side)
             if goal.seconds is not None:
                 past = min(shown.total, int(schedule.clock() - began))
                 shown.advance(past - shown.done, note=task_name(outcome.task))

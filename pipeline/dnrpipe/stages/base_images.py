@@ -23,6 +23,7 @@ from ..core.workspace import Workspace, digest
 from ..effects.plan import EffectPlan
 from ..effects.store import plan_of, trace_config
 from ..raytrace.variants import choose_variant
+from ..workers.task_list import HERE
 from ..workers.view_tasks import only_answer, warn_of_repairs
 from .effect_plan import resolve_plan
 from .stage import Run
@@ -136,6 +137,7 @@ def base_views(
         workers=1,  # a kernel to compile; its threads fill the machine
         book=run.book_views(f"mitsuba {renderer.common['variant']}", folder=f"base/{split}", purpose=purpose),
         environment=renderer.environment,
+        place=HERE if remembers else None,  # one frame after the other, by one worker that knows the last
     )
     warn_of_repairs(tasks, run.console)
     return tasks
@@ -216,6 +218,7 @@ def bake_light(run: Run, renderer: BaseRenderer) -> dict[str, Any] | None:
             log=run.log,
             console=run.console,
             environment=renderer.environment,
+            place=run.place,
         )
         bar.advance(note=f"{task['size']}² texels, {task['spp']} spp")
     if result["lost"]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ..core.console import Console
 from ..effects.plan import DepthPilot, EffectPlan
 from ..effects.store import (
     PILOT_RESOLUTION,
@@ -50,7 +49,7 @@ def _run_pilot(run: Run, plan: EffectPlan) -> DepthPilot:
         "tolerance": chosen.tolerance,
         "pixel_tolerance": chosen.pixel_tolerance,
     }
-    (answer,) = run_pilots([task], choice, run.console, "path depth pilot", run.log)
+    (answer,) = run_pilots([task], choice, run, "path depth pilot", run.log)
     run.book(
         "training",
         "scene",
@@ -75,18 +74,21 @@ def _run_pilot(run: Run, plan: EffectPlan) -> DepthPilot:
 
 
 def run_pilots(
-    tasks: list[dict[str, Any]], choice: VariantChoice, console: Console, label: str, log: Path
+    tasks: list[dict[str, Any]], choice: VariantChoice, run: Run, label: str, log: Path
 ) -> list[dict[str, Any]]:
     """Run pilot tasks, each in a process of its own (bundles add up in memory); answers in the tasks' order.
 
     Raises UserError when one fails twice.
     """
     results: list[dict[str, Any]] = []
+    console = run.console
     with console.bar(label, len(tasks)) as bar:
         for task in tasks:
             common = {"configs": [task[key] for key in ("config", "with_effect", "without_effect") if key in task]}
             module, environment = "dnrpipe.raytrace.pilot", choice.environment
-            result = only_answer(label, module, common, task, log=log, console=console, environment=environment)
+            result = only_answer(
+                label, module, common, task, log=log, console=console, environment=environment, place=run.place
+            )
             if lost := result["masked"]:
                 console.warn(f"repaired: {lost} pixels of {label} pictures were not finite and are black")
             results.append(result)

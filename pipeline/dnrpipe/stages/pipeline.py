@@ -26,6 +26,7 @@ from ..core.scene_files import scene_fingerprint
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest
 from . import evaluate, finetune, prepare, raytrace, select
+from .elsewhere import make_elsewhere, trains
 from .stage import Outcome, Run, Stage
 
 State = Literal["missing", "partial", "stale", "done"]
@@ -224,6 +225,8 @@ def _make(stage: Stage, run: Run, inputs: str) -> Outcome:
         try:
             own = run.for_stage(stage.name, inputs)
             with own.timed("everything else"):
+                if trains(stage.name, run.settings) and not run.place.is_local:
+                    return make_elsewhere(own)
                 return stage.make(own)
         except DamagedFile as damage:
             owner = owner_of(damage.path, run.workspace)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -40,7 +41,7 @@ from ..core.scene_records import Conversion, RasterChoice, SceneSummary
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest, file_sha256
 from ..effects.store import keep_plan
-from ..workers.processes import Retry, run_tasks
+from ..workers.task_list import HERE, Placement, Retry, run_tasks
 from ..workers.view_tasks import warn_of_repairs, warn_of_retries, worker_count
 from .base_images import RENDERED
 from .stage import Outcome, Run
@@ -266,7 +267,7 @@ def bake(run: Run, source: Path, geometry: Path, pending: PendingBakes) -> list[
     folder = run.workspace.root / BAKES
     folder.mkdir(parents=True, exist_ok=True)
     common = BakeCommon(
-        source=source,
+        source=source.resolve(),
         frame=pending.frame,
         geometry=geometry,
         folder=folder,
@@ -283,6 +284,7 @@ def bake(run: Run, source: Path, geometry: Path, pending: PendingBakes) -> list[
             workers=count,
             log=run.log,
             retried=warn_of_retries("bake", console),
+            place=_place_of_bakes(run, source, pending.external),
         ):
             if outcome.result is None:
                 layer = BakeTask.model_validate(outcome.task).layer
@@ -296,6 +298,19 @@ def bake(run: Run, source: Path, geometry: Path, pending: PendingBakes) -> list[
                     )
             bar.advance()
     return refused
+
+
+def _place_of_bakes(run: Run, source: Path, external: Sequence[Path]) -> Placement:
+    """Where textures are baked: here where the scene file refers to others, which a node would have to find."""
+    place = run.place
+    if place.is_local or place.executor.shared:
+        return place
+    if external:
+        run.console.say(
+            f"  textures are baked here: the scene refers to {external[0].name}, which is not packed into it"
+        )
+        return HERE
+    return replace(place, roots=(*place.roots, source.resolve()))
 
 
 def _refuse_if_strict(source: Path, scene_dir: Path, settings: Settings) -> None:

@@ -82,7 +82,9 @@ class Session:
         manifest = self.workspace.manifest
         self._check(self.settings, self.workspace)
         manifest.preset = preset or manifest.preset
-        manifest.overrides = merge(manifest.overrides, overrides)
+        manifest.overrides = merge(manifest.overrides, {k: v for k, v in overrides.items() if k != "executor"})
+        if self.settings.executor.engine != "local":
+            self.workspace.root = self.workspace.root.resolve()  # paths in tasks say where files lie
         return self
 
     def __exit__(self, *exception: Any) -> None:

@@ -17,7 +17,7 @@ from ..core.settings import Settings
 from ..core.workspace import Workspace
 from ..effects.plan import EffectPlan
 from ..effects.store import plan_of
-from ..workers.processes import run_tasks
+from ..workers.task_list import Placement, run_tasks
 from ..workers.view_tasks import Book, Failures, is_made, task_name
 
 LEAST_OVERHEAD = 0.005
@@ -54,6 +54,16 @@ class Run:
     def scene_fingerprint(self) -> str:
         """Hash of what the scene is converted from."""
         return scene_fingerprint(self.workspace)
+
+    @property
+    def place(self) -> Placement:
+        """Where task lists run. Workers read and write in the workspace; what they took of memory the ledger knows."""
+        executor, root = self.settings.executor, self.workspace.root
+        if executor.engine == "local":
+            return Placement(executor, (root,))
+        records = self.workspace.ledger.read()
+        peaks = [record.peak_mb for record in records if record.stage == self.stage and record.unit == "view"]
+        return Placement(executor, (root,), max((peak for peak in peaks if peak), default=None))
 
     @property
     def log(self) -> Path:
@@ -124,11 +134,13 @@ class Run:
         workers: int,
         book: Book,
         environment: dict[str, str] | None = None,
+        place: Placement | None = None,
     ) -> None:
         """Run the tasks whose files are missing or out of date.
 
         Args:
-            module, common, environment: of `processes.run_tasks`.
+            module, common, environment: of `task_list.run_tasks`.
+            place: where they run, instead of where the settings say.
 
         Raises TasksFailed after all other tasks are done when some failed twice. Raises OSError: the disk is full.
         """
@@ -138,12 +150,20 @@ class Run:
         count = max(1, min(workers, len(due)))
         failures = Failures(label, self.console, self.log)
         outcomes = run_tasks(
-            module, common, due, workers=count, log=self.log, retried=failures.retried, environment=environment
+            module,
+            common,
+            due,
+            workers=count,
+            log=self.log,
+            retried=failures.retried,
+            environment=environment,
+            place=place or self.place,
         )
         with self.timed(f"{label}: processes"), self.console.bar(label, len(tasks), len(tasks) - len(due)) as bar:
             for outcome in failures.noted(outcomes):
                 if outcome.result is not None:
-                    book(outcome.task, outcome.result, count)
+                    node = {"node": outcome.node} if outcome.node else {}
+                    book(outcome.task, outcome.result | node, outcome.side_by_side)
                 bar.advance(note=task_name(outcome.task) if outcome.result is not None else "")
         failures.report(len(tasks))
 

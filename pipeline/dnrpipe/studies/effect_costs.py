@@ -86,7 +86,7 @@ def measure_plan(run: Run, plan: EffectPlan) -> EffectPlan:
         views = pilot_views(workspace, settings, plan if plan.on("depth-of-field") else other)
         compare = {"kind": "compare", "with_effect": on, "without_effect": off, "views": views, "spp": MEASURE_SPP}
         tasks[effect.name] = compare
-    results = run_pilots(list(tasks.values()), choice, run.console, "measuring effects", workspace.log("effects"))
+    results = run_pilots(list(tasks.values()), choice, run, "measuring effects", workspace.log("effects"))
     measured = {}
     for name, result in zip(tasks, results, strict=True):
         measured[name] = {key: Measured.model_validate(result[key]) for key in ("cost", "error")}

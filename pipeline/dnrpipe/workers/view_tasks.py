@@ -14,7 +14,7 @@ from dnrtrain.exr import read_metadata
 
 from ..core.console import Console
 from ..core.errors import UserError
-from .processes import Retry, TaskResult, run_tasks
+from .task_list import HERE, Placement, Retry, TaskResult, run_tasks
 
 Book = Callable[[dict[str, Any], dict[str, Any], int], None]
 """Called with a finished task, its result and the number of workers side by side; writes it into the ledger."""
@@ -49,10 +49,22 @@ def only_answer(
     log: Path,
     console: Console,
     environment: dict[str, str] | None = None,
+    place: Placement = HERE,
+    timeout: float | None = None,
 ) -> dict[str, Any]:
     """The result of one task on a worker of its own. Raises UserError: it failed twice."""
     retried = warn_of_retries(label, console)
-    (outcome,) = run_tasks(module, common, [task], workers=1, log=log, retried=retried, environment=environment)
+    (outcome,) = run_tasks(
+        module,
+        common,
+        [task],
+        workers=1,
+        log=log,
+        retried=retried,
+        environment=environment,
+        place=place,
+        timeout=timeout,
+    )
     if outcome.result is None:
         raise UserError(f"{label} failed twice: {outcome.error}; see {log}")
     return outcome.result

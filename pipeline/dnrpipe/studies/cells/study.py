@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -26,12 +26,12 @@ from ...core.errors import UserError
 from ...core.settings import Settings
 from ...core.workspace import digest, locked
 from ...stages.trainer import perceptual_weights, torch_device
-from ...workers.processes import run_tasks
+from ...workers.task_list import Placement, run_tasks
 from ...workers.view_tasks import TasksFailed, warn_of_retries, worker_count
 from .cell import CELL_VERSION
 from .results import code_state, made_by
 from .scenes import Scene, raster_engine, traced_split
-from .tasks import CellTask, PoolTask, Step1Task, files_of
+from .tasks import CellTask, PoolTask, Step1Task, StudyTask, files_of
 
 CELL_WORKER = "dnrpipe.studies.cells.cell"
 Place = TypeVar("Place")
@@ -39,13 +39,14 @@ Place = TypeVar("Place")
 
 @dataclass(frozen=True)
 class WorkerPool:
-    """device: torch's. threads: of each worker, 0 = torch's own choice. log: what workers print."""
+    """device: torch's. threads: of each worker, 0 = torch's own choice. log: what workers print. place: theirs."""
 
     device: str
     threads: int
     workers: int
     log: Path
     console: Console
+    place: Placement
 
     def work(self, label: str, module: str, tasks: Iterable[PoolTask]) -> None:
         """Run the tasks whose ``output`` file is missing on workers of ``module``; of several for one file the first.
@@ -61,6 +62,8 @@ class WorkerPool:
         threads = {name: str(self.threads) for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS")} if self.threads else {}
         common = {"threads": self.threads, "device": self.device}
         failed: list[str] = []
+        workspaces = {task.workspace for task in once.values() if isinstance(task, StudyTask)}
+        place = replace(self.place, roots=(*self.place.roots, *workspaces))
         with self.console.bar(label, len(once), len(once) - len(due)) as bar:
             for outcome in run_tasks(
                 module,
@@ -70,6 +73,7 @@ class WorkerPool:
                 log=self.log,
                 retried=lambda retry: warn_of_retries(retry.task["label"], self.console)(retry),
                 environment=threads,
+                place=place,
             ):
                 label_of = outcome.task["label"]
                 if outcome.result is None:
@@ -120,12 +124,15 @@ class Study(ABC, Generic[Place]):
             raise UserError(f"--seeds {self.seeds} --jobs {self.jobs}: at least 1 seed; jobs from 0 (one per core)")
         if self.out.exists() and not self.out.is_dir():
             raise UserError(f"--out {self.out}: is a file; name a folder")
+        if self.base.executor.engine != "local":
+            self.out = self.out.resolve()  # paths in tasks say where files lie
         device, cores = torch_device(self.base), worker_count(0)
         on_gpu = device.startswith("cuda")
         # Cells side by side on a thread each finish more per hour than one after the other on all cores.
         workers = self.jobs or (1 if on_gpu else cores)
         threads = 0 if on_gpu else 1 if self.SINGLE else max(1, cores // workers)
-        self.worker_pool = WorkerPool(device, threads, workers, self.out / "logs" / "cells.log", self.console)
+        place = Placement(self.base.executor, (self.out,))
+        self.worker_pool = WorkerPool(device, threads, workers, self.out / "logs" / "cells.log", self.console, place)
         self.environment = self.device, self.threads = device, threads
 
     def carry_out(self) -> dict[str, Any]:

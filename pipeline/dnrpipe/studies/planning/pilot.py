@@ -38,7 +38,7 @@ from ...stages.base_images import RENDERED, bake_light, base_renderer
 from ...stages.effect_plan import resolve_plan
 from ...stages.raytrace import view_seed
 from ...stages.stage import Run
-from ...workers.processes import run_tasks
+from ...workers.task_list import run_tasks
 from ...workers.view_tasks import warn_of_retries, worker_count
 from ..cells.scenes import choose_by_pose
 from .pilot_worker import FramesTask, PilotCommon, TrainTask

@@ -1,0 +1,1 @@
+"""Many scenes, unattended: `dnrpipe batch`."""
