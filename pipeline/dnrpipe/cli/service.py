@@ -62,12 +62,9 @@ def _client(server: str | None, token_file: Path | None) -> Client:
 @click.option("--job-disk-mb", type=click.IntRange(1), metavar="N", help="Of a job's workspace (default 51200).")
 @click.option("--keep-days", type=float, metavar="D", help="Logs and events of ended jobs (default 30 days).")
 @click.option("--keep-jobs", type=click.IntRange(1), metavar="N", help="Those of the last N ended jobs (default 1000).")
-<<<<<<< HEAD
 @click.option("--trusted-proxy", metavar="IP", help="Believe what this proxy says of its clients (default: none).")
 @click.option("--public-url", metavar="URL", help="Address that browsers know the server by, behind a proxy.")
-=======
 @with_options(EXECUTOR_OPTIONS)
->>>>>>> ray
 def serve(
     host: str,
     port: int,
@@ -112,7 +109,6 @@ def serve(
         memory_mb=job_memory_mb or default_memory_mb(),
         disk_mb=job_disk_mb or 50 * 1024,
     )
-<<<<<<< HEAD
     url, proxy = options["public_url"], options["trusted_proxy"]
     if url is not None and not _is_address(url):
         raise UserError(f"--public-url {url}: expected an address such as https://render.example.org")
@@ -121,11 +117,9 @@ def serve(
             ipaddress.ip_address(proxy)
         except ValueError:
             raise UserError(f"--trusted-proxy {proxy}: expected the proxy's IP address") from None
-=======
     if options["executor"] == "ray" and (options["address"] or "local") == "local":
         raise UserError("--executor ray: name the cluster that all jobs share: --address auto, or HOST:PORT")
     executor = tuple(executor_assignments(options))
->>>>>>> ray
     given = {key: value for key, value in options.items() if value is not None}
     if "rate" in given:
         given["burst"] = max(1, int(4 * given["rate"]))
