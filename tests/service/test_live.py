@@ -8,10 +8,11 @@ import os
 import shutil
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
+from axe_playwright_python.sync_playwright import Axe
 from PIL import Image
 from playwright.sync_api import Page
 from tests.plan_record import write_plan
@@ -399,3 +400,36 @@ def test_an_empty_server_says_what_to_do_and_its_viewer_gives_up(tmp_path: Path)
             assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
     finally:
         server.stop()
+
+
+@needs_chromium
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
+def test_no_serious_violation_of_accessibility(server: Server, trained: str, width: int, scheme: Literal["light", "dark"]) -> None:
+    """By axe-core, on what its rules for WCAG 2 A and AA see: dashboard with a job and a workspace open, viewer."""
+    empty_workspace(server.root, "plain")
+    with server.client() as client, open_page(server.url, width=width, color_scheme=scheme) as (page, _):
+        job = client.submit(JobRequest(command="finetune", workspace="plain")).id
+        row = f"document.querySelector('#jobs tr[data-job=\"{job}\"]')"
+        wait_for(page, f"{row}?.children[2].textContent === 'failed'")
+        page.evaluate(f"{row}.querySelector('button').click()")
+        page.evaluate(
+            f"[...document.querySelectorAll('#workspaces button')].find(b => b.textContent === '{trained}').click()"
+        )
+        wait_for(page, f"document.querySelector('#detail-title').textContent === '{trained}'")
+        wait_for(page, "document.querySelector('#job-error').textContent !== ''")
+        assert _violations(page) == []
+        page.goto(f"{server.url}/static/viewer.html?w={trained}")
+        wait_for(page, "document.querySelectorAll('#times tr').length > 2")
+        assert _violations(page) == []
+        assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+
+
+def _violations(page: Page) -> list[str]:
+    """What axe-core calls serious or critical: rule, where."""
+    found = Axe().run(page, options={"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "best-practice"]})
+    return [
+        f"{violation['id']}: {node['html'][:100]} {node['failureSummary']}"
+        for violation in found.response["violations"]
+        if violation["impact"] in ("serious", "critical")
+        for node in violation["nodes"]
+    ]
