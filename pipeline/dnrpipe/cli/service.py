@@ -32,13 +32,16 @@ SERVER = [
     ),
     click.option("--json", "as_json", is_flag=True, help="Print one JSON value; messages to stderr."),
 ]
-COMMANDS = ["run", "prepare", "select", "raytrace-selected", "finetune", "evaluate", "render", "report"]
+COMMANDS = [
+    *("run", "prepare", "select", "raytrace-selected", "finetune", "evaluate", "render", "report"),
+    *("export-nerf", "export-onnx", "export-gltf", "export-web"),
+]
 STATES = ["queued", "running", "done", "failed", "cancelled"]
 
 
 def _client(server: str | None, token_file: Path | None) -> Client:
     from ..service.client import DEFAULT_SERVER, Client
-    from ..service.config import read_token
+    from ..service.users import read_token
 
     named = token_file or os.environ.get("DNRPIPE_TOKEN_FILE")
     token = read_token(Path(named)) if named else None
@@ -52,7 +55,7 @@ def _client(server: str | None, token_file: Path | None) -> Client:
     "--root", type=click.Path(path_type=Path), default=Path(), metavar="DIR",
     help="Workspaces, scenes and the queue live here (default: this folder).",
 )  # fmt: skip
-@click.option("--token-file", type=click.Path(path_type=Path), metavar="FILE", help="Requests must carry this token.")
+@click.option("--token-file", type=click.Path(path_type=Path), metavar="FILE", help="Requests must carry its token, or one of its users'.")
 @click.option("--devices", metavar="A,B", help="One worker each: cpu, cuda:0, ... (default: all GPUs, else cpu).")
 @click.option("--upload-mb", type=click.IntRange(1), metavar="N", help="Largest scene file (default 2048 MiB).")
 @click.option("--most-queued", type=click.IntRange(1), metavar="N", help="Jobs that may wait (default 10000).")
@@ -64,6 +67,7 @@ def _client(server: str | None, token_file: Path | None) -> Client:
 @click.option("--keep-jobs", type=click.IntRange(1), metavar="N", help="Those of the last N ended jobs (default 1000).")
 @click.option("--trusted-proxy", metavar="IP", help="Believe what this proxy says of its clients (default: none).")
 @click.option("--public-url", metavar="URL", help="Address that browsers know the server by, behind a proxy.")
+@click.option("--webhook", "webhooks", metavar="URL", multiple=True, help="Jobs may tell addresses that begin so.")
 @with_options(EXECUTOR_OPTIONS)
 def serve(
     host: str,
@@ -87,11 +91,12 @@ def serve(
       dnrpipe serve --host 0.0.0.0 --token-file token.txt
       dnrpipe submit scene.blend             # in another terminal
     """
-    from ..service.config import ServerConfig, default_devices, default_memory_mb, read_token
+    from ..service.config import ServerConfig, default_devices, default_memory_mb
     from ..service.models import Limits
     from ..service.server import serve as run_server
+    from ..service.users import read_users
 
-    token = read_token(token_file) if token_file is not None else None
+    users = read_users(token_file) if token_file is not None else None
     chosen = tuple(part.strip() for part in devices.split(",")) if devices else default_devices()
     for name in chosen:
         if name != "cpu" and not (name.startswith("cuda:") and name.removeprefix("cuda:").isdigit()):
@@ -117,6 +122,9 @@ def serve(
             ipaddress.ip_address(proxy)
         except ValueError:
             raise UserError(f"--trusted-proxy {proxy}: expected the proxy's IP address") from None
+    for hook in options["webhooks"]:
+        if not _is_address(hook, path=True):
+            raise UserError(f"--webhook {hook}: expected an address such as https://ci.example.org/hooks/")
     if options["executor"] == "ray" and (options["address"] or "local") == "local":
         raise UserError("--executor ray: name the cluster that all jobs share: --address auto, or HOST:PORT")
     executor = tuple(executor_assignments(options))
@@ -133,16 +141,15 @@ def serve(
         if url is not None:
             console.say(f"for browsers: {url}")
 
-    run_server(config, token, ready=ready)
+    run_server(config, users, ready=ready)
 
 
-def _is_address(url: str) -> bool:
-    """Scheme, host and perhaps a port; no path."""
+def _is_address(url: str, *, path: bool = False) -> bool:
+    """Scheme, host and perhaps a port; and a path, where there may be one."""
     try:
         parts = urlsplit(url)
-        return (
-            parts.scheme in ("http", "https") and bool(parts.hostname) and parts.path in ("", "/") and parts.port != 0
-        )
+        whole = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+        return whole and (path or parts.path in ("", "/"))
     except ValueError:
         return False
 
@@ -158,6 +165,8 @@ def _is_address(url: str) -> bool:
 @click.option("--hours", type=float, metavar="H", help="Stop the job after this time.")
 @click.option("--memory-mb", type=click.IntRange(64), metavar="N", help="Stop it above this memory.")
 @click.option("--disk-mb", type=click.IntRange(1), metavar="N", help="Stop it when its workspace is larger.")
+@click.option("--orbit", type=click.IntRange(1, 10_000), metavar="N", help="Frames of `--stage render` (default 60).")
+@click.option("--webhook", metavar="URL", help="Told when the job has ended; the server's operator allows which.")
 @click.option("--detach", is_flag=True, help="Do not wait for the job.")
 @with_options(SERVER)
 def submit(
@@ -171,6 +180,8 @@ def submit(
     hours: float | None,
     memory_mb: int | None,
     disk_mb: int | None,
+    orbit: int | None,
+    webhook: str | None,
     detach: bool,
     as_json: bool,
     **server: Any,
@@ -184,6 +195,7 @@ def submit(
     Examples:
       dnrpipe submit scene.blend --set select.budget=25
       dnrpipe submit scene --stage evaluate --force
+      dnrpipe submit scene --stage render --orbit 120
       dnrpipe submit scene.blend --server http://box:8420 --token-file token.txt --detach
     """
     import pydantic
@@ -204,6 +216,7 @@ def submit(
     name = workspace or _plain(path.stem if is_file else scene)
     upload = f"{_plain(path.stem)}{path.suffix.lower()}" if is_file else None
     fields = {"command": command, "workspace": name, "scene": upload, "preset": preset, "settings": settings}
+    fields |= {"orbit": orbit, "webhook": webhook}
     try:
         limits = Limits(seconds=3600 * hours if hours is not None else None, memory_mb=memory_mb, disk_mb=disk_mb)
         request = JobRequest(**fields, force=force, priority=priority, limits=limits)  # type: ignore[arg-type]
@@ -229,9 +242,10 @@ def submit(
 
 @click.command()
 @click.option("--state", "states", type=click.Choice(STATES), multiple=True, help="Only these. Repeatable.")
+@click.option("--search", default="", metavar="WORDS", help="In number, workspace, command or owner.")
 @click.option("-n", "--limit", type=click.IntRange(1), default=20, show_default=True, metavar="N")
 @with_options(SERVER)
-def jobs(states: tuple[str, ...], limit: int, as_json: bool, **server: Any) -> None:
+def jobs(states: tuple[str, ...], search: str, limit: int, as_json: bool, **server: Any) -> None:
     """List the jobs of a server, newest first.
 
     \b
@@ -240,12 +254,12 @@ def jobs(states: tuple[str, ...], limit: int, as_json: bool, **server: Any) -> N
       dnrpipe jobs --state queued --state running --json
     """
     with _client(**server) as client:
-        found = list(islice(client.jobs(states), limit))  # type: ignore[arg-type]
+        found = list(islice(client.jobs(states, search), limit))  # type: ignore[arg-type]
     if as_json:
         click.echo(json.dumps([job.model_dump(mode="json") for job in found], indent=2))
         return
     for job in found:
-        click.echo(f"{job.id:>6}  {job.state:9}  {job.request.command:17}  {job.request.workspace:20}  {_how(job)}")
+        click.echo(f"{job.id:>6}  {job.state:9}  {job.request.command:17}  {job.request.workspace:20}  {job.owner or '':10}  {_how(job)}")
     if not found:
         click.echo("no jobs")
 

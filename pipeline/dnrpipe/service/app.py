@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import AsyncIterator
+import time
+from collections.abc import AsyncIterator, Mapping
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -22,17 +23,21 @@ from .models import first_fault
 from .queue import QueueFull, WrongState
 from .root import UnknownName
 from .state import State
+from .users import User
+from .webhooks import tell_of_ended
 
 LOG = logging.getLogger("dnrpipe.pruning")
 _STATUS: dict[type[UserError], int] = {QueueFull: 429, WrongState: 409, UnknownName: 404, UserError: 422}
 
 
-def create_app(state: State, token: str | None) -> FastAPI:
-    """The application for ``state``. token: None only where the server listens on the loopback interface."""
+def create_app(state: State, users: Mapping[str, User] | None) -> FastAPI:
+    """The application for ``state``. users: by token; None only where the server listens on the loopback interface."""
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        chores = (state.feed.watch(), state.live.close_idle(), _prune_regularly(state))
+        chores = [state.feed.watch(), state.live.close_idle(), _prune_regularly(state)]
+        if state.config.webhooks:
+            chores.append(tell_of_ended(state.queue, state.config.webhooks))
         tasks = [asyncio.create_task(chore) for chore in chores]
         yield
         for task in tasks:
@@ -58,11 +63,11 @@ def create_app(state: State, token: str | None) -> FastAPI:
         Guard,
         hosts=LOOPBACK if state.config.host in LOOPBACK else (),
         public=state.config.public_url,
-        token=token,
+        users=users,
         rate=state.config.rate,
         burst=state.config.burst,
     )
-    if token is not None:
+    if users is not None:
         schema = app.openapi()  # made once, and kept
         schema.setdefault("components", {})["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
         schema["security"] = [{"token": []}]
@@ -74,6 +79,7 @@ async def _prune_regularly(state: State) -> None:
     while True:
         try:
             pruned = await run_in_threadpool(state.queue.prune, state.root, state.config)
+            await run_in_threadpool(state.root.drop_deleted, time.time() - 86_400 * state.config.undo_days)
             if pruned:
                 LOG.info("old logs and events removed", extra={"facts": {"jobs": len(pruned)}})
         except Exception:  # a full disk, a busy queue: the server goes on and tries again

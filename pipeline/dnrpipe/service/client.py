@@ -23,7 +23,19 @@ from pydantic import TypeAdapter
 
 from ..core.errors import UserError
 from ..stages.records import PreviewState
-from .models import Job, JobEvent, JobPage, JobRequest, LogPage, Scene, State, WorkspaceDetail, WorkspaceSummary
+from .models import (
+    Deleted,
+    Job,
+    JobEvent,
+    JobPage,
+    JobRequest,
+    LogPage,
+    Result,
+    Scene,
+    State,
+    WorkspaceDetail,
+    WorkspaceSummary,
+)
 
 DEFAULT_SERVER = "http://127.0.0.1:8420"
 RETRY_SECONDS = 4.0
@@ -73,9 +85,9 @@ class Client:
     def job(self, job: int) -> Job:
         return self._ask("GET", f"/jobs/{job}", Job)
 
-    def jobs(self, states: Sequence[State] = ()) -> Iterator[Job]:
+    def jobs(self, states: Sequence[State] = (), search: str = "") -> Iterator[Job]:
         """All jobs, newest first; asks for further ones as they are wanted."""
-        parameters: dict[str, Any] = {"state": states, "limit": 500}
+        parameters: dict[str, Any] = {"state": states, "search": search, "limit": 500}
         while True:
             page = self._ask("GET", "/jobs", JobPage, params=parameters)
             yield from page.jobs
@@ -131,6 +143,31 @@ class Client:
 
     def workspace(self, name: str) -> WorkspaceDetail:
         return self._ask("GET", f"/workspaces/{name}", WorkspaceDetail)
+
+    def results(self, workspace: str) -> list[Result]:
+        return self._ask("GET", f"/workspaces/{workspace}/results", list[Result])
+
+    def download(self, workspace: str, file: str, target: Path) -> None:
+        """Write one of the results to ``target``, whole or not at all."""
+        temporary = target.with_name(f".{target.name}.part")
+        try:
+            with self._http.stream("GET", f"/workspaces/{workspace}/results/{file}") as answer, temporary.open("wb") as out:
+                if answer.is_error:
+                    answer.read()
+                _checked(answer)
+                for chunk in answer.iter_bytes(CHUNK):
+                    out.write(chunk)
+            temporary.replace(target)
+        except httpx.TransportError as error:
+            raise UserError(f"{self.server}: the download of {file} broke ({error}); try again") from None
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    def delete(self, workspace: str) -> Deleted:
+        return self._ask("DELETE", f"/workspaces/{workspace}", Deleted)
+
+    def restore(self, deleted: str) -> Deleted:
+        return self._ask("POST", f"/deleted/{deleted}/restore", Deleted)
 
     def preview(self, workspace: str) -> PreviewState:
         """What the last picture of a fine-tuning shows. Raises Refused (404) before there is one."""

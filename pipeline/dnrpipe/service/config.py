@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import os
-import re
-import stat
 from pathlib import Path
 
 from pydantic import BaseModel, Field
 
-from ..core.errors import UserError
 from .models import Limits
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 """Hosts that only this machine can reach."""
-TOKEN_PATTERN = r"[A-Za-z0-9_-]{16,256}"
 
 
 class ServerConfig(BaseModel, extra="forbid", frozen=True):
@@ -25,7 +21,8 @@ class ServerConfig(BaseModel, extra="forbid", frozen=True):
     long without a viewer a frame process ends. keep_days, keep_jobs: the server deletes logs and events of jobs that
     ended longer ago, or before so many others. limits: upper bounds for every job. executor: settings of where jobs'
     task lists run. trusted_proxy: address of a proxy whose X-Forwarded-For and -Proto are believed, "" believes none.
-    public_url: the address that browsers know the server by, where that is another.
+    public_url: the address that browsers know the server by, where that is another. webhooks: addresses that may be told
+    when a job ends. undo_days: how long a deleted workspace can be restored.
     """
 
     root: Path
@@ -47,6 +44,8 @@ class ServerConfig(BaseModel, extra="forbid", frozen=True):
     executor: tuple[str, ...] = ()
     trusted_proxy: str = ""
     public_url: str = ""
+    webhooks: tuple[str, ...] = ()
+    undo_days: float = Field(default=7.0, gt=0, le=36_500)
     limits: Limits = Limits(seconds=24 * 3600.0, disk_mb=50 * 1024)
 
 
@@ -68,19 +67,3 @@ def tightest(job: Limits, server: Limits) -> Limits:
     """The smaller of each pair of limits; None means no limit."""
     pairs = {name: (getattr(job, name), getattr(server, name)) for name in Limits.model_fields}
     return Limits(**{name: min((v for v in pair if v is not None), default=None) for name, pair in pairs.items()})
-
-
-def read_token(path: Path) -> str:
-    """The token in a file. Raises UserError: unreadable, readable by others, too short or of other letters."""
-    try:
-        mode, text = path.stat().st_mode, path.read_text(encoding="utf-8").strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: cannot be read as a token file ({error})") from None
-    if mode & (stat.S_IRGRP | stat.S_IROTH):
-        raise UserError(f"{path}: others can read it; run `chmod 600 {path}`")
-    if not re.fullmatch(TOKEN_PATTERN, text):
-        raise UserError(
-            f"{path}: a token is 16 to 256 letters, digits, dashes and underscores;"
-            f" make one with `python -c 'import secrets; print(secrets.token_urlsafe(32))' > {path}`"
-        )
-    return text

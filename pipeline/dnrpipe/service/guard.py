@@ -1,6 +1,6 @@
 """Access control and rate limits: checks every request before a route sees it.
 
-The token comes in a header (`Authorization: Bearer ...`), or as the subprotocol `dnrpipe.token.<token>` of a WebSocket,
+A token names a user, whose role says what kinds of requests are theirs. It comes in a header (`Authorization: Bearer ...`), or as the subprotocol `dnrpipe.token.<token>` of a WebSocket,
 for which browsers send no headers. The comparison takes constant time, and no log shows the token. A server on the
 loopback interface needs no token, but answers only to the names of that interface and to pages of its own origin: web
 pages that the user visits can neither read nor send anything (DNS rebinding, cross-site requests). Behind a proxy it
@@ -15,7 +15,7 @@ import math
 import re
 import time
 from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -24,6 +24,8 @@ from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocketClose
 
+from .users import LOCAL, User
+
 ACCESS = logging.getLogger("dnrpipe.access")
 SUBPROTOCOL = "dnrpipe.live"
 TOKEN_PREFIX = "dnrpipe.token."
@@ -31,6 +33,7 @@ MAX_BODY = 256 * 1024
 """Bytes of any request but an upload of a scene."""
 MAX_CLIENTS = 10_000
 REFUSALS_PER_MINUTE = 20
+WORKER_PATHS = "/leases"
 OPEN_PATHS = ("/", "/healthz", "/favicon.ico")
 HEADERS = {
     "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:;"
@@ -76,16 +79,23 @@ class Guard:
     Args:
         hosts: names that the Host header may have, without port; empty: any (then there is a token).
         public: the address that a proxy in front answers to, or "".
-        token: every request needs it, but for the open paths; None: no token.
+        users: every request needs the token of one of them, but for the open paths; None: no token.
     """
 
     def __init__(
-        self, app: ASGIApp, *, hosts: Iterable[str], public: str = "", token: str | None, rate: float, burst: int
+        self,
+        app: ASGIApp,
+        *,
+        hosts: Iterable[str],
+        public: str = "",
+        users: Mapping[str, User] | None,
+        rate: float,
+        burst: int,
     ) -> None:
         self.app = app
         self.public = _origin(public) if public else None
         self.hosts = frozenset(hosts) | ({self.public[1]} if self.public and hosts else set())
-        self.token = token.encode() if token else None
+        self.users = None if users is None else {token.encode(): user for token, user in users.items()}
         self.rates = Buckets(rate, burst)
         self.refusals = Buckets(REFUSALS_PER_MINUTE / 60, REFUSALS_PER_MINUTE)
 
@@ -143,21 +153,30 @@ class Guard:
         # The dashboard's files hold no data, and the dashboard asks for the token.
         is_open = scope["type"] == "http" and (scope["path"] in OPEN_PATHS or scope["path"].startswith("/static/"))
         # The token first: who has it is never locked out by others behind the same address. Tokens are long and random
-        # (config.TOKEN_PATTERN): guesses need no other bound than the one on wrong answers.
-        wanted = None if is_open else self.token
-        if wanted is not None and not hmac.compare_digest(_given_token(scope, headers), wanted):
+        # (users.TOKEN_PATTERN): guesses need no other bound than the one on wrong answers.
+        user = LOCAL if is_open or self.users is None else self._user(_given_token(scope, headers))
+        if user is None:
             if self.refusals.take(client) > 0:
                 more = {"retry-after": "60", "www-authenticate": "Bearer"}
                 return refused(429, "too many wrong tokens; wait a minute", **more)
             reason = "wrong or missing token; send it as Authorization: Bearer TOKEN"
             return refused(401, reason, **{"www-authenticate": "Bearer"})
-        wait = self.rates.take(client if wanted is None else f"{client} with the token")
+        if not is_open and not _allowed(user, scope):
+            return refused(403, f"{user.name} is a {user.role} here; ask the operator for another role")
+        scope.setdefault("state", {})["user"] = user
+        wait = self.rates.take(client if is_open or self.users is None else f"{client} as {user.name}")
         if wait > 0:
             return refused(429, "too many requests; slow down", **{"retry-after": str(max(1, math.ceil(wait)))})
         length = headers.get("content-length", "0")
         if not is_upload(scope) and length.isascii() and length.isdigit() and int(length) > MAX_BODY:
             return refused(413, f"the request is larger than {MAX_BODY} bytes")
         return None
+
+    def _user(self, token: bytes) -> User | None:
+        """Whose token it is; takes as long for any."""
+        assert self.users is not None
+        found = [user for known, user in self.users.items() if hmac.compare_digest(token, known)]
+        return found[0] if found else None
 
     def _bounded(self, scope: Scope, receive: Receive) -> Receive:
         """Cut a body without a stated length off at the same size; the route then sees a broken request."""
@@ -172,6 +191,14 @@ class Guard:
             return message if seen <= MAX_BODY else {"type": "http.disconnect"}
 
         return receiving
+
+
+def _allowed(user: User, scope: Scope) -> bool:
+    """Whether the role allows the kind of request; what is whose, the routes ask."""
+    if scope["path"].startswith(WORKER_PATHS):
+        return user.role in ("worker", "admin")
+    looks = scope["type"] == "websocket" or scope["method"] in ("GET", "HEAD", "OPTIONS")
+    return user.role in ("submitter", "admin") or (user.role == "viewer" and looks)
 
 
 def _origin(url: str) -> tuple[str, str, int] | None:

@@ -28,7 +28,7 @@ MOST_SPP, MOST_RAYS = 1024, 64
 """Per pixel, of a reference and of a base image at rest."""
 BUDGET = 90.0
 """Milliseconds that a moving frame may take."""
-LEVELS: tuple[tuple[float, int | None], ...] = ((1.0, None), (1.0, 2), (1.0, 1), (0.5, 2), (0.5, 1))
+LEVELS: tuple[tuple[float, int | None], ...] = ((1.0, None), (1.0, 2), (1.0, 1), (0.5, 2), (0.5, 1), (0.25, 1))
 """(share of the side, rays per pixel of the base image; None: the model's own)."""
 START = 2
 STEP = 32
@@ -38,6 +38,8 @@ SLACK = 0.45
 """Below this share of the budget the pace tries a finer level, which costs about twice as much."""
 MIN_FRAMES = 8
 """Frames at a level before it may change."""
+HASTY_FRAMES, HASTY = 2, 2.0
+"""Frames after which it may already become coarser, where they take so many times the budget."""
 
 
 @dataclass
@@ -63,7 +65,8 @@ class Pace:
         mean = self._mean
         self._mean = milliseconds if mean is None else mean + SMOOTHING * (milliseconds - mean)
         self._frames += 1
-        if self._frames < MIN_FRAMES:
+        too_slow = self._frames >= HASTY_FRAMES and self._mean > HASTY * self.budget
+        if self._frames < MIN_FRAMES and not too_slow:
             return
         if self._mean > self.budget and self.level + 1 < len(LEVELS):
             self._move(1)

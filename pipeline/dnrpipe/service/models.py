@@ -15,16 +15,21 @@ if TYPE_CHECKING:
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
 SCENE_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}\.(blend|obj|gltf|glb|fbx|ply|stl)$"
+WEBHOOK_PATTERN = r"^https?://[!-~]+$"
 SETTING_PATTERN = r"^[a-z0-9_]{1,40}(\.[a-z0-9_]{1,40}){0,4}$"
 
 PLAIN = {
     NAME_PATTERN: "a name has letters, digits, - and _, begins with a letter or digit, and has 64 at most",
     SCENE_PATTERN: "a scene file's name has letters, digits, - and _, and ends as scene files do (.blend, .glb, ...)",
     SETTING_PATTERN: "no such setting",
+    WEBHOOK_PATTERN: "an address begins with https:// or http://",
 }
 """What a value that does not match a pattern is told."""
 
-Command = Literal["run", "prepare", "select", "raytrace-selected", "finetune", "evaluate", "render", "report"]
+Stage = Literal["run", "prepare", "select", "raytrace-selected", "finetune", "evaluate", "render", "report"]
+Export = Literal["export-nerf", "export-onnx", "export-gltf", "export-web"]
+Command = Literal[Stage, Export]
+EXPORTS: tuple[Export, ...] = get_args(Export)
 State = Literal["queued", "running", "done", "failed", "cancelled"]
 STATES: tuple[State, ...] = get_args(State)
 FINAL: tuple[State, ...] = ("done", "failed", "cancelled")
@@ -57,7 +62,8 @@ class JobRequest(Strict):
     workspace: its name; the folder is ``<root>/<name>.dnr``. scene: an uploaded scene file, for ``run`` and ``prepare``
     of a workspace that is not there yet; scene_sha256: which file of that name, by its content (default: the one there
     now). settings: as ``--set``, by dotted key. priority: larger goes first.
-    retries: how often the queue starts a job again whose process crashed.
+    retries: how often the queue starts a job again whose process crashed. orbit: frames of the turntable that `render`
+    makes. webhook: address that is told when the job has ended, one of those that the operator allows.
     """
 
     command: Command
@@ -71,6 +77,8 @@ class JobRequest(Strict):
     force: bool = False
     priority: int = Field(default=0, ge=-100, le=100)
     retries: int = Field(default=1, ge=0, le=10)
+    orbit: int | None = Field(default=None, ge=1, le=10_000)
+    webhook: Annotated[str, Field(pattern=WEBHOOK_PATTERN, max_length=2000)] | None = None
     limits: Limits = Limits()
 
 
@@ -79,6 +87,7 @@ class Job(Strict):
 
     starts: how many processes were started for it; crashes: how many of those ended by a signal, a limit aside.
     exit_code: of the last process, negative for a signal. error: why it failed, one line. progress: the last report.
+    owner: whose token submitted it. device: what works on it, a device of the server or a worker elsewhere.
     """
 
     id: int = Field(ge=1, le=2**53)
@@ -94,6 +103,7 @@ class Job(Strict):
     exit_code: int | None = None
     error: str | None = None
     progress: dict[str, Any] | None = None
+    owner: str | None = None
 
 
 class JobPage(Strict):
@@ -143,13 +153,33 @@ class StageState(Strict):
 
 
 class WorkspaceSummary(Strict):
-    """A workspace under the root. problem: why it cannot be read, if so."""
+    """A workspace under the root. owner: of its first job. mb: of disk, MiB. problem: why it cannot be read, if so."""
 
     name: str
     modified: float
     viewable: bool
     report: bool
+    owner: str | None = None
+    mb: float = 0.0
     problem: str | None = None
+
+
+class Deleted(Strict):
+    """A deleted workspace. until: it can be restored, unix seconds."""
+
+    id: str
+    name: str
+    until: float
+    owner: str | None
+
+
+class Result(Strict):
+    """A file to download. kind: movie, frames (a zip), export (a file, or a folder as a zip), report."""
+
+    file: str
+    kind: Literal["movie", "frames", "export", "report"]
+    mb: float
+    modified: float
 
 
 class Curve(Strict):

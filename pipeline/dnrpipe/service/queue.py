@@ -24,7 +24,7 @@ from .config import ServerConfig
 from .models import FINAL, STATES, Job, JobEvent, JobRequest, State
 from .root import ServiceRoot, UnknownName
 
-SCHEMA = 1
+SCHEMA = 2
 DAY = 86_400.0
 MAX_STARTS = 6
 """A job fails for good once its process or server has died this often."""
@@ -47,7 +47,10 @@ CREATE TABLE IF NOT EXISTS jobs (
     exit_code INTEGER,
     error TEXT,
     progress TEXT,
-    token TEXT UNIQUE
+    token TEXT UNIQUE,
+    owner TEXT,
+    hook_due REAL,
+    hook_tries INTEGER NOT NULL DEFAULT 0
 );
 CREATE INDEX IF NOT EXISTS jobs_due ON jobs (state, priority DESC, id);
 CREATE TABLE IF NOT EXISTS events (
@@ -59,6 +62,7 @@ CREATE TABLE IF NOT EXISTS events (
 );
 CREATE INDEX IF NOT EXISTS events_of_job ON events (job, id);
 """
+_SINCE_2 = ("owner TEXT", "hook_due REAL", "hook_tries INTEGER NOT NULL DEFAULT 0")
 _COLUMNS = ", ".join(Job.model_fields)
 
 
@@ -87,11 +91,21 @@ class Queue:
                     raise UserError(f"{path}: queue schema {version} is newer than this dnrpipe ({SCHEMA}); upgrade it")
                 for statement in _TABLES.split(";"):
                     db.execute(statement)
+                if version == 1:
+                    for column in _SINCE_2:
+                        db.execute(f"ALTER TABLE jobs ADD COLUMN {column}")
                 db.execute(f"PRAGMA user_version = {SCHEMA}")
         except sqlite3.DatabaseError as error:
             raise UserError(f"{path}: not a job queue ({error}); move it away to start a new one") from None
 
-    def submit(self, request: JobRequest, *, most_queued: int | None = None, token: str | None = None) -> Job:
+    def submit(
+        self,
+        request: JobRequest,
+        *,
+        most_queued: int | None = None,
+        token: str | None = None,
+        owner: str | None = None,
+    ) -> Job:
         """Add a job; it is on disk when this returns.
 
         token: idempotency key. A client that never saw the answer sends its request again with the same key, and
@@ -107,9 +121,9 @@ class Queue:
                 if waiting >= most_queued:
                     raise QueueFull(f"{waiting} jobs wait already, which is the limit; try again when some are done")
             row = db.execute(
-                "INSERT INTO jobs (state, workspace, priority, request, created, token)"
-                " VALUES ('queued', ?, ?, ?, ?, ?) RETURNING id",
-                (request.workspace, request.priority, request.model_dump_json(), time.time(), token),
+                "INSERT INTO jobs (state, workspace, priority, request, created, token, owner)"
+                " VALUES ('queued', ?, ?, ?, ?, ?, ?) RETURNING id",
+                (request.workspace, request.priority, request.model_dump_json(), time.time(), token, owner),
             ).fetchone()
             _change(db, row["id"], "queued")
             return self.get(row["id"])
@@ -122,9 +136,16 @@ class Queue:
         return _job(row)
 
     def page(
-        self, *, states: Sequence[State] = (), workspace: str | None = None, before: int | None = None, limit: int = 100
+        self,
+        *,
+        states: Sequence[State] = (),
+        workspace: str | None = None,
+        search: str = "",
+        before: int | None = None,
+        limit: int = 100,
     ) -> list[Job]:
-        """At most ``limit`` jobs by descending id, below ``before``."""
+        """At most ``limit`` jobs by descending id, below ``before``; with all words of ``search`` in their number,
+        workspace, command or owner."""
         where, values = ["1"], []
         if states:
             where.append(f"state IN ({', '.join('?' * len(states))})")
@@ -132,11 +153,25 @@ class Queue:
         if workspace is not None:
             where.append("workspace = ?")
             values.append(workspace)
+        for word in search.split():
+            told = "id || ' ' || workspace || ' ' || json_extract(request, '$.command') || ' ' || coalesce(owner, '')"
+            where.append(f"instr(lower({told}), ?)")
+            values.append(word.lower())
         if before is not None:
             where.append("id < ?")
             values.append(before)
         query = f"SELECT {_COLUMNS} FROM jobs WHERE {' AND '.join(where)} ORDER BY id DESC LIMIT ?"
         return [_job(row) for row in self._db().execute(query, (*values, limit))]
+
+    def owners(self) -> dict[str, str | None]:
+        """By workspace: who submitted its first job."""
+        found = self._db().execute("SELECT workspace, owner, min(id) FROM jobs GROUP BY workspace").fetchall()
+        return {row["workspace"]: row["owner"] for row in found}
+
+    def busy(self, workspace: str) -> bool:
+        """Whether a job waits for it or works in it."""
+        query = "SELECT 1 FROM jobs WHERE workspace = ? AND state IN ('queued', 'running')"
+        return self._db().execute(query, (workspace,)).fetchone() is not None
 
     def counts(self) -> dict[State, int]:
         found = dict(self._db().execute("SELECT state, count(*) FROM jobs GROUP BY state").fetchall())
@@ -209,6 +244,18 @@ class Queue:
             blank = dict.fromkeys(("started", "finished", "exit_code", "error"))
             _change(db, job, "queued", "retried", cancel_requested=False, starts=0, crashes=0, **blank)
             return self.get(job)
+
+    def due_hooks(self) -> list[tuple[Job, int]]:
+        """Ended jobs whose webhook is to be told now, and how often that was tried before."""
+        query = f"SELECT {_COLUMNS}, hook_tries FROM jobs WHERE hook_due <= ? ORDER BY hook_due LIMIT 20"
+        rows = self._db().execute(query, (time.time(),)).fetchall()
+        return [(_job(row), row["hook_tries"]) for row in rows]
+
+    def hook_told(self, job: int, again: float | None) -> None:
+        """It was heard, or given up (None); or is to be tried again after so many seconds."""
+        due = None if again is None else time.time() + again
+        with self._writing() as db:
+            db.execute("UPDATE jobs SET hook_due = ?, hook_tries = hook_tries + 1 WHERE id = ?", (due, job))
 
     def add_events(self, job: int, events: Sequence[dict[str, Any]]) -> None:
         """Store lines of the event stream; the job keeps the last progress, too."""
@@ -305,7 +352,12 @@ class Queue:
 
 
 def _change(db: sqlite3.Connection, job: int, state: str, why: str | None = None, **columns: Any) -> None:
-    """Set a job's state and other columns, and note the state as an event."""
+    """Set a job's state and other columns, and note the state as an event. One that ended is told of (`webhooks`)."""
+    if state in FINAL:
+        db.execute(
+            "UPDATE jobs SET hook_due = ?, hook_tries = 0 WHERE id = ? AND json_extract(request, '$.webhook') IS NOT NULL",
+            (time.time(), job),
+        )
     names = ", ".join(f"{name} = ?" for name in ("state", *columns))
     db.execute(f"UPDATE jobs SET {names} WHERE id = ?", (state, *columns.values(), job))
     data = json.dumps({"state": state} | ({"why": why} if why else {}))
@@ -313,4 +365,5 @@ def _change(db: sqlite3.Connection, job: int, state: str, why: str | None = None
 
 
 def _job(row: sqlite3.Row) -> Job:
-    return Job(**dict(row) | {key: json.loads(row[key] or "null") for key in ("request", "progress")})
+    known = {key: row[key] for key in Job.model_fields}
+    return Job(**known | {key: json.loads(row[key] or "null") for key in ("request", "progress")})

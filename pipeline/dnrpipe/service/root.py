@@ -6,6 +6,7 @@ root/
   dnrpipe.toml         settings for all jobs, if the operator puts one there
   .service/            queue.sqlite, logs/<job>.log, events/<job>.jsonl, lock
     uploads/<sha256>/<file>   the same files by content; a job names the one that it was submitted with
+    deleted/<unix seconds>-<name>.dnr   workspaces that can still be restored
 """
 
 from __future__ import annotations
@@ -15,11 +16,12 @@ import os
 import re
 import secrets
 import shutil
+import time
 from collections.abc import Collection
 from pathlib import Path
 
 from ..core.errors import UserError
-from ..core.workspace import SUFFIX, Workspace, file_sha256
+from ..core.workspace import LOCK_FILES, SUFFIX, Workspace, file_sha256, locked
 from .models import NAME_PATTERN, SCENE_PATTERN
 
 
@@ -36,12 +38,13 @@ class ServiceRoot:
         self.queue = self.private / "queue.sqlite"
         self.scenes = self.folder / "scenes"
         self.uploads = self.private / "uploads"
+        self.deleted = self.private / "deleted"
 
     def create(self) -> ServiceRoot:
         """Make the folders that are missing; the private one is readable by its owner alone."""
         self.folder.mkdir(parents=True, exist_ok=True)
         self.private.mkdir(mode=0o700, exist_ok=True)
-        for folder in (self.scenes, self.uploads, self.private / "logs", self.private / "events"):
+        for folder in (self.scenes, self.uploads, self.deleted, self.private / "logs", self.private / "events"):
             folder.mkdir(exist_ok=True)
         return self
 
@@ -116,6 +119,41 @@ class ServiceRoot:
                 files = list(folder.iterdir())
                 if all(file.stat().st_nlink == 1 for file in files):
                     shutil.rmtree(folder, ignore_errors=True)
+
+    def delete(self, name: str) -> str:
+        """Put a workspace away; what it is called there. Raises UnknownName; UserError: a command works in it."""
+        path = self.workspace(name)
+        put_away = f"{time.time_ns() // 10**9}-{name}"
+        with locked(path, "delete"):
+            path.rename(self.deleted / f"{put_away}{SUFFIX}")
+        (self.deleted / f"{put_away}{SUFFIX}" / LOCK_FILES[1]).unlink(missing_ok=True)
+        return put_away
+
+    def restorable(self) -> list[tuple[str, str, float]]:
+        """(what it is called, workspace, when it was deleted) of the workspaces put away, the last first."""
+        found = []
+        for path in self.deleted.glob(f"*{SUFFIX}"):
+            when, _, name = path.name.removesuffix(SUFFIX).partition("-")
+            if when.isdigit():
+                found.append((f"{when}-{name}", name, float(when)))
+        return sorted(found, key=lambda entry: -entry[2])
+
+    def restore(self, put_away: str) -> str:
+        """The workspace's name. Raises UnknownName: it is not there any more; UserError: its name is taken."""
+        name = next((name for known, name, _ in self.restorable() if known == put_away), None)
+        if name is None:
+            raise UnknownName(f"{put_away[:80]!r}: no deleted workspace; its time may be over")
+        path = self.workspace(name, must_exist=False)
+        if path.exists():
+            raise UserError(f"{name}: there is a workspace of this name again; delete that one first")
+        (self.deleted / f"{put_away}{SUFFIX}").rename(path)
+        return name
+
+    def drop_deleted(self, before: float) -> None:
+        """Remove for good what was deleted before that, unix seconds."""
+        for put_away, _, when in self.restorable():
+            if when < before:
+                shutil.rmtree(self.deleted / f"{put_away}{SUFFIX}", ignore_errors=True)
 
     def result(self, name: str, file: str, problem: str) -> Path:
         """A file of a workspace. Raises UnknownName with `problem`: it is not there, or leads out of the root."""

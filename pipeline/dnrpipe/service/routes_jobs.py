@@ -12,9 +12,11 @@ from starlette.concurrency import run_in_threadpool
 
 from ..core.cameras import KEYWORDS
 from ..core.settings import merge, parse_assignment, resolve
-from .models import FINAL, Job, JobPage, JobRequest, LogPage, Name, Problem, State
+from .models import EXPORTS, FINAL, Job, JobPage, JobRequest, LogPage, Name, Problem, State
 from .state import Shared
 from .state import State as Service
+from .users import Caller, User
+from .webhooks import check_webhook
 
 KEEP_ALIVE = 15.0
 LOG_CHUNK = 256 * 1024
@@ -57,6 +59,7 @@ router = APIRouter(tags=["jobs"], responses=REFUSED)
 def submit(
     request: JobRequest,
     service: Shared,
+    caller: Caller,
     idempotency_key: Annotated[str | None, Header(max_length=64, pattern=r"^[A-Za-z0-9_-]{8,64}$")] = None,
 ) -> Job:
     """Put a job into the queue. It is on disk when the answer is sent.
@@ -68,7 +71,7 @@ def submit(
     if request.scene is not None:  # a later upload of that name is no business of this job
         sha256, _ = service.root.submitted_scene(request.scene, request.scene_sha256)
         request = request.model_copy(update={"scene_sha256": sha256})
-    return service.queue.submit(request, most_queued=service.config.most_queued, token=idempotency_key)
+    return service.queue.submit(request, most_queued=service.config.most_queued, token=idempotency_key, owner=caller.name)
 
 
 @router.get("/jobs")
@@ -76,11 +79,12 @@ def list_jobs(
     service: Shared,
     state: Annotated[list[State] | None, Query(max_length=5)] = None,
     workspace: Annotated[Name | None, Query()] = None,
+    search: Annotated[str, Query(max_length=200, description="Words in number, workspace, command or owner")] = "",
     before: Annotated[int | None, Query(ge=1, le=2**53)] = None,
     limit: Annotated[int, Query(ge=1, le=500)] = 100,
 ) -> JobPage:
     """Jobs, newest first."""
-    jobs = service.queue.page(states=state or (), workspace=workspace, before=before, limit=limit + 1)
+    jobs = service.queue.page(states=state or (), workspace=workspace, search=search, before=before, limit=limit + 1)
     more = len(jobs) > limit
     return JobPage(jobs=jobs[:limit], next=jobs[limit - 1].id if more else None)
 
@@ -92,14 +96,16 @@ def get_job(job: JobPath, service: Shared) -> Job:
 
 
 @router.post("/jobs/{job}/cancel", responses=refusals(404, 409))
-def cancel(job: JobPath, service: Shared) -> Job:
+def cancel(job: JobPath, service: Shared, caller: Caller) -> Job:
     """Cancel a queued or running job. A running one stops within seconds; what it made is kept."""
+    require_own(service.queue.get(job), caller)
     return service.queue.cancel(job)
 
 
 @router.post("/jobs/{job}/retry", responses=refusals(404, 409))
-def retry(job: JobPath, service: Shared) -> Job:
+def retry(job: JobPath, service: Shared, caller: Caller) -> Job:
     """Queue a failed or cancelled job again. It goes on from its checkpoints."""
+    require_own(service.queue.get(job), caller)
     return service.queue.retry(job)
 
 
@@ -177,11 +183,23 @@ async def events(
     return StreamingResponse(lines(), media_type="text/event-stream")
 
 
+def require_own(job: Job, caller: User) -> None:
+    """Raises HTTPException 403: another's job, and not an admin."""
+    if not caller.may_change(job.owner):
+        raise HTTPException(403, f"job {job.id} is {job.owner or 'nobody'}'s; only they and admins may change it")
+
+
 def check_request(request: JobRequest, service: Service) -> None:
     """Refuse what the job's command would refuse later: unknown settings, scenes, workspaces.
 
     Raises HTTPException 422, UnknownName.
     """
+    if request.orbit is not None and request.command != "render":
+        raise HTTPException(422, f"orbit: {request.command} makes no frames; only render does")
+    if request.command in EXPORTS and (request.settings or request.preset or request.force):
+        raise HTTPException(422, f"settings: {request.command} takes none; it exports what is there")
+    if request.webhook is not None:
+        check_webhook(request.webhook, service.config.webhooks)
     if request.scene is not None:
         if request.command not in ("run", "prepare"):
             raise HTTPException(422, f"scene: {request.command} takes none; only run and prepare do")

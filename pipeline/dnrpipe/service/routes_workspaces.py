@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, HTTPException, Path, Request, Response
 from fastapi.responses import FileResponse
+from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
@@ -31,25 +32,33 @@ from .models import (
     SCENE_PATTERN,
     CostState,
     Curve,
+    Deleted,
     PlannedStage,
     PlanState,
+    Result,
     Scene,
     StageState,
     TestPicture,
     WorkspaceDetail,
     WorkspaceSummary,
 )
+from .results import pack, results
+from .root import UnknownName
 from .routes_jobs import REFUSED, refusals
 from .state import Shared, State
+from .users import Caller, User
+from .worker import folder_mb
 
 NamePath = Annotated[str, Path(pattern=NAME_PATTERN)]
 ScenePath = Annotated[str, Path(pattern=SCENE_PATTERN)]
+DeletedPath = Annotated[str, Path(pattern=r"^[0-9]{1,12}-[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
 ViewPath = Annotated[str, Path(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}$")]
 # The page holds names from scene files: it may run its own scripts, but load and send nothing.
 REPORT_POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data:; base-uri 'none';"
     " form-action 'none'; frame-ancestors 'none'; sandbox allow-scripts"
 )
+ANY: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}, "description": "A file"}}
 PNG: dict[int | str, dict[str, Any]] = {200: {"content": {"image/png": {}}, "description": "PNG"}}
 HTML: dict[int | str, dict[str, Any]] = {200: {"content": {"text/html": {}}, "description": "One HTML file"}}
 
@@ -59,7 +68,7 @@ router = APIRouter(tags=["workspaces"], responses=REFUSED)
 @router.get("/workspaces")
 def list_workspaces(service: Shared) -> list[WorkspaceSummary]:
     """All workspaces of the server, by name."""
-    found = []
+    found, owners = [], service.queue.owners()
     for name in service.root.workspaces():
         path = service.root.workspace(name)
         problem = None
@@ -73,6 +82,8 @@ def list_workspaces(service: Shared) -> list[WorkspaceSummary]:
                 modified=(path / "manifest.json").stat().st_mtime,
                 viewable=workspace is not None and "finetune" in workspace.manifest.stages,
                 report=(path / "report" / "report.html").is_file(),
+                owner=owners.get(name),
+                mb=service.sizes.get(name, service.queue.last_event(), lambda path=path: round(folder_mb(path), 1)),
                 problem=problem,
             )
         )
@@ -118,6 +129,80 @@ def _detail(name: str, service: State) -> WorkspaceDetail:
         viewable="finetune" in workspace.manifest.stages,
         report=(path / "report" / "report.html").is_file(),
     )
+
+
+@router.delete("/workspaces/{name}", responses=refusals(404, 409))
+def delete_workspace(name: NamePath, service: Shared, caller: Caller) -> Deleted:
+    """Delete a workspace; for some days it can be restored. 409: a job waits for it or works in it."""
+    service.root.workspace(name)
+    require_owner(service.queue.owners().get(name), caller, name)
+    if service.queue.busy(name):
+        raise HTTPException(409, f"{name}: a job waits for it or works in it; cancel that first")
+    put_away = service.root.delete(name)
+    return next(entry for entry in _restorable(service) if entry.id == put_away)
+
+
+@router.get("/deleted")
+def list_deleted(service: Shared) -> list[Deleted]:
+    """Workspaces that can be restored, the last deleted first."""
+    return _restorable(service)
+
+
+@router.post("/deleted/{id}/restore", responses=refusals(404, 409))
+def restore_workspace(id: DeletedPath, service: Shared, caller: Caller) -> Deleted:
+    """Put a deleted workspace back. 409: there is another of its name by now."""
+    found = next((entry for entry in _restorable(service) if entry.id == id), None)
+    if found is not None:
+        require_owner(found.owner, caller, found.name)
+    try:
+        service.root.restore(id)
+    except UnknownName:
+        raise
+    except UserError as error:
+        raise HTTPException(409, str(error)) from None
+    assert found is not None
+    return found
+
+
+def _restorable(service: State) -> list[Deleted]:
+    owners, kept = service.queue.owners(), 86_400 * service.config.undo_days
+    return [
+        Deleted(id=put_away, name=name, until=when + kept, owner=owners.get(name))
+        for put_away, name, when in service.root.restorable()
+    ]
+
+
+def require_owner(owner: str | None, caller: User, name: str) -> None:
+    """Raises HTTPException 403: another's workspace, and not an admin."""
+    if not caller.may_change(owner):
+        raise HTTPException(403, f"{name} is {owner or 'nobody'}'s; only they and admins may delete or restore it")
+
+
+@router.get("/workspaces/{name}/results", responses=refusals(404))
+def list_results(name: NamePath, service: Shared) -> list[Result]:
+    """What there is to download: movies, frames, exports, the report."""
+    return results(service.root.workspace(name))
+
+
+@router.get("/workspaces/{name}/results/{file:path}", response_class=FileResponse, responses=refusals(404, 507) | ANY)
+def download(name: NamePath, file: Annotated[str, Path(max_length=200)], service: Shared) -> FileResponse:
+    """One of the results; folders come as a zip."""
+    workspace = service.root.workspace(name)
+    if file not in (found.file for found in results(workspace)):
+        raise HTTPException(404, f"{name} has no result {file[:80]!r}; see GET /workspaces/{name}/results")
+    saved_as = f"{name}-{file.rpartition('/')[2]}"
+    if (workspace / file).is_file():
+        path = service.root.result(name, file, f"{name} has no result {file[:80]!r}")
+        return FileResponse(path, media_type="application/octet-stream", filename=saved_as)
+    service.require_space(service.root.private)
+    packed = service.root.private / f"{secrets.token_hex(8)}.zip"
+    try:
+        pack(workspace / file.removesuffix(".zip"), packed)
+    except BaseException:
+        packed.unlink(missing_ok=True)
+        raise
+    gone = BackgroundTask(packed.unlink, missing_ok=True)
+    return FileResponse(packed, media_type="application/zip", filename=saved_as, background=gone)
 
 
 @router.get("/workspaces/{name}/preview", responses=refusals(404, 409))

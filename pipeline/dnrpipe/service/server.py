@@ -9,7 +9,7 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import h11
@@ -26,20 +26,21 @@ from .queue import Queue
 from .root import ServiceRoot
 from .state import Feed, State
 from .supervisor import Supervisor
+from .users import User
 
 HEAD_SECONDS, BODY_SECONDS = 20.0, 60.0
 """How long a client may take to send the head of a request, and its body."""
 UPGRADED = ("upgraded", 0)
 
 
-def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], None]) -> None:
+def serve(config: ServerConfig, users: Mapping[str, User] | None, *, ready: Callable[[str], None]) -> None:
     """Serve until SIGTERM or Ctrl-C. ``ready`` is called with the address once requests are answered.
 
     Raises UserError: a host that others can reach without a token, a root that another server holds, a port in use.
     """
-    if config.host not in LOOPBACK and token is None:
+    if config.host not in LOOPBACK and users is None:
         raise UserError(f"--host {config.host}: others can reach it, so a token is needed; give --token-file FILE")
-    if token is None and (config.public_url or config.trusted_proxy):
+    if users is None and (config.public_url or config.trusted_proxy):
         raise UserError("behind a proxy others can reach the server, so a token is needed; give --token-file FILE")
     if not config.root.parent.is_dir():
         raise UserError(f"--root {config.root}: {config.root.parent} does not exist")
@@ -61,7 +62,7 @@ def serve(config: ServerConfig, token: str | None, *, ready: Callable[[str], Non
         live = LivePool(config, root)
         state = State(config, root, queue, supervisor, live, Feed(queue))
         settings = uvicorn.Config(
-            create_app(state, token),
+            create_app(state, users),
             host=config.host,
             port=config.port,
             log_config=None,

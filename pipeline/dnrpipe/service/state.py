@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -56,25 +57,26 @@ class Feed:
 
 
 class Remembered:
-    """Answers that take long to make: each is made by one request at a time, and good for all who ask within a second
+    """Answers that take long to make: each is made by one request at a time, and good for all who ask within ``seconds``
     while nothing happens."""
 
     SECONDS = 1.0
 
-    def __init__(self) -> None:
+    def __init__(self, seconds: float = SECONDS) -> None:
+        self.seconds = seconds
         self._lock = threading.Lock()
         self._locks: dict[str, threading.Lock] = {}
         self._made: dict[str, tuple[float, int, Any]] = {}
 
     def get(self, key: str, version: int, make: Callable[[], T]) -> T:
-        """What ``make`` returned for the key, begun at most a second ago and with this version. What it raises is not
+        """What ``make`` returned for the key, begun at most ``seconds`` ago and with this version. What it raises is not
         remembered."""
         with self._lock:
             lock = self._locks.setdefault(key, threading.Lock())
         with lock:
             when, made_with, value = self._made.get(key, (-math.inf, version, None))
             began = time.monotonic()
-            if began - when > self.SECONDS or made_with != version:
+            if began - when > self.seconds or made_with != version:
                 value = make()
                 self._made[key] = (began, version, value)
             return value
@@ -92,6 +94,7 @@ class State:
     feed: Feed
     streams: int = 0
     details: Remembered = field(default_factory=Remembered)
+    sizes: Remembered = field(default_factory=partial(Remembered, 30.0))
 
     def require_space(self, folder: Path) -> None:
         """Raises HTTPException 507: too little of the folder's disk is free."""

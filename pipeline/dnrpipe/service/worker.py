@@ -28,6 +28,7 @@ from ..workers.task_list import TIMEOUT_VARIABLE
 from .config import ServerConfig, tightest
 from .models import Job, Limits
 from .queue import MAX_STARTS, Queue
+from .results import EXPORTED
 from .root import ServiceRoot
 
 GRACE = 15.0
@@ -171,6 +172,10 @@ def job_command(job: Job, root: ServiceRoot, executor: tuple[str, ...] = ()) -> 
     if request.scene is not None:
         command.append(str(root.submitted_scene(request.scene, request.scene_sha256)[1]))
     command += ["-w", str(workspace), "--json"]
+    if request.command in EXPORTED:
+        return [*command, "--out", str(workspace / EXPORTED[request.command])]
+    if request.orbit is not None:
+        command += ["--orbit", str(request.orbit)]
     if request.preset is not None:
         command += ["--preset", request.preset]
     for key, value in request.settings.items():

@@ -32,6 +32,25 @@ const api = (function () {
       const body = value === undefined ? {} : { body: JSON.stringify(value), headers: { "Content-Type": "application/json" } };
       return (await ask(path, Object.assign({ method: "POST" }, body))).json();
     },
+    remove: async function (path) { return (await ask(path, { method: "DELETE" })).json(); },
+    /* PUT a file; `told` hears the share that is sent, 0 to 1. */
+    upload: function (path, file, told) {
+      return new Promise(function (done, failed) {
+        const request = new XMLHttpRequest();
+        request.open("PUT", path);
+        Object.entries(headers({ "Content-Type": "application/octet-stream" })).forEach(function (entry) { request.setRequestHeader(entry[0], entry[1]); });
+        request.upload.addEventListener("progress", function (event) { if (event.lengthComputable) told(event.loaded / event.total); });
+        request.addEventListener("error", function () { failed(new Error("The server does not answer. Is it running, and is this machine connected?")); });
+        request.addEventListener("load", function () {
+          let body = {};
+          try { body = JSON.parse(request.responseText); } catch (error) { /* said below */ }
+          if (request.getResponseHeader("www-authenticate")) document.dispatchEvent(new CustomEvent("token-wanted"));
+          if (request.status < 300) done(body);
+          else failed(new Error(body.detail || "The server answered " + request.status + " to " + path + "."));
+        });
+        request.send(file);
+      });
+    },
     picture: async function (path) { return URL.createObjectURL(await (await ask(path)).blob()); },
     /* Events of a job, until it has ended or `signal` is aborted; takes a broken stream up. Throws what refuses it. */
     events: async function (job, signal, seen) {

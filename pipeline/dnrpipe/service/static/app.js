@@ -44,13 +44,42 @@
     refresh();
   });
 
+  let pages = [], older = null;  // `before` of each page that was turned to
+  $("older").addEventListener("click", function () { if (older !== null) pages.push(older); refresh(); });
+  $("newer").addEventListener("click", function () { pages.pop(); refresh(); });
+  $("search").addEventListener("input", function () { pages = []; refresh(); });
+
+  /* Jobs that were submitted here and have not ended; told of by the browser once they have. */
+  const mine = new Set();
+  $("notify").addEventListener("change", async function () {
+    if (!$("notify").checked) return;
+    const allowed = "Notification" in window ? await Notification.requestPermission() : "denied";
+    if (allowed !== "granted") { $("notify").checked = false; problem(new Error("This browser allows no notifications from here.")); }
+  });
+  async function tellOfEnded() {
+    for (const id of Array.from(mine)) {
+      const entry = await api.get("/jobs/" + id);
+      if (!FINAL.includes(entry.state)) continue;
+      mine.delete(id);
+      if ($("notify").checked) new Notification("dnrpipe: job " + id + " " + entry.state, { body: entry.error || entry.request.command + " " + entry.request.workspace });
+    }
+  }
+
   async function refresh() {
     try {
       const health = await api.get("/healthz");
       $("health").textContent = health.status + " · " + health.running + " running, " + health.queued + " queued · workers: " +
         Object.keys(health.workers).map(function (d) { return d + (health.workers[d] ? "" : " (down)"); }).join(", ");
-      showJobs((await api.get("/jobs?limit=30")).jobs);
+      const query = new URLSearchParams({ limit: "30", search: $("search").value });
+      if (pages.length) query.set("before", pages[pages.length - 1]);
+      const page = await api.get("/jobs?" + query);
+      older = page.next;
+      $("pages").hidden = !pages.length && older === null;
+      $("newer").disabled = !pages.length; $("older").disabled = older === null;
+      showJobs(page.jobs);
       showWorkspaces(await api.get("/workspaces"));
+      showDeleted(await api.get("/deleted"));
+      await tellOfEnded();
     } catch (error) { $("health").textContent = error.message; }
   }
   function showJobs(jobs) {
@@ -61,12 +90,12 @@
       row.dataset.job = entry.id;
       name.append(button("", function () { select(row.entry); }));
       name.firstChild.className = "link";
-      row.append(cell(entry.id), name, cell(""), document.createElement("td"));
+      row.append(cell(entry.id), name, cell(""), cell(entry.owner || ""), document.createElement("td"));
       row.addEventListener("click", function (event) { if (!event.target.closest("button")) select(row.entry); });
       return row;
     }, function (row, entry) {
       const final = FINAL.includes(entry.state), act = final ? (entry.state === "done" ? "" : "retry") : "cancel";
-      const state = row.children[2], acts = row.children[3];
+      const state = row.children[2], acts = row.children[4];
       row.entry = entry;
       row.classList.toggle("selected", entry.id === job);
       say(row.children[1].firstChild, entry.request.command + " " + entry.request.workspace);
@@ -97,13 +126,54 @@
       const item = document.createElement("li");
       item.append(button(entry.name, function () { return open(entry.name); }), document.createElement("span"));
       return item;
-    }, function (item, entry) { say(item.children[1], entry.problem ? " " + entry.problem : ""); });
+    }, function (item, entry) { 
+      say(item.children[1], " " + (entry.problem || size(entry.mb) + (entry.owner ? ", " + entry.owner : "")));
+    });
     const names = found.map(function (entry) { return entry.name; }), list = $("workspace"), before = list.value;
     if (Array.from(list.options, function (o) { return o.value; }).slice(1).join() !== names.join()) {
       list.replaceChildren.apply(list, [""].concat(names).map(function (name) { return new Option(name || "(the scene's)", name); }));
       list.value = before;
     }
   }
+
+  function showDeleted(found) {
+    $("deleted-card").hidden = !found.length;
+    update($("deleted"), found, function (entry) { return entry.id; }, function (entry) {
+      const item = document.createElement("li"), back = button("Restore", function () { return api.post("/deleted/" + entry.id + "/restore"); });
+      back.setAttribute("aria-label", "Restore " + entry.name);
+      item.append(entry.name + ", gone for good " + new Date(1000 * entry.until).toLocaleString() + " ", back);
+      return item;
+    }, function () {});
+  }
+  function size(mb) { return mb >= 1024 ? (mb / 1024).toFixed(1) + " GiB" : mb >= 10 ? Math.round(mb) + " MiB" : mb.toFixed(1) + " MiB"; }
+
+  async function showResults(name) {
+    const found = await api.get("/workspaces/" + name + "/results");
+    if (name !== workspace) return;
+    $("results-card").hidden = !found.length;
+    update($("results"), found, function (entry) { return name + " " + entry.file; }, function (entry) {
+      const item = document.createElement("li");
+      item.append(button(entry.file, function () { return save("/workspaces/" + name + "/results/" + entry.file, name + "-" + entry.file.split("/").pop()); }), document.createElement("span"));
+      return item;
+    }, function (item, entry) { say(item.children[1], " " + entry.kind + ", " + size(entry.mb)); });
+  }
+  /* A link carries no token: fetched, and saved as a file. */
+  async function save(path, name) {
+    const link = document.createElement("a");
+    link.href = await api.picture(path);
+    link.download = name;
+    link.click();
+    setTimeout(function () { URL.revokeObjectURL(link.href); }, 60000);
+  }
+  $("delete").addEventListener("click", function () {
+    $("sure-text").textContent = "Delete " + workspace + " with all that is in it? It can be restored for some days.";
+    $("sure").hidden = false; $("sure-no").focus();
+  });
+  $("sure-no").addEventListener("click", function () { $("sure").hidden = true; $("delete").focus(); });
+  $("sure-yes").addEventListener("click", function () {
+    $("sure").hidden = true;
+    api.remove("/workspaces/" + workspace).then(function () { workspace = null; $("detail").hidden = true; $("file").focus(); }).then(settled).then(refresh).catch(problem);
+  });
 
   function select(entry) {
     if (watching) watching.abort();
@@ -217,7 +287,9 @@
     const costs = found.costs;
     $("cost").textContent = "Cost so far " + clock(costs.total) + "." + (costs.traced_views === null ? "" :
       " Ray-traced " + costs.traced_views + " of " + costs.candidates + " candidates in " + clock(costs.tracing_seconds) + "; all would have cost " + clock(costs.tracing_all_seconds) + ".");
+    $("sure").hidden = true;
     showPlan(found.plan);
+    await showResults(name);
     $("sphere-card").hidden = !found.sphere;
     if (found.sphere && found.sphere !== sphere) {  // else it stays as it was turned
       sphere = found.sphere;
@@ -248,13 +320,10 @@
   }
   $("view").addEventListener("change", function () { pictures().catch(problem); });
   $("split").addEventListener("input", function () { $("split").parentElement.style.setProperty("--split", $("split").value + "%"); });
-  $("open-report").addEventListener("click", async function (event) {
-    if (!api.hasToken()) return;  // a link carries no token: fetched, and saved as a file
+  $("open-report").addEventListener("click", function (event) {
+    if (!api.hasToken()) return;
     event.preventDefault();
-    const link = document.createElement("a");
-    link.href = await api.picture("/workspaces/" + workspace + "/report");
-    link.download = workspace + ".html";
-    link.click();
+    save("/workspaces/" + workspace + "/report", workspace + ".html").catch(problem);
   });
 
   $("submit").addEventListener("submit", async function (event) {
@@ -267,12 +336,21 @@
         request.scene = stem + file.name.slice(dot).toLowerCase();
         request.workspace = request.workspace || stem;
         $("upload").textContent = "uploading " + file.name;
-        const stored = await (await api.ask("/scenes/" + request.scene, { method: "PUT", body: file, headers: { "Content-Type": "application/octet-stream" } })).json();
+        const stored = await api.upload("/scenes/" + request.scene, file, function (share) { say($("upload"), "uploading " + file.name + ", " + Math.round(100 * share) + " %"); });
         request.scene_sha256 = stored.sha256;
         if (stored.replaced) problem(new Error("Another file named " + request.scene + " was there. Jobs that were submitted with it keep it."));
       }
       if (budget) request.settings["select.budget"] = Number(budget);
+      if ($("preset").value) request.preset = $("preset").value;
+      if (Number($("priority").value)) request.priority = Number($("priority").value);
+      if ($("orbit").value && request.command === "render") request.orbit = Number($("orbit").value);
+      $("settings").value.split("\n").forEach(function (line) {
+        const at = line.indexOf("=");
+        if (at > 0) request.settings[line.slice(0, at).trim()] = line.slice(at + 1).trim();
+        else if (line.trim()) throw new Error("Settings: " + line.trim() + " is not KEY=VALUE.");
+      });
       const made = await api.post("/jobs", request);
+      mine.add(made.id);
       $("upload").textContent = "job " + made.id;
       select(made);
     } catch (error) { $("upload").textContent = ""; problem(error); }

@@ -40,6 +40,17 @@
     $("status").textContent = "not connected; trying again";
     setTimeout(start, Math.min(30000, 1000 * Math.pow(2, tries - 1)));
   }
+  /* Pixels of the picture at rest: as many as the window shows, in steps that the network takes. */
+  function pixels() {
+    if ($("size").value !== "window") return Number($("size").value);
+    return Math.max(128, Math.min(512, 32 * Math.round(canvas.clientWidth * (window.devicePixelRatio || 1) / 32)));
+  }
+  /* What takes longer than a second is said: the first frame of a mode and size compiles kernels. */
+  let asked = 0;
+  setInterval(function () {
+    const seconds = Math.floor((performance.now() - asked) / 1000);
+    if (waiting && seconds >= 1) $("status").textContent = (canvas.dataset.frames ? "waiting for a frame" : "loading the scene, compiling its kernels") + ": " + seconds + " s";
+  }, 500);
   function home() {
     camera = { azimuth: -Math.PI / 3, elevation: 0.44, distance: hello.distance, target: hello.center.slice() };
     ask(false);
@@ -48,8 +59,8 @@
     moving = inMotion;
     if (!hello || socket.readyState !== WebSocket.OPEN) return;
     if (waiting) { wanted = true; return; }
-    waiting = true; wanted = false;
-    socket.send(JSON.stringify({ camera: camera, size: Number($("size").value), mode: mode, moving: moving }));
+    waiting = true; wanted = false; asked = performance.now();
+    socket.send(JSON.stringify({ camera: camera, size: pixels(), mode: mode, moving: moving }));
   }
   function moved() {
     camera.elevation = Math.max(-STEEPEST, Math.min(STEEPEST, camera.elevation));
@@ -66,7 +77,7 @@
       if (typeof event.data === "string") {
         const told = JSON.parse(event.data);
         if (told.kind === "hello") {
-          hello = told; tries = 0; problem(""); $("status").textContent = "loading the scene";
+          hello = told; tries = 0; problem(""); $("status").textContent = "loading the scene, compiling its kernels";
           choices();
           if (camera) ask(false); else home();
         } else { waiting = false; refused = !hello; problem(told.detail); $("status").textContent = ""; }
@@ -116,7 +127,6 @@
       label.append(input, " " + (NAMES[key] || key));
       $("modes").append(label);
     });
-    if ([128, 256, 384, 512].includes(hello.size)) $("size").value = String(hello.size);
   }
 
   function pan(dx, dy) {
@@ -157,5 +167,6 @@
   });
   $("home").addEventListener("click", home);
   $("size").addEventListener("change", function () { ask(false); });
+  window.addEventListener("resize", function () { if (camera && $("size").value === "window") moved(); });
   start();
 })();
