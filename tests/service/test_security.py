@@ -17,7 +17,7 @@ from websockets.sync.client import connect
 
 from dnrpipe.core.errors import UserError
 from dnrpipe.service.client import Refused
-from dnrpipe.service.config import read_token
+from dnrpipe.service.users import read_token
 from dnrpipe.service.models import JobRequest
 from dnrpipe.service.root import ServiceRoot, UnknownName
 

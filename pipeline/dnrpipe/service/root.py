@@ -6,7 +6,7 @@ root/
   dnrpipe.toml         settings for all jobs, if the operator puts one there
   .service/            queue.sqlite, logs/<job>.log, events/<job>.jsonl, lock
     uploads/<sha256>/<file>   the same files by content; a job names the one that it was submitted with
-    deleted/<unix seconds>-<name>.dnr   workspaces that can still be restored
+    deleted/<unix nanoseconds>-<name>.dnr   workspaces that can still be restored
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ class ServiceRoot:
     def delete(self, name: str) -> str:
         """Put a workspace away; what it is called there. Raises UnknownName; UserError: a command works in it."""
         path = self.workspace(name)
-        put_away = f"{time.time_ns() // 10**9}-{name}"
+        put_away = f"{time.time_ns()}-{name}"
         with locked(path, "delete"):
             path.rename(self.deleted / f"{put_away}{SUFFIX}")
         (self.deleted / f"{put_away}{SUFFIX}" / LOCK_FILES[1]).unlink(missing_ok=True)
@@ -135,7 +135,7 @@ class ServiceRoot:
         for path in self.deleted.glob(f"*{SUFFIX}"):
             when, _, name = path.name.removesuffix(SUFFIX).partition("-")
             if when.isdigit():
-                found.append((f"{when}-{name}", name, float(when)))
+                found.append((f"{when}-{name}", name, int(when) / 1e9))
         return sorted(found, key=lambda entry: -entry[2])
 
     def restore(self, put_away: str) -> str:

@@ -51,7 +51,7 @@ from .worker import folder_mb
 
 NamePath = Annotated[str, Path(pattern=NAME_PATTERN)]
 ScenePath = Annotated[str, Path(pattern=SCENE_PATTERN)]
-DeletedPath = Annotated[str, Path(pattern=r"^[0-9]{1,12}-[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
+DeletedPath = Annotated[str, Path(pattern=r"^[0-9]{1,20}-[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
 ViewPath = Annotated[str, Path(pattern=r"^[A-Za-z0-9_-][A-Za-z0-9_.-]{0,99}$")]
 # The page holds names from scene files: it may run its own scripts, but load and send nothing.
 REPORT_POLICY = (
