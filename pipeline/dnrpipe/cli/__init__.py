@@ -21,6 +21,7 @@ from .fleet import batch
 from .plan import frontier, plan
 from .service import cancel, jobs, logs, retry, serve, submit
 from .studies import ablate, bench_select
+from .worker import worker
 
 _EXTRAS = {
     "train": ("torch",),
@@ -78,7 +79,7 @@ for _command in (
     frontier,
     ablate,
     bench_select,
-    *(serve, submit, jobs, logs, cancel, retry),
+    *(serve, worker, submit, jobs, logs, cancel, retry),
     information.status,
     information.verify,
     information.costs,

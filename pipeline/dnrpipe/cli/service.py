@@ -1,4 +1,4 @@
-"""Commands of the service: serve; submit, jobs, logs, cancel, retry, which talk to a server."""
+"""Commands of the service: serve; submit, jobs, logs, cancel, retry, which talk to a server. `worker` is beside it."""
 
 from __future__ import annotations
 
@@ -39,13 +39,19 @@ COMMANDS = [
 STATES = ["queued", "running", "done", "failed", "cancelled"]
 
 
-def _client(server: str | None, token_file: Path | None) -> Client:
-    from ..service.client import DEFAULT_SERVER, Client
+def server_and_token(server: str | None, token_file: Path | None) -> tuple[str, str | None]:
+    """What the options, else the environment, name. Raises UserError: no token in the file."""
+    from ..service.client import DEFAULT_SERVER
     from ..service.users import read_token
 
     named = token_file or os.environ.get("DNRPIPE_TOKEN_FILE")
-    token = read_token(Path(named)) if named else None
-    return Client(server or os.environ.get("DNRPIPE_SERVER") or DEFAULT_SERVER, token)
+    return server or os.environ.get("DNRPIPE_SERVER") or DEFAULT_SERVER, read_token(Path(named)) if named else None
+
+
+def _client(server: str | None, token_file: Path | None) -> Client:
+    from ..service.client import Client
+
+    return Client(*server_and_token(server, token_file))
 
 
 @click.command()
@@ -56,7 +62,7 @@ def _client(server: str | None, token_file: Path | None) -> Client:
     help="Workspaces, scenes and the queue live here (default: this folder).",
 )  # fmt: skip
 @click.option("--token-file", type=click.Path(path_type=Path), metavar="FILE", help="Requests must carry its token, or one of its users'.")
-@click.option("--devices", metavar="A,B", help="One worker each: cpu, cuda:0, ... (default: all GPUs, else cpu).")
+@click.option("--devices", metavar="A,B", help="One worker each: cpu, cuda:0, ..., or none (default: all GPUs, else cpu).")
 @click.option("--upload-mb", type=click.IntRange(1), metavar="N", help="Largest scene file (default 2048 MiB).")
 @click.option("--most-queued", type=click.IntRange(1), metavar="N", help="Jobs that may wait (default 10000).")
 @click.option("--rate", type=float, metavar="N", help="Requests per second and client address (default 50).")
@@ -91,18 +97,13 @@ def serve(
       dnrpipe serve --host 0.0.0.0 --token-file token.txt
       dnrpipe submit scene.blend             # in another terminal
     """
-    from ..service.config import ServerConfig, default_devices, default_memory_mb
+    from ..service.config import ServerConfig, default_memory_mb
     from ..service.models import Limits
     from ..service.server import serve as run_server
     from ..service.users import read_users
 
     users = read_users(token_file) if token_file is not None else None
-    chosen = tuple(part.strip() for part in devices.split(",")) if devices else default_devices()
-    for name in chosen:
-        if name != "cpu" and not (name.startswith("cuda:") and name.removeprefix("cuda:").isdigit()):
-            raise UserError(f"--devices {name}: neither cpu nor cuda:<number>")
-    if len(set(chosen)) < len(chosen):
-        raise UserError(f"--devices {devices}: names a device twice")
+    chosen = () if devices == "none" else chosen_devices(devices)
     days = options["keep_days"]
     if days is not None and not 0 < days <= 36_500:
         raise UserError(f"--keep-days {days:g}: must be above 0, and 36500 at most")
@@ -136,12 +137,26 @@ def serve(
     whole = root.resolve()  # the server works in it
 
     def ready(address: str) -> None:
-        console.say(f"serving {whole}, workers: {', '.join(chosen)}; Ctrl-C stops, jobs go on at the next start")
+        workers = ", ".join(chosen) or "none of its own"
+        console.say(f"serving {whole}, workers: {workers}; Ctrl-C stops, jobs go on at the next start")
         console.say(f"dashboard: {address}")
         if url is not None:
             console.say(f"for browsers: {url}")
 
     run_server(config, users, ready=ready)
+
+
+def chosen_devices(text: str | None) -> tuple[str, ...]:
+    """The devices that ``--devices`` names; None: all there are. Raises UserError."""
+    from ..service.config import default_devices
+
+    chosen = tuple(part.strip() for part in text.split(",")) if text else default_devices()
+    for name in chosen:
+        if name != "cpu" and not (name.startswith("cuda:") and name.removeprefix("cuda:").isdigit()):
+            raise UserError(f"--devices {name}: neither cpu nor cuda:<number>")
+    if len(set(chosen)) < len(chosen):
+        raise UserError(f"--devices {text}: names a device twice")
+    return chosen
 
 
 def _is_address(url: str, *, path: bool = False) -> bool:

@@ -16,9 +16,10 @@ from starlette.exceptions import HTTPException
 
 from .. import __version__
 from ..core.errors import UserError
-from . import routes_jobs, routes_live, routes_server, routes_workspaces
+from . import routes_jobs, routes_leases, routes_live, routes_server, routes_workspaces
 from .config import LOOPBACK
 from .guard import Guard
+from .leases import LeaseGone
 from .models import first_fault
 from .queue import QueueFull, WrongState
 from .root import UnknownName
@@ -27,7 +28,15 @@ from .users import User
 from .webhooks import tell_of_ended
 
 LOG = logging.getLogger("dnrpipe.pruning")
-_STATUS: dict[type[UserError], int] = {QueueFull: 429, WrongState: 409, UnknownName: 404, UserError: 422}
+WORKERS = logging.getLogger("dnrpipe.workers")
+LAPSE_INTERVAL = 1.0
+_STATUS: dict[type[UserError], int] = {
+    QueueFull: 429,
+    WrongState: 409,
+    LeaseGone: 410,
+    UnknownName: 404,
+    UserError: 422,
+}
 
 
 def create_app(state: State, users: Mapping[str, User] | None) -> FastAPI:
@@ -35,7 +44,7 @@ def create_app(state: State, users: Mapping[str, User] | None) -> FastAPI:
 
     @contextlib.asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        chores = [state.feed.watch(), state.live.close_idle(), _prune_regularly(state)]
+        chores = [state.feed.watch(), state.live.close_idle(), _prune_regularly(state), _end_lapsed_leases(state)]
         if state.config.webhooks:
             chores.append(tell_of_ended(state.queue, state.config.webhooks))
         tasks = [asyncio.create_task(chore) for chore in chores]
@@ -55,7 +64,7 @@ def create_app(state: State, users: Mapping[str, User] | None) -> FastAPI:
         separate_input_output_schemas=True,
     )
     app.state.service = state
-    for module in (routes_server, routes_jobs, routes_workspaces, routes_live):
+    for module in (routes_server, routes_jobs, routes_workspaces, routes_live, routes_leases):
         app.include_router(module.router)
     for kind in (*_STATUS, RequestValidationError, HTTPException):
         app.add_exception_handler(kind, _answer)
@@ -85,6 +94,17 @@ async def _prune_regularly(state: State) -> None:
         except Exception:  # a full disk, a busy queue: the server goes on and tries again
             LOG.exception("old logs and events could not be removed")
         await asyncio.sleep(3600)
+
+
+async def _end_lapsed_leases(state: State) -> None:
+    """Queue jobs again whose workers elsewhere are silent, for as long as the server runs."""
+    while True:
+        try:
+            for job in await run_in_threadpool(state.queue.recover_lapsed):
+                WORKERS.error("worker elsewhere was lost", extra={"facts": {"job": job}})
+        except Exception:  # a full disk, a busy queue: the server goes on and tries again
+            WORKERS.exception("lapsed leases could not be ended")
+        await asyncio.sleep(LAPSE_INTERVAL)
 
 
 async def _answer(_: Request, error: Exception) -> JSONResponse:

@@ -48,17 +48,21 @@ Answer = TypeVar("Answer")
 
 
 class Refused(UserError):
-    """The server refused the request; `status` is the HTTP status."""
+    """The server refused the request; `status` is the HTTP status. wait: seconds until it may be sent again, if so."""
 
-    def __init__(self, status: int, message: str) -> None:
+    def __init__(self, status: int, message: str, wait: float | None = None) -> None:
         super().__init__(message)
-        self.status = status
+        self.status, self.wait = status, wait
+
+
+class Unreachable(UserError):
+    """The server does not answer."""
 
 
 class Client:
     """Talks to one server; retries when it is busy or does not answer.
 
-    Raises UserError: the server does not answer. Raises Refused: it refuses the request.
+    Raises Unreachable. Raises Refused: the server refuses the request.
     """
 
     def __init__(
@@ -197,23 +201,27 @@ class Client:
 
     def _ask(self, method: str, path: str, model: type[Answer], **options: Any) -> Answer:
         """Send a request, with retries: safe for everything but uploads, since submissions carry a key."""
-        deadline, refusals = time.monotonic() + self.retry_seconds, 0
+        return self._retrying(lambda: self._read(_checked(self._http.request(method, path, **options)), model))
+
+    def _retrying(self, attempt: Callable[[], Answer]) -> Answer:
+        """What ``attempt`` returns; tried again while the server does not answer, or says to wait."""
+        failing, refusals = None, 0
         while True:
             try:
-                answer = self._http.request(method, path, **options)
+                return attempt()
             except httpx.TransportError as error:
-                if time.monotonic() > deadline:
-                    raise UserError(
+                now = time.monotonic()
+                failing = failing or now
+                if now - failing > self.retry_seconds:
+                    raise Unreachable(
                         f"{self.server}: cannot be reached ({error}); is `dnrpipe serve` running there?"
                     ) from None
                 time.sleep(RETRY_INTERVAL)
-                continue
-            wait = answer.headers.get("retry-after", "")
-            if answer.status_code == 429 and wait.isdigit() and refusals < MAX_REFUSALS:
+            except Refused as refused:
+                if refused.status != 429 or refused.wait is None or refusals >= MAX_REFUSALS:
+                    raise
                 refusals += 1
-                time.sleep(min(float(wait), MAX_WAIT))
-                continue
-            return self._read(_checked(answer), model)
+                time.sleep(min(refused.wait, MAX_WAIT))
 
     def _read(self, answer: httpx.Response, model: type[Answer]) -> Answer:
         try:
@@ -229,10 +237,14 @@ def _trust() -> ssl.SSLContext:
 
 
 def _checked(answer: httpx.Response) -> httpx.Response:
+    """Raises Refused. Raises httpx.TransportError: a proxy in front of the server does not reach it."""
     if answer.is_success:
         return answer
+    if answer.status_code in (502, 504):
+        raise httpx.ProxyError(f"the proxy in front of it answers with {answer.status_code}")
     try:
         detail = str(answer.json()["detail"])
     except (ValueError, KeyError, TypeError):
         detail = f"{answer.request.method} {answer.request.url.path} was answered with {answer.status_code}"
-    raise Refused(answer.status_code, detail)
+    wait = answer.headers.get("retry-after", "")
+    raise Refused(answer.status_code, detail, float(wait) if wait.isdigit() else None)

@@ -30,7 +30,7 @@ ACCESS = logging.getLogger("dnrpipe.access")
 SUBPROTOCOL = "dnrpipe.live"
 TOKEN_PREFIX = "dnrpipe.token."
 MAX_BODY = 256 * 1024
-"""Bytes of any request but an upload of a scene."""
+"""Bytes of any request but an upload: of a scene, or of what a worker elsewhere made."""
 MAX_CLIENTS = 10_000
 REFUSALS_PER_MINUTE = 20
 WORKER_PATHS = "/leases"
@@ -218,8 +218,11 @@ def _name_of(host: str) -> str:
 
 
 def is_upload(scope: Any) -> bool:
-    """Whether a request sends a scene file."""
-    return scope["type"] == "http" and scope["method"] == "PUT" and scope["path"].startswith("/scenes/")
+    """Whether a request sends a scene file, or what a worker elsewhere made."""
+    if scope["type"] != "http" or scope["method"] != "PUT":
+        return False
+    path = scope["path"]
+    return path.startswith("/scenes/") or (path.startswith(f"{WORKER_PATHS}/") and path.endswith("/result"))
 
 
 def _given_token(scope: Scope, headers: Headers) -> bytes:

@@ -87,7 +87,8 @@ class Job(Strict):
 
     starts: how many processes were started for it; crashes: how many of those ended by a signal, a limit aside.
     exit_code: of the last process, negative for a signal. error: why it failed, one line. progress: the last report.
-    owner: whose token submitted it. device: what works on it, a device of the server or a worker elsewhere.
+    owner: whose token submitted it. device: what works on it, a device of the server or ``machine/device`` of a worker
+    elsewhere. lost: those starts of which nothing came back, since such a worker was lost.
     """
 
     id: int = Field(ge=1, le=2**53)
@@ -104,6 +105,19 @@ class Job(Strict):
     error: str | None = None
     progress: dict[str, Any] | None = None
     owner: str | None = None
+    lost: int = 0
+
+
+class End(Strict):
+    """How a start of a job ended. state queued: it is to be started again. crashed: its process died, which counts.
+
+    error: why it failed, or why it is queued again, in one line.
+    """
+
+    state: Literal["queued", "done", "failed", "cancelled"]
+    exit_code: int | None = Field(default=None, ge=-255, le=255)
+    error: str | None = None
+    crashed: bool = False
 
 
 class JobPage(Strict):

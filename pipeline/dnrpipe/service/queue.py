@@ -21,7 +21,8 @@ from typing import Any
 
 from ..core.errors import UserError
 from .config import ServerConfig
-from .models import FINAL, STATES, Job, JobEvent, JobRequest, State
+from .leases import LeaseGone
+from .models import FINAL, STATES, End, Job, JobEvent, JobRequest, State
 from .root import ServiceRoot, UnknownName
 
 SCHEMA = 2
@@ -50,7 +51,12 @@ CREATE TABLE IF NOT EXISTS jobs (
     token TEXT UNIQUE,
     owner TEXT,
     hook_due REAL,
-    hook_tries INTEGER NOT NULL DEFAULT 0
+    hook_tries INTEGER NOT NULL DEFAULT 0,
+    lost INTEGER NOT NULL DEFAULT 0,
+    lease TEXT,
+    lease_until REAL,
+    lease_beat INTEGER,
+    lease_result INTEGER
 );
 CREATE INDEX IF NOT EXISTS jobs_due ON jobs (state, priority DESC, id);
 CREATE TABLE IF NOT EXISTS events (
@@ -61,8 +67,12 @@ CREATE TABLE IF NOT EXISTS events (
     data TEXT NOT NULL
 );
 CREATE INDEX IF NOT EXISTS events_of_job ON events (job, id);
+CREATE UNIQUE INDEX IF NOT EXISTS jobs_leased ON jobs (lease) WHERE lease IS NOT NULL;
 """
-_SINCE_2 = ("owner TEXT", "hook_due REAL", "hook_tries INTEGER NOT NULL DEFAULT 0")
+_SINCE_2 = (
+    *("owner TEXT", "hook_due REAL", "hook_tries INTEGER NOT NULL DEFAULT 0", "lost INTEGER NOT NULL DEFAULT 0"),
+    *("lease TEXT", "lease_until REAL", "lease_beat INTEGER", "lease_result INTEGER"),
+)
 _COLUMNS = ", ".join(Job.model_fields)
 
 
@@ -89,11 +99,11 @@ class Queue:
                 version = db.execute("PRAGMA user_version").fetchone()[0]
                 if version > SCHEMA:
                     raise UserError(f"{path}: queue schema {version} is newer than this dnrpipe ({SCHEMA}); upgrade it")
-                for statement in _TABLES.split(";"):
-                    db.execute(statement)
                 if version == 1:
                     for column in _SINCE_2:
                         db.execute(f"ALTER TABLE jobs ADD COLUMN {column}")
+                for statement in _TABLES.split(";"):
+                    db.execute(statement)
                 db.execute(f"PRAGMA user_version = {SCHEMA}")
         except sqlite3.DatabaseError as error:
             raise UserError(f"{path}: not a job queue ({error}); move it away to start a new one") from None
@@ -177,8 +187,11 @@ class Queue:
         found = dict(self._db().execute("SELECT state, count(*) FROM jobs GROUP BY state").fetchall())
         return {state: found.get(state, 0) for state in STATES}
 
-    def claim(self, device: str) -> Job | None:
-        """Take the next job: the highest priority, then the oldest, whose workspace no job is working on."""
+    def claim(self, device: str, *, lease: str | None = None, seconds: float = 0.0) -> Job | None:
+        """Take the next job: the highest priority, then the oldest, whose workspace no job is working on.
+
+        lease: of a worker elsewhere; the job is its for ``seconds`` after every sign of life.
+        """
         with self._writing() as db:
             row = db.execute(
                 "SELECT id, starts FROM jobs WHERE state = 'queued' AND workspace NOT IN"
@@ -187,8 +200,48 @@ class Queue:
             if row is None:
                 return None
             news = {"device": device, "started": time.time(), "starts": row["starts"] + 1}
+            if lease is not None:
+                news |= {"lease": lease, "lease_until": time.time() + seconds, "lease_beat": 0, "lease_result": 0}
             _change(db, row["id"], "running", **news, finished=None, exit_code=None, error=None)
             return self.get(row["id"])
+
+    @contextmanager
+    def leased(self, lease: str) -> Iterator[Job]:
+        """The running job of a lease; nobody else writes to the queue meanwhile, so the lease stays. Raises LeaseGone."""
+        with self._writing() as db:
+            row = db.execute(f"SELECT {_COLUMNS} FROM jobs WHERE lease = ?", (lease,)).fetchone()
+            if row is None:
+                raise LeaseGone("this lease is over; its job ended, or was queued again")
+            yield _job(row)
+
+    def extend(self, lease: str, seconds: float) -> Job:
+        """A sign of life: the lease lasts ``seconds`` from now. Raises LeaseGone."""
+        with self.leased(lease) as job:
+            self._db().execute("UPDATE jobs SET lease_until = ? WHERE id = ?", (time.time() + seconds, job.id))
+            return job
+
+    def hear(self, job: int, number: int) -> bool:
+        """Note a heartbeat of a leased job's worker. Returns whether it was not heard before."""
+        with self._writing() as db:
+            query = "UPDATE jobs SET lease_beat = ? WHERE id = ? AND lease_beat < ?"
+            return db.execute(query, (number, job, number)).rowcount == 1
+
+    def result_came(self, job: int) -> None:
+        """What a leased job made is here."""
+        with self._writing() as db:
+            db.execute("UPDATE jobs SET lease_result = 1 WHERE id = ? AND lease IS NOT NULL", (job,))
+
+    def has_result(self, job: int) -> bool:
+        """Whether what a leased job made is here."""
+        found = self._db().execute("SELECT 1 FROM jobs WHERE id = ? AND lease_result = 1", (job,))
+        return found.fetchone() is not None
+
+    def end(self, job: int, end: End) -> None:
+        """Record how a start of a job ended. Does nothing when it is not running any more."""
+        if end.state == "queued":
+            self.requeue(job, crashed=end.crashed, why=end.error or "")
+        else:
+            self.finish(job, end.state, exit_code=end.exit_code, error=end.error)
 
     def finish(self, job: int, state: State, *, exit_code: int | None = None, error: str | None = None) -> None:
         """Record how a running job ended. Does nothing when it is not running any more."""
@@ -205,12 +258,23 @@ class Queue:
                 _change(db, job, "queued", why, crashes=found.crashes + crashed)
 
     def recover(self, device: str | None = None) -> list[int]:
-        """After a crash of server or worker, queue again what was running (on `device`), or cancel it if that was
-        requested. Returns the jobs that were running."""
+        """After a crash of server or worker, queue again what was running here (on `device`), or cancel it if that was
+        requested. Returns the jobs that were running. Those of workers elsewhere live on."""
+        return self._recover("lease IS NULL AND (? IS NULL OR device = ?)", device, device)
+
+    def recover_lapsed(self) -> list[int]:
+        """As `recover`, for the jobs of workers elsewhere that gave no sign of life in time."""
+        lapsed, now = "lease IS NOT NULL AND lease_until < ?", time.time()
+        if self._db().execute(f"SELECT 1 FROM jobs WHERE {lapsed}", (now,)).fetchone() is None:
+            return []  # without holding the file for writing
+        return self._recover(lapsed, now)
+
+    def _recover(self, which: str, *values: Any) -> list[int]:
         with self._writing() as db:
             rows = db.execute(
-                "SELECT id, cancel_requested, starts FROM jobs WHERE state = 'running' AND (? IS NULL OR device = ?)",
-                (device, device),
+                "SELECT id, cancel_requested, starts, lost + (lease_result IS 0) AS lost FROM jobs"
+                f" WHERE state = 'running' AND {which}",
+                values,
             ).fetchall()
             for row in rows:
                 if row["cancel_requested"]:
@@ -220,7 +284,8 @@ class Queue:
                 else:
                     state, error = "queued", None
                 finished = None if state == "queued" else time.time()
-                _change(db, row["id"], state, error or "its worker was lost", error=error, finished=finished)
+                why = error or "its worker was lost"
+                _change(db, row["id"], state, why, error=error, finished=finished, lost=row["lost"])
             return [row["id"] for row in rows]
 
     def cancel(self, job: int) -> Job:
@@ -242,7 +307,7 @@ class Queue:
             if state not in ("failed", "cancelled"):
                 raise WrongState(f"job {job} is {state}; only failed and cancelled jobs can be retried")
             blank = dict.fromkeys(("started", "finished", "exit_code", "error"))
-            _change(db, job, "queued", "retried", cancel_requested=False, starts=0, crashes=0, **blank)
+            _change(db, job, "queued", "retried", cancel_requested=False, starts=0, crashes=0, lost=0, **blank)
             return self.get(job)
 
     def due_hooks(self) -> list[tuple[Job, int]]:
@@ -340,8 +405,11 @@ class Queue:
 
     @contextmanager
     def _writing(self) -> Iterator[sqlite3.Connection]:
-        """One transaction that holds the file for writing."""
+        """One transaction that holds the file for writing; inside another of this thread, a part of that."""
         db = self._db()
+        if db.in_transaction:
+            yield db
+            return
         db.execute("BEGIN IMMEDIATE")
         try:
             yield db
@@ -352,7 +420,9 @@ class Queue:
 
 
 def _change(db: sqlite3.Connection, job: int, state: str, why: str | None = None, **columns: Any) -> None:
-    """Set a job's state and other columns, and note the state as an event. One that ended is told of (`webhooks`)."""
+    """Set a job's state and other columns, and note the state as an event. One that ended is told of (`webhooks`). A
+    lease lasts no longer than the state that it came with."""
+    columns = {"lease": None, "lease_until": None, "lease_beat": None, "lease_result": None} | columns
     if state in FINAL:
         db.execute(
             "UPDATE jobs SET hook_due = ?, hook_tries = 0 WHERE id = ? AND json_extract(request, '$.webhook') IS NOT NULL",

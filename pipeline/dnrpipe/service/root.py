@@ -5,6 +5,7 @@ root/
   scenes/<file>        scene files by name: the last upload of each
   dnrpipe.toml         settings for all jobs, if the operator puts one there
   .service/            queue.sqlite, logs/<job>.log, events/<job>.jsonl, lock
+    incoming/          what workers elsewhere send, until it is whole and checked
     uploads/<sha256>/<file>   the same files by content; a job names the one that it was submitted with
     deleted/<unix nanoseconds>-<name>.dnr   workspaces that can still be restored
 """
@@ -39,14 +40,21 @@ class ServiceRoot:
         self.scenes = self.folder / "scenes"
         self.uploads = self.private / "uploads"
         self.deleted = self.private / "deleted"
+        self.incoming = self.private / "incoming"
 
     def create(self) -> ServiceRoot:
         """Make the folders that are missing; the private one is readable by its owner alone."""
         self.folder.mkdir(parents=True, exist_ok=True)
         self.private.mkdir(mode=0o700, exist_ok=True)
-        for folder in (self.scenes, self.uploads, self.deleted, self.private / "logs", self.private / "events"):
+        private = (self.uploads, self.deleted, self.incoming, self.private / "logs", self.private / "events")
+        for folder in (self.scenes, *private):
             folder.mkdir(exist_ok=True)
         return self
+
+    def drop_incoming(self) -> None:
+        """Remove what a killed server left half-way. Only where no server works."""
+        shutil.rmtree(self.incoming)
+        self.incoming.mkdir()
 
     def log(self, job: int) -> Path:
         return self.private / "logs" / f"{job}.log"
@@ -71,6 +79,8 @@ class ServiceRoot:
     def keep_scene(self, file: Path, name: str, sha256: str) -> bool:
         """Move a file of this content to its places. Returns whether it replaced another of that name."""
         kept, named = self._upload(sha256) / name, self.scene(name, must_exist=False)
+        with file.open("rb") as written:
+            os.fsync(written.fileno())
         replaced = named.is_file() and not (kept.is_file() and kept.samefile(named)) and file_sha256(named) != sha256
         if not kept.is_file():
             file.chmod(0o444)  # what was submitted stays what it was

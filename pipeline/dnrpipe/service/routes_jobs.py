@@ -28,6 +28,7 @@ STATUSES = {
     403: "A page of another origin",
     404: "No such thing",
     409: "The job's state forbids it",
+    410: "The lease is over",
     413: "Too large",
     421: "Not a name of this server",
     422: "Not a valid request",

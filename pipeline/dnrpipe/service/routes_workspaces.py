@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import os
 import secrets
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
@@ -12,7 +10,6 @@ from fastapi import APIRouter, HTTPException, Path, Request, Response
 from fastapi.responses import FileResponse
 from starlette.background import BackgroundTask
 from starlette.concurrency import run_in_threadpool
-from starlette.requests import ClientDisconnect
 
 from dnrtrain.contract import DamagedFile
 from dnrtrain.records import read
@@ -46,6 +43,7 @@ from .results import pack, results
 from .root import UnknownName
 from .routes_jobs import REFUSED, refusals
 from .state import Shared, State
+from .uploads import receive
 from .users import Caller, User
 from .worker import folder_mb
 
@@ -265,31 +263,16 @@ async def upload(name: ScenePath, request: Request, service: Shared) -> Scene:
     must be packed into it. Scripts embedded in it are never run.
     """
     target = service.root.scene(name, must_exist=False)
-    limit = service.config.upload_mb * 2**20
-    declared = request.headers.get("content-length", "")
-    if declared.isascii() and declared.isdigit() and int(declared) > limit:
-        raise HTTPException(413, f"the file is larger than {service.config.upload_mb} MiB")
     await run_in_threadpool(_check_space, service, name)
     temporary = target.parent / f".{secrets.token_hex(8)}.part"
-    checksum, size = hashlib.sha256(), 0
     try:
-        with temporary.open("xb") as file:
-            async for chunk in request.stream():
-                size += len(chunk)
-                if size > limit:
-                    raise HTTPException(413, f"the file is larger than {service.config.upload_mb} MiB")
-                checksum.update(chunk)
-                await run_in_threadpool(file.write, chunk)
-            file.flush()
-            await run_in_threadpool(os.fsync, file.fileno())
+        sha256, size = await receive(request, temporary, service.config.upload_mb)
         if size == 0:
             raise HTTPException(422, "the body is empty; it must be the scene file")
-        replaced = await run_in_threadpool(service.root.keep_scene, temporary, name, checksum.hexdigest())
-    except ClientDisconnect:
-        raise HTTPException(400, "the connection ended before the file did") from None
+        replaced = await run_in_threadpool(service.root.keep_scene, temporary, name, sha256)
     finally:
         temporary.unlink(missing_ok=True)
-    return Scene(name=name, size=size, sha256=checksum.hexdigest(), replaced=replaced)
+    return Scene(name=name, size=size, sha256=sha256, replaced=replaced)
 
 
 @router.delete("/scenes/{name}", status_code=204, responses=refusals(404))

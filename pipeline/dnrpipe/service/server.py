@@ -56,6 +56,7 @@ def serve(config: ServerConfig, users: Mapping[str, User] | None, *, ready: Call
     except Timeout:
         raise UserError(f"{root.folder}: another server works here; stop it or choose another --root") from None
     with lock:
+        root.drop_incoming()
         queue = Queue(root.queue)
         queue.recover()
         supervisor = Supervisor(config, queue, root.private / "workers.log")
@@ -92,7 +93,7 @@ def serve(config: ServerConfig, users: Mapping[str, User] | None, *, ready: Call
 
 
 class _Patient(H11Protocol):
-    """Closes connections whose request does not come: its head in time, and its body, uploads of scenes aside."""
+    """Closes connections whose request does not come: its head in time, and its body, uploads aside."""
 
     _timer: asyncio.TimerHandle | None = None
     _awaited: tuple[str, int] | None = None

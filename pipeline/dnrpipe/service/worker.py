@@ -1,5 +1,7 @@
 """The worker process of one device: claims a job, runs its command, watches it and records how it ended.
 
+`run_job` is all of that but claiming and recording; workers elsewhere (`remote_worker`) use it, too.
+
 `python -m dnrpipe.service.worker DEVICE SERVER_PID`, with the server's configuration as JSON on standard input. The
 job's process leads its own session. It dies with the worker, and the worker dies with the server: after kill -9 nothing
 runs on unseen, and the next server queues the job again.
@@ -14,9 +16,10 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from filelock import FileLock, Timeout
 
@@ -26,7 +29,7 @@ from ..core.workspace import LOCK_FILES
 from ..workers.processes import die_with_parent, how_ended
 from ..workers.task_list import TIMEOUT_VARIABLE
 from .config import ServerConfig, tightest
-from .models import Job, Limits
+from .models import End, Job, Limits
 from .queue import MAX_STARTS, Queue
 from .results import EXPORTED
 from .root import ServiceRoot
@@ -41,6 +44,14 @@ MACHINE_VARIABLES = ("DNRPIPE_CACHE", TIMEOUT_VARIABLE)
 UNLOCK_SECONDS = 10.0
 """How long the processes of a killed worker may still hold a workspace."""
 INTERRUPTED = 130
+
+
+class Report(Protocol):
+    """Where a running job's news go, and word of its cancellation comes from."""
+
+    def news(self, events: list[dict[str, Any]]) -> None: ...
+
+    def cancelled(self) -> bool: ...
 
 
 class Worker:
@@ -60,82 +71,123 @@ class Worker:
             if job is None:
                 time.sleep(IDLE)
                 continue
+            limits = tightest(job.request.limits, self.config.limits)
+            report = _QueueReport(self.queue, job.id)
             try:
-                self._run_job(job)
+                end = run_job(
+                    job, self.root, self.device, limits, report, lambda: self.stopping, executor=self.config.executor
+                )
             except (UserError, OSError) as error:  # the job cannot start; the worker goes on
-                self.queue.finish(job.id, "failed", error=" ".join(str(error).split()))
+                end = End(state="failed", error=" ".join(str(error).split()))
+            self.queue.end(job.id, end)
 
     def stop(self, *_: Any) -> None:
         self.stopping = True
 
-    def _run_job(self, job: Job) -> None:
-        workspace = self.root.workspace(job.request.workspace, must_exist=False)
-        command = job_command(job, self.root, self.config.executor)
-        if workspace.is_dir():  # if somebody else holds it, the command says so
-            with contextlib.suppress(Timeout), FileLock(workspace / LOCK_FILES[0], timeout=UNLOCK_SECONDS):
-                pass
-        events = self.root.events(job.id)
-        events.write_bytes(b"")  # the queue already has the events of earlier attempts
-        with self.root.log(job.id).open("ab") as log:
-            log.write(f"--- {time.strftime('%F %T')} start {job.starts} on {self.device}\n".encode())
-            log.flush()
-            process = subprocess.Popen(
-                command,
-                cwd=self.root.folder,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                env=job_environment(self.device, events),
-                start_new_session=True,
-                preexec_fn=partial(die_with_parent, os.getpid()),
-            )
-        limits = tightest(job.request.limits, self.config.limits)
-        ended = self._watch(job, process, workspace, limits, EventReader(events))
-        self._record_end(job, process.returncode, ended)
 
-    def _watch(
-        self, job: Job, process: subprocess.Popen[bytes], workspace: Path, limits: Limits, events: EventReader
-    ) -> str | None:
-        """Wait until the job ends. Returns why it was stopped: "cancelled", "stopping" or a limit; None: by itself."""
-        started, disk_due = time.monotonic(), 0.0
-        ended = None
-        while process.poll() is None:
-            self.queue.add_events(job.id, events.read())
-            now = time.monotonic()
-            if self.queue.get(job.id).cancel_requested:
-                ended = "cancelled"
-            elif self.stopping:
-                ended = "stopping"
-            elif limits.seconds is not None and now - started > limits.seconds:
-                ended = f"took longer than its limit of {limits.seconds:g} s"
-            elif limits.memory_mb is not None and session_memory_mb(process.pid) > limits.memory_mb:
-                ended = f"used more than its limit of {limits.memory_mb} MiB of memory"
-            elif limits.disk_mb is not None and now >= disk_due:
-                disk_due = now + DISK_INTERVAL
-                if folder_mb(workspace) > limits.disk_mb:
-                    ended = f"its workspace is larger than its limit of {limits.disk_mb} MiB"
-            if ended is not None:
-                end_group(process)
-                break
-            time.sleep(WATCH)
-        end_group(process, grace=0)  # helpers that outlive their command
-        self.queue.add_events(job.id, events.read())
-        return ended
+class _QueueReport:
+    """To the queue itself."""
 
-    def _record_end(self, job: Job, code: int, ended: str | None) -> None:
-        queue = self.queue
-        if code == 0 and ended in (None, "cancelled", "stopping"):  # it ended before it was stopped
-            queue.finish(job.id, "done", exit_code=0)
-        elif ended == "cancelled":
-            queue.finish(job.id, "cancelled", exit_code=code)
-        elif ended == "stopping":
-            queue.requeue(job.id, crashed=False, why="the server was stopped")
-        elif ended is not None:
-            queue.finish(job.id, "failed", exit_code=code, error=f"{ended}; raise it and retry to go on")
-        elif code < 0 and job.crashes < job.request.retries and job.starts < MAX_STARTS:
-            queue.requeue(job.id, crashed=True, why=f"its process {how_ended(code)}")
-        else:
-            queue.finish(job.id, "failed", exit_code=code, error=_reason(self.root.log(job.id), code))
+    def __init__(self, queue: Queue, job: int) -> None:
+        self.queue, self.job = queue, job
+
+    def news(self, events: list[dict[str, Any]]) -> None:
+        self.queue.add_events(self.job, events)
+
+    def cancelled(self) -> bool:
+        return self.queue.get(self.job).cancel_requested
+
+
+def run_job(
+    job: Job,
+    root: ServiceRoot,
+    device: str,
+    limits: Limits,
+    report: Report,
+    stopping: Callable[[], bool],
+    *,
+    executor: tuple[str, ...] = (),
+) -> End:
+    """Run a job's command in ``root`` on a device, and watch it until it ends. Returns how it did.
+
+    stopping: asked all the time; when it says so the job is stopped, and is to be started again. Raises UserError,
+    OSError: the command cannot be started. Raises what ``report`` raises; the job's processes are gone then.
+    """
+    workspace = root.workspace(job.request.workspace, must_exist=False)
+    command = job_command(job, root, executor)
+    if workspace.is_dir():  # if somebody else holds it, the command says so
+        with contextlib.suppress(Timeout), FileLock(workspace / LOCK_FILES[0], timeout=UNLOCK_SECONDS):
+            pass
+    events = root.events(job.id)
+    events.write_bytes(b"")  # the queue already has the events of earlier attempts
+    with root.log(job.id).open("ab") as log:
+        log.write(f"--- {time.strftime('%F %T')} start {job.starts} on {job.device}\n".encode())
+        log.flush()
+        process = subprocess.Popen(
+            command,
+            cwd=root.folder,
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env=job_environment(device, events),
+            start_new_session=True,
+            preexec_fn=partial(die_with_parent, os.getpid()),
+        )
+    try:
+        stopped = _watch(process, workspace, limits, EventReader(events), report, stopping)
+    except BaseException:
+        end_group(process, grace=0)
+        raise
+    return _how_ended(job, process.returncode, stopped, root.log(job.id))
+
+
+def _watch(
+    process: subprocess.Popen[bytes],
+    workspace: Path,
+    limits: Limits,
+    events: EventReader,
+    report: Report,
+    stopping: Callable[[], bool],
+) -> str | None:
+    """Wait until the job ends. Returns why it was stopped: "cancelled", "stopping" or a limit; None: by itself."""
+    started, disk_due = time.monotonic(), 0.0
+    ended = None
+    while process.poll() is None:
+        report.news(events.read())
+        now = time.monotonic()
+        if report.cancelled():
+            ended = "cancelled"
+        elif stopping():
+            ended = "stopping"
+        elif limits.seconds is not None and now - started > limits.seconds:
+            ended = f"took longer than its limit of {limits.seconds:g} s"
+        elif limits.memory_mb is not None and session_memory_mb(process.pid) > limits.memory_mb:
+            ended = f"used more than its limit of {limits.memory_mb} MiB of memory"
+        elif limits.disk_mb is not None and now >= disk_due:
+            disk_due = now + DISK_INTERVAL
+            if folder_mb(workspace) > limits.disk_mb:
+                ended = f"its workspace is larger than its limit of {limits.disk_mb} MiB"
+        if ended is not None:
+            end_group(process)
+            break
+        time.sleep(WATCH)
+    end_group(process, grace=0)  # helpers that outlive their command
+    report.news(events.read())
+    return ended
+
+
+def _how_ended(job: Job, code: int, stopped: str | None, log: Path) -> End:
+    if code == 0 and stopped in (None, "cancelled", "stopping"):  # it ended before it was stopped
+        return End(state="done", exit_code=0)
+    if stopped == "cancelled":
+        return End(state="cancelled", exit_code=code)
+    if stopped == "stopping":
+        return End(state="queued", error="its worker was stopped")
+    if stopped is not None:
+        return End(state="failed", exit_code=code, error=f"{stopped}; raise it and retry to go on")
+    if code < 0 and job.crashes < job.request.retries and job.starts < MAX_STARTS:
+        return End(state="queued", error=f"its process {how_ended(code)}", crashed=True)
+    return End(state="failed", exit_code=code, error=_reason(log, code))
 
 
 class EventReader:
@@ -165,7 +217,7 @@ class EventReader:
 
 
 def job_command(job: Job, root: ServiceRoot, executor: tuple[str, ...] = ()) -> list[str]:
-    """The command line of a job. Only the first start gets `--force`; later ones resume."""
+    """The command line of a job. Only the first start of which something is left gets `--force`; later ones resume."""
     request = job.request
     workspace = root.workspace(request.workspace, must_exist=False)
     command = [sys.executable, "-m", "dnrpipe.cli", request.command]
@@ -182,7 +234,7 @@ def job_command(job: Job, root: ServiceRoot, executor: tuple[str, ...] = ()) -> 
         command += ["--set", f"{key}={value if isinstance(value, str) else json.dumps(value)}"]
     for setting in executor:  # the operator's word, after the job's
         command += ["--set", setting]
-    if request.force and job.starts == 1:
+    if request.force and job.starts - job.lost == 1:
         command.append("--force")
     return command
 
