@@ -62,7 +62,7 @@ def _client(server: str | None, token_file: Path | None) -> Client:
     help="Workspaces, scenes and the queue live here (default: this folder).",
 )  # fmt: skip
 @click.option("--token-file", type=click.Path(path_type=Path), metavar="FILE", help="Requests must carry its token, or one of its users'.")
-@click.option("--devices", metavar="A,B", help="One worker each: cpu, cuda:0, ..., or none (default: all GPUs, else cpu).")
+@click.option("--devices", metavar="A,B", help="A worker each: cpu, cuda:0, ...; or none (default: GPUs, else cpu).")
 @click.option("--upload-mb", type=click.IntRange(1), metavar="N", help="Largest scene file (default 2048 MiB).")
 @click.option("--most-queued", type=click.IntRange(1), metavar="N", help="Jobs that may wait (default 10000).")
 @click.option("--rate", type=float, metavar="N", help="Requests per second and client address (default 50).")

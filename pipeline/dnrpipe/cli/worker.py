@@ -57,7 +57,8 @@ def worker(
     console = Console()
     chosen = chosen_devices(devices)
     address, token = server_and_token(server, token_file)
-    called = name if name is not None else re.sub(r"[^A-Za-z0-9._-]", "-", platform.node()).lstrip("-._")[:64] or "worker"
+    machine = re.sub(r"[^A-Za-z0-9._-]", "-", platform.node()).lstrip("-._")[:64] or "worker"
+    called = machine if name is None else name
     if not re.fullmatch(WORKER_PATTERN, called):
         raise UserError(f"--name {called[:80]!r}: expected 64 letters, digits, dots, dashes and underscores at most")
     place = (root or cache_root() / "workers").expanduser()

@@ -73,7 +73,7 @@ def unpack(archive: IO[bytes], folder: Path) -> None:
     """
     seen = set()
     try:
-        with tarfile.open(fileobj=archive, mode="r|") as tar:
+        with tarfile.open(fileobj=archive, mode="r|", bufsize=CHUNK) as tar:
             for member in tar:
                 _check(member)
                 if member.name in seen:
@@ -101,21 +101,20 @@ def put_in_place(fresh: Path, workspace: Path) -> None:
     Raises BadArchive, before anything is touched: a file would replace a folder, or lead through a link or a file.
     """
     removed = _index(fresh).removed
-    names = sorted(set(stamps(fresh)) - {INDEX}, key=lambda name: (name == MANIFEST, name))
+    names = set(stamps(fresh)) - {INDEX}
     for name in (*names, *removed):
         _check_place(workspace, name)
     folders = {workspace}
-    for name in names:
-        if name == MANIFEST:  # what it speaks of is there
-            _remove(workspace, removed)
-            _sync(*folders)
+    for name in sorted(names - {MANIFEST}):
         target = workspace / name
         target.parent.mkdir(parents=True, exist_ok=True)
         (fresh / name).replace(target)
-        folders.add(target.parent)
-    if MANIFEST not in names:
-        _remove(workspace, removed)
+        folders.update(parent for parent in target.parents if parent.is_relative_to(workspace))
+    _remove(workspace, removed)
     _sync(*folders)
+    if MANIFEST in names:  # what it speaks of is there
+        (fresh / MANIFEST).replace(workspace / MANIFEST)
+        _sync(workspace)
 
 
 def _header(name: str, size: int) -> bytes:

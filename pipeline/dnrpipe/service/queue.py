@@ -207,7 +207,7 @@ class Queue:
 
     @contextmanager
     def leased(self, lease: str) -> Iterator[Job]:
-        """The running job of a lease; nobody else writes to the queue meanwhile, so the lease stays. Raises LeaseGone."""
+        """The running job of a lease, which stays so: nobody else writes to the queue meanwhile. Raises LeaseGone."""
         with self._writing() as db:
             row = db.execute(f"SELECT {_COLUMNS} FROM jobs WHERE lease = ?", (lease,)).fetchone()
             if row is None:

@@ -1,8 +1,8 @@
 """The worker of one device on another machine than the server: takes whole jobs of it over HTTP (`dnrpipe worker`).
 
-A job's workspace is fetched, worked in here as the server's own workers would, and what changed in it goes back; then it
-is removed here. A worker that is killed loses its start of the job, nothing else: the server queues the job again when
-the lease is over.
+A job's workspace is fetched, worked in as the server's own workers would, and what changed goes back; then it is
+removed here. A worker that is killed loses its start of the job, nothing else: the server queues the job again when the
+lease is over.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from .leases import BEAT_SECONDS, MAX_EVENTS, MAX_LOG, Beat, Lease, LeaseGone, W
 from .models import End, Limits
 from .queue import DAY
 from .root import ServiceRoot
-from .worker import GRACE, run_job
+from .worker import run_job
 
 IDLE = 1.0
 MARKER = "elsewhere"
 """File in the private folder of a worker's root: its workspaces are copies."""
-NOT_OURS = (401, 403)
+UNWANTED = (401, 403)
 """What a server answers that does not want this worker; other refusals are about one job."""
 
 
@@ -80,8 +80,10 @@ class RemoteWorker:
                 self.say(f"job {lease.job.id}: {request.command} of {request.workspace}")
                 try:
                     self._work(client, lease)
-                except (LeaseGone, Unreachable) as error:
-                    self.say(f"job {lease.job.id}: given up ({error})")
+                except UserError as error:
+                    if _is_unwanted(error):
+                        raise
+                    self.say(f"job {lease.job.id}: given up ({_line(error)})")
                 finally:
                     self._forget(lease)
 
@@ -92,16 +94,20 @@ class RemoteWorker:
         self.stopping = True
 
     def _work(self, client: LeaseClient, lease: Lease) -> None:
-        """Raises LeaseGone, Unreachable: the job is not ours any more. Raises Refused: nor will others be."""
+        """Raises UserError: the job is not ours any more; the server queues it again when the lease is over."""
         job, root = lease.job, self.root
         workspace = root.workspace(job.request.workspace, must_exist=False)
         root.log(job.id).unlink(missing_ok=True)
         report = _LeaseReport(client, lease, root.log(job.id))
         limits = tightest(lease.limits, self.config.limits)
-        before: dict[str, archive.Stamp] = {}
         try:
             self._fetch(client, lease, workspace)
-            before = archive.stamps(workspace)
+        except (UserError, OSError) as error:  # half a workspace is nothing to send back
+            _raise_if_over(error)
+            client.end(lease, End(state="failed", error=f"it could not be fetched: {_line(error)}"))
+            return
+        before = archive.stamps(workspace)
+        try:
             end = run_job(job, root, self.config.device, limits, report, lambda: self.stopping)
         except (UserError, OSError) as error:
             _raise_if_over(error)
@@ -144,7 +150,7 @@ class RemoteWorker:
 
 
 class _LeaseReport:
-    """To the server, by heartbeats. One that was not answered is sent again as it was, so that nothing is told twice."""
+    """To the server, by heartbeats. One without an answer is sent again as it was, so that nothing is told twice."""
 
     def __init__(self, client: LeaseClient, lease: Lease, log: Path) -> None:
         self.client, self.lease, self.log = client, lease, log
@@ -224,7 +230,7 @@ def _own(root: ServiceRoot) -> Iterator[None]:
     marker.touch()
     root.create()
     try:
-        lock = FileLock(root.private / "lock", timeout=GRACE).acquire()  # a killed worker's job may take a moment to end
+        lock = FileLock(root.private / "lock", timeout=10).acquire()  # a killed worker may take a moment to end
     except Timeout:
         raise UserError(f"--root {root.folder}: another worker works here; choose another") from None
     with lock:
@@ -246,7 +252,7 @@ def _signals(stop: Callable[..., None]) -> Iterator[None]:
 
 
 def _move_source(workspace: Path, old: Path, new: Path) -> None:
-    """The manifest names its scene file by absolute path: where it lay under one root, it lies there under the other."""
+    """The manifest has the path of its scene file: where that lay under one root, it lies there under the other."""
     with contextlib.suppress(UserError):  # no manifest yet, or a damaged one, as the job will say
         found = Workspace.open(workspace)
         source = Path(found.manifest.source.path)
@@ -255,9 +261,13 @@ def _move_source(workspace: Path, old: Path, new: Path) -> None:
             found.save()
 
 
+def _is_unwanted(error: Exception) -> bool:
+    return isinstance(error, Refused) and error.status in UNWANTED
+
+
 def _raise_if_over(error: Exception) -> None:
-    """Raise what is about more than this job."""
-    if isinstance(error, LeaseGone | Unreachable) or (isinstance(error, Refused) and error.status in NOT_OURS):
+    """Raise what leaves nobody to tell how the job ended."""
+    if isinstance(error, LeaseGone | Unreachable) or _is_unwanted(error):
         raise error
 
 
