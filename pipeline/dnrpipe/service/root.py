@@ -46,6 +46,8 @@ class ServiceRoot:
         self.private.mkdir(mode=0o700, exist_ok=True)
         for folder in (self.scenes, self.uploads, self.deleted, self.private / "logs", self.private / "events"):
             folder.mkdir(exist_ok=True)
+        for left in (*self.private.glob("*.zip"), *self.scenes.glob(".*.part"), *self.uploads.glob(".*.part")):
+            left.unlink(missing_ok=True)  # of requests that a former server did not finish
         return self
 
     def log(self, job: int) -> Path:
