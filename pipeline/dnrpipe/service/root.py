@@ -46,9 +46,12 @@ class ServiceRoot:
         self.private.mkdir(mode=0o700, exist_ok=True)
         for folder in (self.scenes, self.uploads, self.deleted, self.private / "logs", self.private / "events"):
             folder.mkdir(exist_ok=True)
-        for left in (*self.private.glob("*.zip"), *self.scenes.glob(".*.part"), *self.uploads.glob(".*.part")):
-            left.unlink(missing_ok=True)  # of requests that a former server did not finish
         return self
+
+    def clear(self) -> None:
+        """Remove what a former server left of requests that it did not finish."""
+        for left in (*self.private.glob("*.zip"), *self.scenes.glob(".*.part"), *self.uploads.glob(".*.part")):
+            left.unlink(missing_ok=True)
 
     def log(self, job: int) -> Path:
         return self.private / "logs" / f"{job}.log"
