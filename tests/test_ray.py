@@ -19,7 +19,8 @@ from tests.test_executors import WORKER
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import ExecutorSettings
 from dnrpipe.workers import ray_workers
-from dnrpipe.workers.task_list import Placement, Retry, TaskResult, run_tasks
+from dnrpipe.workers.placement import Placement
+from dnrpipe.workers.task_list import Retry, TaskResult, run_tasks
 from dnrtrain.exr import read_exr
 
 Cluster = pytest.importorskip("ray.cluster_utils", reason="the extra 'ray' is not installed").Cluster

@@ -19,6 +19,7 @@ from dnrpipe.stages.base_images import BaseRenderer, bake_light
 from dnrpipe.stages.effect_plan import run_pilots
 from dnrpipe.stages.stage import Run
 from dnrpipe.workers import view_tasks
+from dnrpipe.workers.placement import HERE
 from dnrpipe.workers.task_list import TaskResult
 from dnrpipe.workers.view_tasks import warn_of_repairs
 from dnrtrain.contract import ContractError, View
@@ -120,7 +121,8 @@ def test_pilot_pictures_that_are_not_finite_are_counted(
     assert answer["error"]["mean"] == 0
     monkeypatch.setattr(view_tasks, "run_tasks", lambda *_, **__: [TaskResult(task, answer)])
     choice: Any = SimpleNamespace(environment={})
-    assert run_pilots([task], choice, Console(quiet=True), "pilot", tmp_path / "log") == [answer]
+    run: Any = SimpleNamespace(console=Console(quiet=True), place=HERE)
+    assert run_pilots([task], choice, run, "pilot", tmp_path / "log") == [answer]
     assert "repaired: 6 pixels of pilot pictures were not finite" in capsys.readouterr().err
 
 

@@ -29,7 +29,8 @@ from dnrpipe.core.ledger import Ledger
 from dnrpipe.core.settings import ExecutorSettings
 from dnrpipe.fleet.forecast import Step, chain_of, forecast
 from dnrpipe.studies.cells.results import made_by
-from dnrpipe.workers.task_list import Placement, run_tasks
+from dnrpipe.workers.placement import Placement
+from dnrpipe.workers.task_list import run_tasks
 from dnrpipe.workers.view_tasks import worker_count
 from dnrtrain.atomic import write_json
 

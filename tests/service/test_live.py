@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import shutil
 import time
 from pathlib import Path
@@ -262,6 +263,11 @@ def test_dashboard_and_viewer_in_a_browser(server: Server, trained: str) -> None
         wait_for(page, "document.querySelector('#picture').dataset.fine === 'yes'")
         assert page.evaluate("document.querySelector('#picture').toDataURL()") != first
         assert "base image" in page.evaluate("document.querySelector('#times').textContent")
+        page.evaluate("document.querySelector('#beside').click()")
+        wait_for(page, "Number(document.querySelector('#reference').dataset.spp) >= 8")  # it gets better
+        assert re.fullmatch(r"path-traced, \d+ samples a pixel, \d+ ms", page.inner_text("#reference-caption"))
+        page.evaluate("document.querySelector('#beside').click()")
+        assert page.evaluate("document.querySelector('#beside-stage').hidden")
         page.evaluate("document.querySelector('input[value=depth]').click()")
         wait_for(page, "document.querySelector('#picture').dataset.mode === 'depth'")
         assert errors == []

@@ -93,7 +93,8 @@ class LiveSession:
         self._worker = LocalWorker("dnrpipe.service.live_frames", scene.common, log, scene.environment)
 
     async def frame(self, request: LiveRequest) -> dict[str, Any]:
-        """The answer of the frame process (see `live_frames`), and `nearest`: the most similar training view.
+        """The answer of the frame process (see `live_frames`), and `nearest`: the most similar training view;
+        `viewers`: how many share the process; `waited_ms`: for frames of others, part of `total_ms`.
 
         Raises UserError: the frame failed; says why.
         """
@@ -113,11 +114,17 @@ class LiveSession:
             "file": str(self.scene.root / "raytraced" / "train" / f"{nearest.name}.exr") if nearest else None,
         }
         started = time.perf_counter()
-        answer = await asyncio.get_running_loop().run_in_executor(self._thread, self._ask, task)
-        total = 1000 * (time.perf_counter() - started)
+        began, answer = await asyncio.get_running_loop().run_in_executor(self._thread, self._ask, task)
+        total, waited = 1000 * (time.perf_counter() - started), 1000 * (began - started)
         if moving:
             self.pace.record(request.size, total)
-        return answer | {"total_ms": round(total, 1), "nearest": nearest.name if nearest else None, "samples": samples}
+        return answer | {
+            "total_ms": round(total, 1),
+            "waited_ms": round(waited, 1),
+            "viewers": self.viewers,
+            "nearest": nearest.name if nearest else None,
+            "samples": samples,
+        }
 
     async def warm(self, request: LiveRequest) -> None:
         """Compile the kernels of moving frames before the camera moves; does nothing after the first time."""
@@ -126,11 +133,12 @@ class LiveSession:
             with contextlib.suppress(UserError):  # the request for the frame itself reports it
                 await self.frame(request.model_copy(update={"moving": True, "mode": "neural"}))
 
-    def _ask(self, task: dict[str, Any]) -> dict[str, Any]:
-        reason = ""
+    def _ask(self, task: dict[str, Any]) -> tuple[float, dict[str, Any]]:
+        """(when it was asked, by perf_counter; the answer)"""
+        reason, began = "", time.perf_counter()
         for _ in range(MAX_ATTEMPTS):  # a new process replaces one that died
             try:
-                return self._worker.ask(task, FRAME_SECONDS)
+                return began, self._worker.ask(task, FRAME_SECONDS)
             except (TaskFailed, WorkerDied, OSError, ValueError) as error:
                 reason = " ".join(str(error).split())
         raise UserError(f"the frame failed: {reason}; see {self.scene.root.name}/logs/live.log")

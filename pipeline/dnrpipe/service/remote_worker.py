@@ -234,7 +234,7 @@ def _own(root: ServiceRoot) -> Iterator[None]:
     except Timeout:
         raise UserError(f"--root {root.folder}: another worker works here; choose another") from None
     with lock:
-        root.drop_incoming()
+        root.clear()
         for folder in root.folder.glob(f"*{SUFFIX}"):
             shutil.rmtree(folder)
         yield

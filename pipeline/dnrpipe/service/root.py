@@ -51,8 +51,10 @@ class ServiceRoot:
             folder.mkdir(exist_ok=True)
         return self
 
-    def drop_incoming(self) -> None:
-        """Remove what a killed server left half-way. Only where no server works."""
+    def clear(self) -> None:
+        """Remove what a former server left of requests that it did not finish."""
+        for left in (*self.private.glob("*.zip"), *self.scenes.glob(".*.part"), *self.uploads.glob(".*.part")):
+            left.unlink(missing_ok=True)
         shutil.rmtree(self.incoming)
         self.incoming.mkdir()
 

@@ -81,7 +81,7 @@ def list_workspaces(service: Shared) -> list[WorkspaceSummary]:
                 viewable=workspace is not None and "finetune" in workspace.manifest.stages,
                 report=(path / "report" / "report.html").is_file(),
                 owner=owners.get(name),
-                mb=service.sizes.get(name, service.queue.last_event(), lambda path=path: round(folder_mb(path), 1)),
+                mb=service.sizes.get(name, 0, lambda path=path: round(folder_mb(path), 1)),
                 problem=problem,
             )
         )

@@ -56,7 +56,7 @@ def serve(config: ServerConfig, users: Mapping[str, User] | None, *, ready: Call
     except Timeout:
         raise UserError(f"{root.folder}: another server works here; stop it or choose another --root") from None
     with lock:
-        root.drop_incoming()
+        root.clear()
         queue = Queue(root.queue)
         queue.recover()
         supervisor = Supervisor(config, queue, root.private / "workers.log")

@@ -13,6 +13,7 @@ import asyncio
 import ipaddress
 import logging
 import socket
+import sqlite3
 from collections.abc import Sequence
 from urllib.parse import SplitResult, urlsplit
 
@@ -32,8 +33,8 @@ PAUSES = (10.0, 60.0)
 def check_webhook(url: str, allowed: Sequence[str]) -> None:
     """Raises HTTPException 422: not an address that the operator allows."""
     if _allowing(url, allowed) is None:
-        known = ", ".join(allowed) or "none; ask the operator for serve --webhook"
-        raise HTTPException(422, f"webhook: not an address that this server calls; those begin with {known}")
+        known = f"those begin with {', '.join(allowed)}" if allowed else "ask its operator for serve --webhook"
+        raise HTTPException(422, f"webhook: not an address that this server calls; {known}")
 
 
 def address_of(url: str, allowed: Sequence[str]) -> str:
@@ -73,16 +74,25 @@ async def tell(job: Job, allowed: Sequence[str]) -> None:
 async def tell_of_ended(queue: Queue, allowed: Sequence[str]) -> None:
     """Tell of every job that ends, for as long as the server runs; those of a former server first."""
     while True:
-        for job, attempt in await run_in_threadpool(queue.due_hooks):
-            facts = {"job": job.id, "url": job.request.webhook, "attempt": attempt + 1}
-            try:
-                await tell(job, allowed)
-                again = None
-            except (ValueError, OSError, httpx.HTTPError) as error:
-                again = PAUSES[attempt] if attempt < len(PAUSES) else None
-                LOG.warning("webhook failed", extra={"facts": facts | {"reason": str(error) or type(error).__name__}})
-            await run_in_threadpool(queue.hook_told, job.id, again)
+        try:
+            for job, attempt in await run_in_threadpool(queue.due_hooks):
+                again = await _attempt(job, attempt, allowed)
+                await run_in_threadpool(queue.hook_told, job.id, again)
+        except sqlite3.Error:  # a full disk, a busy queue: the server goes on and tries again
+            LOG.exception("webhooks could not be looked up")
         await asyncio.sleep(POLL)
+
+
+async def _attempt(job: Job, attempt: int, allowed: Sequence[str]) -> float | None:
+    """Seconds until the next attempt; None: it was heard, or is given up."""
+    try:
+        await tell(job, allowed)
+    except (ValueError, OSError, httpx.HTTPError) as error:
+        reason = str(error) or type(error).__name__
+        facts = {"job": job.id, "url": job.request.webhook, "attempt": attempt + 1, "reason": reason}
+        LOG.warning("webhook failed", extra={"facts": facts})
+        return PAUSES[attempt] if attempt < len(PAUSES) else None
+    return None
 
 
 def _allowing(url: str, allowed: Sequence[str]) -> str | None:

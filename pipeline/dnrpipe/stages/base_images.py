@@ -23,7 +23,7 @@ from ..core.workspace import Workspace, digest
 from ..effects.plan import EffectPlan
 from ..effects.store import plan_of, trace_config
 from ..raytrace.variants import choose_variant
-from ..workers.task_list import HERE
+from ..workers.placement import HERE
 from ..workers.view_tasks import only_answer, warn_of_repairs
 from .effect_plan import resolve_plan
 from .stage import Run

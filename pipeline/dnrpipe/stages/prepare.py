@@ -41,7 +41,8 @@ from ..core.scene_records import Conversion, RasterChoice, SceneSummary
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest, file_sha256
 from ..effects.store import keep_plan
-from ..workers.task_list import HERE, Placement, Retry, run_tasks
+from ..workers.placement import HERE, Placement
+from ..workers.task_list import Retry, run_tasks
 from ..workers.view_tasks import warn_of_repairs, warn_of_retries, worker_count
 from .base_images import RENDERED
 from .stage import Outcome, Run

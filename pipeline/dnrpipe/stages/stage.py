@@ -17,7 +17,8 @@ from ..core.settings import Settings
 from ..core.workspace import Workspace
 from ..effects.plan import EffectPlan
 from ..effects.store import plan_of
-from ..workers.task_list import Placement, run_tasks
+from ..workers.placement import Placement
+from ..workers.task_list import run_tasks
 from ..workers.view_tasks import Book, Failures, is_made, task_name
 
 LEAST_OVERHEAD = 0.005

@@ -25,9 +25,9 @@ from .. import __version__
 from ..core.errors import UserError
 from ..core.machine import cache_root
 from ..core.settings import ExecutorSettings
+from .placement import Placement, WorkerLost
 from .processes import Answerer, WorkerDied
 from .shipping import Mirror, Pack, moved, packed, packs_of, receive, under
-from .task_list import Placement, WorkerLost
 
 PACKAGES = ("ray", "numpy", "bpy", "mitsuba", "drjit", "torch", "OpenEXR")
 """Versions that have to agree: pictures and weights follow from them."""

@@ -14,13 +14,13 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from ..core.errors import UserError
-from ..core.settings import ExecutorSettings
 from ..core.units import parse_seconds
+from .placement import HERE, Placement, Worker, WorkerLost
 from .processes import LocalWorker
 
 MAX_ATTEMPTS, MOST_LOSSES = 2, 3
@@ -92,52 +92,6 @@ class TaskTimeout:
     def reason(self) -> str:
         """What the limit came from."""
         return f"; the longest so far took {self.longest:.0f} s" if self.fixed is None and self.longest else ""
-
-
-@dataclass(frozen=True)
-class Placement:
-    """Where a task list runs.
-
-    Args:
-        executor: this machine's processes, or a Ray cluster.
-        roots: files and folders that workers may read and write; what else tasks name stays as it is.
-        memory_mb: what a worker takes, as far as it is known; a cluster puts no more on a node than it has.
-    """
-
-    executor: ExecutorSettings = field(default_factory=ExecutorSettings)
-    roots: tuple[Path, ...] = ()
-    memory_mb: float | None = None
-
-    @property
-    def is_local(self) -> bool:
-        return self.executor.engine == "local"
-
-
-HERE = Placement()
-
-
-class WorkerLost(RuntimeError):
-    """The machine that the worker ran on is gone: not the task's doing, so it does not count as a try."""
-
-
-class Worker(Protocol):
-    """What answers tasks, one at a time, asked by one thread."""
-
-    def ready(self) -> bool:
-        """Whether it can be asked now; False after a moment's waiting (a cluster may have no place for it yet)."""
-        ...
-
-    def answer(self, task: dict[str, Any], timeout: float, why: str = "") -> dict[str, Any]:
-        """As `processes.Answerer`, with "node" where that is not this machine. Raises WorkerDied, WorkerLost."""
-        ...
-
-    def kill(self) -> None:
-        """At once, and from any thread; `close` is still to be called."""
-        ...
-
-    def close(self, *, force: bool = True) -> None:
-        """End it. Without ``force`` it may finish first."""
-        ...
 
 
 def run_tasks(

@@ -14,7 +14,8 @@ from dnrtrain.exr import read_metadata
 
 from ..core.console import Console
 from ..core.errors import UserError
-from .task_list import HERE, Placement, Retry, TaskResult, run_tasks
+from .placement import HERE, Placement
+from .task_list import Retry, TaskResult, run_tasks
 
 Book = Callable[[dict[str, Any], dict[str, Any], int], None]
 """Called with a finished task, its result and the number of workers side by side; writes it into the ledger."""

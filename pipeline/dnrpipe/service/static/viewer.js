@@ -5,7 +5,7 @@
   const NAMES = { neural: "neural", base: "base image", reference: "path-traced (gets better)", error: "error (FLIP)", nearest: "nearest training view" };
   const STEEPEST = 89 * Math.PI / 180, SETTLED = 150;
   const name = new URLSearchParams(location.search).get("w") || "";
-  const canvas = $("picture"), pen = canvas.getContext("2d");
+  const canvas = $("picture");
   let socket = null, hello = null, camera = null, waiting = false, wanted = false, moving = false, timer = null, mode = "neural", frames = [];
   let refused = false, tries = 0;
   const TRIES = 8;
@@ -54,6 +54,7 @@
   function home() {
     camera = { azimuth: -Math.PI / 3, elevation: 0.44, distance: hello.distance, target: hello.center.slice() };
     ask(false);
+    trace();
   }
   function ask(inMotion) {
     moving = inMotion;
@@ -65,8 +66,9 @@
   function moved() {
     camera.elevation = Math.max(-STEEPEST, Math.min(STEEPEST, camera.elevation));
     clearTimeout(timer);
-    timer = setTimeout(function () { ask(false); }, SETTLED);
+    timer = setTimeout(function () { ask(false); trace(); }, SETTLED);
     ask(true);
+    if (tracer) { tracer.close(); tracer = null; $("reference-caption").textContent = "waits for the camera to rest"; }
   }
 
   function connect() {
@@ -93,13 +95,43 @@
       if (refused) stop($("problem-text").textContent); else again("");
     };
   }
-  async function show(message) {
+  async function draw(message, onto) {
     const length = new DataView(message).getUint32(0, true);
     const header = JSON.parse(new TextDecoder().decode(new Uint8Array(message, 4, length)));
     const picture = await createImageBitmap(new Blob([new Uint8Array(message, 4 + length)], { type: header.type }));
-    if (canvas.width !== picture.width) { canvas.width = picture.width; canvas.height = picture.height; }
-    pen.drawImage(picture, 0, 0);
+    if (onto.width !== picture.width) { onto.width = picture.width; onto.height = picture.height; }
+    onto.getContext("2d").drawImage(picture, 0, 0);
     picture.close();
+    return header;
+  }
+
+  /* The path-traced picture beside it has a socket of its own, open while the camera rests: the server adds samples. */
+  let tracer = null, traced = 0;
+  function trace() {
+    if (tracer) tracer.close();
+    tracer = null;
+    $("beside-stage").hidden = !$("beside").checked;
+    if (!$("beside").checked || !camera || moving) return;
+    const mine = tracer = api.socket("/workspaces/" + encodeURIComponent(name) + "/live");
+    mine.binaryType = "arraybuffer"; traced = 0;
+    mine.onmessage = async function (event) {
+      if (mine !== tracer) return;
+      if (typeof event.data === "string") {
+        const told = JSON.parse(event.data);
+        if (told.kind === "hello") mine.send(JSON.stringify({ camera: camera, size: pixels(), mode: "reference", moving: false }));
+        else $("reference-caption").textContent = told.detail;
+        return;
+      }
+      const header = await draw(event.data, $("reference"));
+      traced += (header.ms["path tracing"] || 0);
+      $("reference-caption").textContent = "path-traced, " + header.spp + " samples a pixel, " + Math.round(traced) + " ms";
+      $("reference").dataset.spp = header.spp;
+    };
+  }
+  $("beside").addEventListener("change", function () { trace(); if (camera) ask(false); });
+
+  async function show(message) {
+    const header = await draw(message, canvas);
     canvas.dataset.frames = Number(canvas.dataset.frames || 0) + 1;
     canvas.dataset.fine = header.moving ? "" : "yes";
     canvas.dataset.mode = header.mode;
@@ -110,7 +142,8 @@
     $("status").textContent = header.width + "²" + (rays ? ", " + rays + " rays" : "") + (header.spp ? ", " + header.spp + " spp" : "") +
       (header.moving ? ", " + pace.toFixed(1) + " frames/s" : ", full quality") + (header.nearest ? " · nearest training view " + header.nearest : "") +
       (header.repaired ? " · repaired: " + header.repaired + " pixels that were not finite" : "");
-    const rows = Object.entries(header.ms).concat([["altogether", header.total_ms]]).map(function (entry) {
+    const waited = header.waited_ms >= 1 ? [["waiting for " + (header.viewers > 1 ? "others (" + header.viewers + " views open)" : "the frame before"), header.waited_ms]] : [];
+    const rows = Object.entries(header.ms).concat(waited, [["altogether", header.total_ms]]).map(function (entry) {
       const row = document.createElement("tr"), head = document.createElement("th"), value = document.createElement("td");
       head.textContent = entry[0]; value.textContent = entry[1].toFixed(1) + " ms";
       row.append(head, value);

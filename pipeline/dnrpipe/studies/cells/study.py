@@ -26,7 +26,8 @@ from ...core.errors import UserError
 from ...core.settings import Settings
 from ...core.workspace import digest, locked
 from ...stages.trainer import perceptual_weights, torch_device
-from ...workers.task_list import Placement, run_tasks
+from ...workers.placement import Placement
+from ...workers.task_list import run_tasks
 from ...workers.view_tasks import TasksFailed, warn_of_retries, worker_count
 from .cell import CELL_VERSION
 from .results import code_state, made_by
