@@ -55,7 +55,7 @@ def worker(
     from ..service.remote_worker import RemoteWorker, WorkerConfig
 
     console = Console()
-    chosen = chosen_devices(devices)
+    device, *further = chosen = chosen_devices(devices)
     address, token = server_and_token(server, token_file)
     machine = re.sub(r"[^A-Za-z0-9._-]", "-", platform.node()).lstrip("-._")[:64] or "worker"
     called = machine if name is None else name
@@ -63,7 +63,7 @@ def worker(
         raise UserError(f"--name {called[:80]!r}: expected 64 letters, digits, dots, dashes and underscores at most")
     place = (root or cache_root() / "workers").expanduser()
     memory = job_memory_mb or default_memory_mb()
-    if len(chosen) > 1:
+    if further:
         with LeaseClient(address, token) as client:
             client.check()  # one line where each of the processes would say the same
         again = ["--server", address, "--root", str(place), "--name", called]
@@ -74,9 +74,9 @@ def worker(
     config = WorkerConfig(
         server=address,
         token=token,
-        root=place / chosen[0].replace(":", "-"),
+        root=place / device.replace(":", "-"),
         name=called,
-        device=chosen[0],
+        device=device,
         limits=Limits(memory_mb=memory),
     )
     RemoteWorker(config, console.say).run()

@@ -16,7 +16,7 @@ import ssl
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import httpx
 from pydantic import TypeAdapter
@@ -75,7 +75,7 @@ class Client:
         except (httpx.InvalidURL, ValueError) as error:
             raise UserError(f"--server {server}: not an address ({error}); e.g. {DEFAULT_SERVER}") from None
 
-    def __enter__(self) -> Client:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -41,7 +41,7 @@ class LeaseClient(Client):
         except Refused as refused:
             if refused.status != 404:
                 raise
-            raise Refused(404, f"{self.server}: is no dnrpipe server that takes workers; is its version another?") from None
+            raise Refused(404, f"{self.server}: is no dnrpipe server that takes workers; another version?") from None
 
     def take(self, worker: str, device: str) -> Lease | None:
         """A job; None: nothing waits. Raises Refused: as `check`."""
