@@ -152,12 +152,15 @@ def test_a_queue_of_the_former_schema_is_taken_over(tmp_path: Path) -> None:
     queue.close()
     with sqlite3.connect(tmp_path / "queue.sqlite") as db:
         present = {row[1] for row in db.execute("PRAGMA table_info(jobs)")}
-        for column in present & {"owner", "hook_due", "hook_tries", "lease", "lease_until"}:
+        db.execute("DROP INDEX jobs_leased")
+        leases = {"lost", "lease", "lease_until", "lease_beat", "lease_result"}
+        for column in present & {"owner", "hook_due", "hook_tries", *leases}:
             db.execute(f"ALTER TABLE jobs DROP COLUMN {column}")
         db.execute("PRAGMA user_version = 1")
     db.close()
     queue = Queue(tmp_path / "queue.sqlite")
     assert queue.get(1).owner is None and queue.submit(_fails("new"), owner="sue").owner == "sue"
+    assert queue.claim("box/cpu", lease="some-lease", seconds=60) is not None and queue.extend("some-lease", 60).lost == 0
     queue.close()
     Queue(tmp_path / "queue.sqlite").close()
 

@@ -17,7 +17,6 @@ import click
 
 from ..core.console import Console
 from ..core.errors import UserError
-from ..core.machine import cache_root
 from ..workers.processes import die_with_parent
 from .options import options as with_options
 from .service import SERVER, chosen_devices, server_and_token
@@ -48,6 +47,7 @@ def worker(
       dnrpipe worker --server http://box:8420 --token-file token.txt --devices cuda:0,cuda:1
       dnrpipe serve --root ~/scenes --devices none     # a server without workers of its own
     """
+    from ..core.machine import cache_root
     from ..service.config import default_memory_mb
     from ..service.lease_client import LeaseClient
     from ..service.leases import WORKER_PATTERN

@@ -110,7 +110,7 @@ class LeaseClient(Client):
         headers = {
             SHA256_HEADER: checksum.hexdigest(),
             "Content-Length": str(size),
-            "Content-Type": "application/x-tar",
+            "Content-Type": "application/octet-stream",
         }
 
         def attempt() -> None:

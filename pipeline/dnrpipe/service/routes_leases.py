@@ -47,7 +47,8 @@ from .uploads import receive
 LeasePath = Annotated[str, PathParameter(pattern=ID_PATTERN)]
 TAR: dict[int | str, dict[str, Any]] = {200: {"content": {"application/x-tar": {}}, "description": "A tar"}}
 FILE: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}, "description": "A file"}}
-BODY = {"requestBody": {"required": True, "content": TAR[200]["content"]}}
+BINARY = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
+BODY = {"requestBody": {"required": True, "content": BINARY}}
 ARCHIVE_SHARE = 1.1
 """How much larger than a workspace's files their archive may be."""
 
