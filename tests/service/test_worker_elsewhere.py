@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import tarfile
@@ -197,6 +198,25 @@ def test_a_worker_stopped_in_order_gives_its_job_back(server: Server, start: Cal
         found = _until(client, job.id, "done", "failed")
         assert found.state == "done" and found.device == "second/cpu"
         assert _states(client, job.id) == ["queued", "running", "queued", "running", "done"]
+
+
+def test_a_job_that_was_taken_back_is_ended_there(
+    server: Server, start: Callable[..., Elsewhere], tmp_path: Path
+) -> None:
+    """As after a silence that was too long: the worker hears of it, stops what it runs, and forgets it."""
+    with server.client() as client:
+        job = _prepare(client, "taken-back")
+        worker = start("late")
+        _working(client, job.id)
+        database = sqlite3.connect(server.root / ".service" / "queue.sqlite", timeout=60, isolation_level=None)
+        while client.job(job.id).starts == 1:
+            database.execute("UPDATE jobs SET lease_until = 0 WHERE lease_until IS NOT NULL AND starts = 1")
+            time.sleep(0.02)
+        database.close()
+        found = _until(client, job.id, "done", "failed")
+        assert (found.state, found.starts, found.lost) == ("done", 2, 1), client.log(job.id).text
+        assert _states(client, job.id) == ["queued", "running", "queued", "running", "done"]
+        assert "given up (this lease is over" in worker.output.read_text()
 
 
 def _tar(*members: tuple[str, bytes | str], removed: Sequence[str] = ()) -> bytes:
