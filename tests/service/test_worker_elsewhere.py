@@ -21,6 +21,7 @@ import httpx
 import pytest
 from tests.service.harness import TINY, Server, empty_workspace, processes_of
 
+from dnrpipe.core.workspace import Workspace
 from dnrpipe.service import archive
 from dnrpipe.service.client import Client, Refused
 from dnrpipe.service.lease_client import LeaseClient
@@ -182,6 +183,8 @@ def test_a_restart_of_the_server_is_no_end_of_a_job(server: Server, start: Calla
         # Its scene file is found again by the next job, although it was another machine that read it.
         forced = client.submit(JobRequest(command="prepare", workspace="lamp", force=True))
         assert _until(client, forced.id, "done", "failed").state == "done", client.log(forced.id).text
+    source = Workspace.open(server.root / "lamp.dnr").manifest.source
+    assert source.path == str(server.root / ".service" / "uploads" / scene.sha256 / "lamp.blend")
 
 
 def test_a_worker_stopped_in_order_gives_its_job_back(server: Server, start: Callable[..., Elsewhere]) -> None:
@@ -213,7 +216,9 @@ def test_a_job_that_was_taken_back_is_ended_there(
             database.execute("UPDATE jobs SET lease_until = 0 WHERE lease_until IS NOT NULL AND starts = 1")
             time.sleep(0.02)
         database.close()
-        found = _until(client, job.id, "done", "failed")
+        while (found := client.job(job.id)).state not in ("done", "failed"):
+            commands = [line for line in processes_of(worker.root) if "dnrpipe.cli" in line]
+            assert len(commands) <= 1, commands
         assert (found.state, found.starts, found.lost) == ("done", 2, 1), client.log(job.id).text
         assert _states(client, job.id) == ["queued", "running", "queued", "running", "done"]
         assert "given up (this lease is over" in worker.output.read_text()
