@@ -140,7 +140,7 @@ class Client:
             answer = self._http.put(f"/scenes/{name or path.name}", content=chunks(), headers=headers)
         except httpx.TransportError as error:
             raise UserError(f"{self.server}: the upload of {path} broke ({error}); try again") from None
-        return self._read(_checked(answer), Scene)
+        return self._read(checked(answer), Scene)
 
     def workspaces(self) -> list[WorkspaceSummary]:
         return self._ask("GET", "/workspaces", list[WorkspaceSummary])
@@ -158,7 +158,7 @@ class Client:
             with self._http.stream("GET", f"/workspaces/{workspace}/results/{file}") as answer, temporary.open("wb") as out:
                 if answer.is_error:
                     answer.read()
-                _checked(answer)
+                checked(answer)
                 for chunk in answer.iter_bytes(CHUNK):
                     out.write(chunk)
             temporary.replace(target)
@@ -183,7 +183,7 @@ class Client:
         with self._http.stream("GET", f"/jobs/{job}/events", headers=headers) as answer:
             if answer.is_error:
                 answer.read()
-            _checked(answer)
+            checked(answer)
             fields: dict[str, str] = {}
             for line in answer.iter_lines():
                 if line:
@@ -201,7 +201,7 @@ class Client:
 
     def _ask(self, method: str, path: str, model: type[Answer], **options: Any) -> Answer:
         """Send a request, with retries: safe for everything but uploads, since submissions carry a key."""
-        return self._retrying(lambda: self._read(_checked(self._http.request(method, path, **options)), model))
+        return self._retrying(lambda: self._read(checked(self._http.request(method, path, **options)), model))
 
     def _retrying(self, attempt: Callable[[], Answer]) -> Answer:
         """What ``attempt`` returns; tried again while the server does not answer, or says to wait."""
@@ -236,7 +236,7 @@ def _trust() -> ssl.SSLContext:
     return ssl.create_default_context()
 
 
-def _checked(answer: httpx.Response) -> httpx.Response:
+def checked(answer: httpx.Response) -> httpx.Response:
     """Raises Refused. Raises httpx.TransportError: a proxy in front of the server does not reach it."""
     if answer.is_success:
         return answer

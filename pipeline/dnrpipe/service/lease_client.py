@@ -15,7 +15,7 @@ from pydantic import TypeAdapter
 from .. import __version__
 from ..core.workspace import file_sha256
 from . import archive
-from .client import CHUNK, Client, Refused, _checked
+from .client import CHUNK, Client, Refused, checked
 from .leases import SECONDS, SHA256_HEADER, Beat, BeatAnswer, Lease, LeaseGone, LeaseTerms, LeaseWish, SceneFile
 from .models import End
 
@@ -48,7 +48,7 @@ class LeaseClient(Client):
         wish = LeaseWish(worker=worker, device=device, version=__version__).model_dump()
 
         def attempt() -> Lease | None:
-            answer = _checked(self._http.post("/leases", json=wish))
+            answer = checked(self._http.post("/leases", json=wish))
             return None if answer.status_code == 204 else self._read(answer, Lease)
 
         return self._retrying(attempt)
@@ -156,9 +156,9 @@ def _streamed(answer: httpx.Response) -> httpx.Response:
 
 
 def _alive(answer: httpx.Response) -> httpx.Response:
-    """Raises LeaseGone, and what `_checked` raises."""
+    """Raises LeaseGone, and what `checked` raises."""
     try:
-        return _checked(answer)
+        return checked(answer)
     except Refused as refused:
         if refused.status == GONE:
             raise LeaseGone(str(refused)) from None

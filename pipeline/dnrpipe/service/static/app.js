@@ -69,7 +69,7 @@
     try {
       const health = await api.get("/healthz");
       $("health").textContent = health.status + " · " + health.running + " running, " + health.queued + " queued · workers: " +
-        Object.keys(health.workers).map(function (d) { return d + (health.workers[d] ? "" : " (down)"); }).join(", ");
+        (Object.keys(health.workers).map(function (d) { return d + (health.workers[d] ? "" : " (down)"); }).join(", ") || "none here");
       const query = new URLSearchParams({ limit: "30", search: $("search").value });
       if (pages.length) query.set("before", pages[pages.length - 1]);
       const page = await api.get("/jobs?" + query);
