@@ -160,7 +160,7 @@ def test_a_queue_of_the_former_schema_is_taken_over(tmp_path: Path) -> None:
     db.close()
     queue = Queue(tmp_path / "queue.sqlite")
     assert queue.get(1).owner is None and queue.submit(_fails("new"), owner="sue").owner == "sue"
-    assert queue.claim("box/cpu", lease="some-lease", seconds=60) is not None and queue.extend("some-lease", 60).lost == 0
+    assert queue.claim("box/cpu", lease="a-lease", seconds=60) is not None and queue.extend("a-lease", 60).lost == 0
     queue.close()
     Queue(tmp_path / "queue.sqlite").close()
 
