@@ -410,7 +410,9 @@ def test_an_empty_server_says_what_to_do_and_its_viewer_gives_up(tmp_path: Path)
 
 @needs_chromium
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
-def test_no_serious_violation_of_accessibility(server: Server, trained: str, width: int, scheme: Literal["light", "dark"]) -> None:
+def test_no_serious_violation_of_accessibility(
+    server: Server, trained: str, width: int, scheme: Literal["light", "dark"]
+) -> None:
     """By axe-core, on what its rules for WCAG 2 A and AA see: dashboard with a job and a workspace open, viewer."""
     empty_workspace(server.root, "plain")
     with server.client() as client, open_page(server.url, width=width, color_scheme=scheme) as (page, _):

@@ -355,7 +355,8 @@ def _change(db: sqlite3.Connection, job: int, state: str, why: str | None = None
     """Set a job's state and other columns, and note the state as an event. One that ended is told of (`webhooks`)."""
     if state in FINAL:
         db.execute(
-            "UPDATE jobs SET hook_due = ?, hook_tries = 0 WHERE id = ? AND json_extract(request, '$.webhook') IS NOT NULL",
+            "UPDATE jobs SET hook_due = ?, hook_tries = 0"
+            " WHERE id = ? AND json_extract(request, '$.webhook') IS NOT NULL",
             (time.time(), job),
         )
     names = ", ".join(f"{name} = ?" for name in ("state", *columns))
