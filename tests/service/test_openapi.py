@@ -40,7 +40,7 @@ def test_no_surprises(server: Server, mode: GenerationMode) -> None:
 
         attempt()
         tried.append(operation.label)
-    assert len(tried) == (18 if mode is GenerationMode.POSITIVE else 14), tried
+    assert len(tried) == (23 if mode is GenerationMode.POSITIVE else 18), tried
 
 
 def test_metrics_are_prometheus_text(server: Server) -> None:
