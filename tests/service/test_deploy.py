@@ -17,6 +17,7 @@ import pytest
 from tests.service.harness import Server, empty_workspace
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
+from websockets.typing import Origin, Subprotocol
 
 from dnrpipe.service.guard import MAX_BODY
 
@@ -122,14 +123,18 @@ def test_pages_jobs_uploads_and_events_come_through(proxied: Proxied) -> None:
 def test_the_viewers_socket_comes_through(proxied: Proxied) -> None:
     empty_workspace(proxied.server.root, "seen")
     address = f"wss://{NAME}:{proxied.port}/workspaces/seen/live"
-    subprotocols = ["dnrpipe.live", f"dnrpipe.token.{TOKEN}"]
+    subprotocols = [Subprotocol("dnrpipe.live"), Subprotocol(f"dnrpipe.token.{TOKEN}")]
     with ExitStack() as stack:
         link = stack.enter_context(socket.create_connection(("127.0.0.1", proxied.port)))
-        with connect(address, sock=link, ssl=proxied.tls(), origin=proxied.url, subprotocols=subprotocols) as viewer:
+        with connect(
+            address, sock=link, ssl=proxied.tls(), origin=Origin(proxied.url), subprotocols=subprotocols
+        ) as viewer:
             assert "seen" in str(viewer.recv(timeout=30))  # that it has not been prepared
         other = stack.enter_context(socket.create_connection(("127.0.0.1", proxied.port)))
         with pytest.raises(InvalidStatus, match="403"):
-            connect(address, sock=other, ssl=proxied.tls(), origin="https://evil.example", subprotocols=subprotocols)
+            connect(
+                address, sock=other, ssl=proxied.tls(), origin=Origin("https://evil.example"), subprotocols=subprotocols
+            )
 
 
 def test_other_names_other_pages_and_forged_addresses(proxied: Proxied) -> None:

@@ -187,7 +187,7 @@ def _children(parent: int) -> list[tuple[int, bytes]]:
 def test_pace() -> None:
     """Slow frames make it coarser, quick ones finer, and it settles where frames fit into the budget."""
     pace = Pace()
-    cost = {0: 400.0, 1: 150.0, 2: 80.0, 3: 40.0, 4: 25.0}
+    cost = {0: 400.0, 1: 150.0, 2: 80.0, 3: 40.0, 4: 25.0, 5: 20.0}
     for _ in range(10 * MIN_FRAMES):
         pace.record(256, cost[pace.level])
     assert pace.level == 2
@@ -351,10 +351,9 @@ def test_the_dashboard_by_keyboard(server: Server, trained: str) -> None:
         assert page.evaluate("document.activeElement.textContent") == "retry"
         page.keyboard.press("Enter")
         deadline = time.monotonic() + 60
-        while client.job(job).starts < 2 or client.job(job).state != "failed":
+        while sum(event.kind == "state" for event in client.events(job)) < 6:  # queued, running, failed; and again
             assert time.monotonic() < deadline
             time.sleep(0.1)
-        assert sum(event.kind == "state" for event in client.events(job)) == 6  # queued, running, failed; and again
         wait_for(page, f"{row}.children[2].textContent === 'failed'")
         wait_for(page, "document.querySelector('#note').textContent.startsWith('failed')")
         assert page.evaluate("document.activeElement.textContent") == "retry"  # focus stayed where it was
@@ -410,11 +409,14 @@ def test_an_empty_server_says_what_to_do_and_its_viewer_gives_up(tmp_path: Path)
 
 @needs_chromium
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
-def test_no_serious_violation_of_accessibility(server: Server, trained: str, width: int, scheme: Literal["light", "dark"]) -> None:
+def test_no_serious_violation_of_accessibility(
+    server: Server, trained: str, width: int, scheme: Literal["light", "dark"]
+) -> None:
     """By axe-core, on what its rules for WCAG 2 A and AA see: dashboard with a job and a workspace open, viewer."""
-    empty_workspace(server.root, "plain")
+    name = f"wcag-{width}"
+    empty_workspace(server.root, name)
     with server.client() as client, open_page(server.url, width=width, color_scheme=scheme) as (page, _):
-        job = client.submit(JobRequest(command="finetune", workspace="plain")).id
+        job = client.submit(JobRequest(command="finetune", workspace=name)).id
         row = f"document.querySelector('#jobs tr[data-job=\"{job}\"]')"
         wait_for(page, f"{row}?.children[2].textContent === 'failed'")
         page.evaluate(f"{row}.querySelector('button').click()")

@@ -17,9 +17,9 @@ from websockets.sync.client import connect
 
 from dnrpipe.core.errors import UserError
 from dnrpipe.service.client import Refused
-from dnrpipe.service.users import read_token
 from dnrpipe.service.models import JobRequest
 from dnrpipe.service.root import ServiceRoot, UnknownName
+from dnrpipe.service.users import read_token
 
 TOKEN = "correct-horse-battery-staple"
 

@@ -11,7 +11,7 @@ import zipfile
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import httpx
 import pytest
@@ -31,9 +31,9 @@ ROLES = {"vera": "viewer", "sam": "submitter", "sue": "submitter", "ada": "admin
 
 
 class Receiver(BaseHTTPRequestHandler):
-    """Keeps what it is told; /moved sends elsewhere, /busy refuses the first time."""
+    """Keeps what it is told; /hooks/moved sends elsewhere."""
 
-    heard: list[tuple[str, dict[str, Any]]] = []
+    heard: ClassVar[list[tuple[str, dict[str, Any]]]] = []
 
     def do_POST(self) -> None:
         body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
@@ -200,22 +200,23 @@ def test_deleted_workspaces_can_be_restored(team: Server, tmp_path: Path) -> Non
 def test_what_is_made_can_be_downloaded(server: Server, trained: str, tmp_path: Path) -> None:
     """A movie and an export, made by jobs; nothing else of the workspace."""
     with server.client() as client:
-        movie = client.submit(
-            JobRequest(command="render", workspace=trained, orbit=3, settings={"cameras.width": 48})
-        )
+        movie = client.submit(JobRequest(command="render", workspace=trained, orbit=3, settings={"cameras.width": 48}))
         exported = client.submit(JobRequest(command="export-nerf", workspace=trained))
         for job in (movie, exported):
             assert _ended(client, job.id, 240).state == "done", client.log(job.id).text
         found = {result.file: result for result in client.results(trained)}
         movies = [file for file, result in found.items() if result.kind == "movie"]
-        assert movies == ["renders/orbit/orbit.mp4"] and {"renders/orbit.zip", "exports/nerf.zip"} <= set(found)
+        assert movies == ["renders/orbit-3/orbit-3.mp4"] and {"renders/orbit-3.zip", "exports/nerf.zip"} <= set(found)
         client.download(trained, movies[0], tmp_path / "orbit.mp4")
         assert (tmp_path / "orbit.mp4").read_bytes() == (server.root / f"{trained}.dnr" / movies[0]).read_bytes()
-        client.download(trained, "renders/orbit.zip", tmp_path / "frames.zip")
+        client.download(trained, "renders/orbit-3.zip", tmp_path / "frames.zip")
         with zipfile.ZipFile(tmp_path / "frames.zip") as archive:
             assert archive.testzip() is None
-            assert sum(name.startswith("orbit/frame_") for name in archive.namelist()) == 3
-        assert not list((server.root / ".service").glob("*.zip"))
+            assert sum(name.startswith("orbit-3/frame_") for name in archive.namelist()) == 3
+        deadline = time.monotonic() + 10  # removed once it is sent
+        while list((server.root / ".service").glob("*.zip")):
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
         for file in ("manifest.json", "renders/../manifest.json", "../../etc/passwd", "renders/none.zip"):
             with pytest.raises(Refused):
                 client.download(trained, file, tmp_path / "no")

@@ -61,7 +61,12 @@ def _client(server: str | None, token_file: Path | None) -> Client:
     "--root", type=click.Path(path_type=Path), default=Path(), metavar="DIR",
     help="Workspaces, scenes and the queue live here (default: this folder).",
 )  # fmt: skip
-@click.option("--token-file", type=click.Path(path_type=Path), metavar="FILE", help="Requests must carry its token, or one of its users'.")
+@click.option(
+    "--token-file",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Who may do what (docs/service.md).",
+)
 @click.option("--devices", metavar="A,B", help="A worker each: cpu, cuda:0, ...; or none (default: GPUs, else cpu).")
 @click.option("--upload-mb", type=click.IntRange(1), metavar="N", help="Largest scene file (default 2048 MiB).")
 @click.option("--most-queued", type=click.IntRange(1), metavar="N", help="Jobs that may wait (default 10000).")
@@ -274,7 +279,8 @@ def jobs(states: tuple[str, ...], search: str, limit: int, as_json: bool, **serv
         click.echo(json.dumps([job.model_dump(mode="json") for job in found], indent=2))
         return
     for job in found:
-        click.echo(f"{job.id:>6}  {job.state:9}  {job.request.command:17}  {job.request.workspace:20}  {job.owner or '':10}  {_how(job)}")
+        what = f"{job.id:>6}  {job.state:9}  {job.request.command:17}  {job.request.workspace:20}"
+        click.echo(f"{what}  {job.owner or '':10}  {_how(job)}")
     if not found:
         click.echo("no jobs")
 

@@ -155,7 +155,10 @@ class Client:
         """Write one of the results to ``target``, whole or not at all."""
         temporary = target.with_name(f".{target.name}.part")
         try:
-            with self._http.stream("GET", f"/workspaces/{workspace}/results/{file}") as answer, temporary.open("wb") as out:
+            with (
+                self._http.stream("GET", f"/workspaces/{workspace}/results/{file}") as answer,
+                temporary.open("wb") as out,
+            ):
                 if answer.is_error:
                     answer.read()
                 checked(answer)

@@ -21,8 +21,8 @@ class ServerConfig(BaseModel, extra="forbid", frozen=True):
     long without a viewer a frame process ends. keep_days, keep_jobs: the server deletes logs and events of jobs that
     ended longer ago, or before so many others. limits: upper bounds for every job. executor: settings of where jobs'
     task lists run. trusted_proxy: address of a proxy whose X-Forwarded-For and -Proto are believed, "" believes none.
-    public_url: the address that browsers know the server by, where that is another. webhooks: addresses that may be told
-    when a job ends. undo_days: how long a deleted workspace can be restored.
+    public_url: the address that browsers know the server by, where that is another. webhooks: addresses that may be
+    told when a job ends. undo_days: how long a deleted workspace can be restored.
     """
 
     root: Path

@@ -1,10 +1,11 @@
 """Access control and rate limits: checks every request before a route sees it.
 
-A token names a user, whose role says what kinds of requests are theirs. It comes in a header (`Authorization: Bearer ...`), or as the subprotocol `dnrpipe.token.<token>` of a WebSocket,
-for which browsers send no headers. The comparison takes constant time, and no log shows the token. A server on the
-loopback interface needs no token, but answers only to the names of that interface and to pages of its own origin: web
-pages that the user visits can neither read nor send anything (DNS rebinding, cross-site requests). Behind a proxy it
-answers to the name of its public address, too; what a proxy says of the client counts where that proxy is trusted.
+A token names a user, whose role says what kinds of requests are theirs. It comes in a header (`Authorization: Bearer
+...`), or as the subprotocol `dnrpipe.token.<token>` of a WebSocket, for which browsers send no headers. The comparison
+takes constant time, and no log shows the token. A server on the loopback interface needs no token, but answers only to
+the names of that interface and to pages of its own origin: web pages that the user visits can neither read nor send
+anything (DNS rebinding, cross-site requests). Behind a proxy it answers to the name of its public address, too; what a
+proxy says of the client counts where that proxy is trusted.
 """
 
 from __future__ import annotations

@@ -33,6 +33,8 @@ LEVELS: tuple[tuple[float, int | None], ...] = ((1.0, None), (1.0, 2), (1.0, 1),
 START = 2
 STEP = 32
 """Sides are multiples of this: the U-Net halves them."""
+LEAST = 4 * STEP
+"""The side of a moving frame, where the view at rest has no fewer."""
 SMOOTHING = 0.3
 SLACK = 0.45
 """Below this share of the budget the pace tries a finer level, which costs about twice as much."""
@@ -55,7 +57,7 @@ class Pace:
     def pick(self, size: int) -> tuple[int, int | None]:
         """(side in pixels, samples) of the next moving frame, of a view of ``size``² at rest."""
         share, samples = LEVELS[self.level]
-        return size if share == 1 else max(2 * STEP, round(share * size / STEP) * STEP), samples
+        return size if share == 1 else max(min(size, LEAST), round(share * size / STEP) * STEP), samples
 
     def record(self, size: int, milliseconds: float) -> None:
         """Record the time of a moving frame of a view of `size`²; change the level where that calls for it."""

@@ -425,7 +425,8 @@ def _change(db: sqlite3.Connection, job: int, state: str, why: str | None = None
     columns = {"lease": None, "lease_until": None, "lease_beat": None, "lease_result": None} | columns
     if state in FINAL:
         db.execute(
-            "UPDATE jobs SET hook_due = ?, hook_tries = 0 WHERE id = ? AND json_extract(request, '$.webhook') IS NOT NULL",
+            "UPDATE jobs SET hook_due = ?, hook_tries = 0"
+            " WHERE id = ? AND json_extract(request, '$.webhook') IS NOT NULL",
             (time.time(), job),
         )
     names = ", ".join(f"{name} = ?" for name in ("state", *columns))

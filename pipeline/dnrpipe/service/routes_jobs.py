@@ -72,7 +72,9 @@ def submit(
     if request.scene is not None:  # a later upload of that name is no business of this job
         sha256, _ = service.root.submitted_scene(request.scene, request.scene_sha256)
         request = request.model_copy(update={"scene_sha256": sha256})
-    return service.queue.submit(request, most_queued=service.config.most_queued, token=idempotency_key, owner=caller.name)
+    return service.queue.submit(
+        request, most_queued=service.config.most_queued, token=idempotency_key, owner=caller.name
+    )
 
 
 @router.get("/jobs")

@@ -3,8 +3,8 @@
 server  {"kind": "hello", center, radius, distance, size, modes}                  text
 client  a LiveRequest as JSON, at any time; only the newest one counts            text
 server  4 bytes length of the header, little endian; header as JSON; the picture  binary
-        header: type, width, height, mode, moving, refined, samples, rays, spp, repaired, ms by stage, total_ms, waited_ms, viewers,
-        nearest
+        header: type, width, height, mode, moving, refined, samples, rays, spp, repaired, ms by stage, total_ms,
+        waited_ms, viewers, nearest
 server  {"kind": "problem", "detail": one line}                                   text
 
 After the last request of a moving camera the server renders the view once more at full quality; it adds samples to a

@@ -28,7 +28,7 @@ from .state import Feed, State
 from .supervisor import Supervisor
 from .users import User
 
-HEAD_SECONDS, BODY_SECONDS = 20.0, 60.0
+HEAD_SECONDS, BODY_SECONDS = 20.0, 30.0
 """How long a client may take to send the head of a request, and its body."""
 UPGRADED = ("upgraded", 0)
 

@@ -57,8 +57,8 @@ class Feed:
 
 
 class Remembered:
-    """Answers that take long to make: each is made by one request at a time, and good for all who ask within ``seconds``
-    while nothing happens."""
+    """Answers that take long to make: each is made by one request at a time, and good for all who ask within
+    ``seconds`` while nothing happens."""
 
     SECONDS = 1.0
 
@@ -69,8 +69,8 @@ class Remembered:
         self._made: dict[str, tuple[float, int, Any]] = {}
 
     def get(self, key: str, version: int, make: Callable[[], T]) -> T:
-        """What ``make`` returned for the key, begun at most ``seconds`` ago and with this version. What it raises is not
-        remembered."""
+        """What ``make`` returned for the key, begun at most ``seconds`` ago and with this version. What it raises is
+        not remembered."""
         with self._lock:
             lock = self._locks.setdefault(key, threading.Lock())
         with lock:

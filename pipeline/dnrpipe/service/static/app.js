@@ -145,7 +145,7 @@
       return item;
     }, function () {});
   }
-  function size(mb) { return mb >= 1024 ? (mb / 1024).toFixed(1) + " GiB" : mb >= 10 ? Math.round(mb) + " MiB" : mb.toFixed(1) + " MiB"; }
+  function size(mb) { return mb >= 1024 ? (mb / 1024).toFixed(1) + " GiB" : mb >= 10 ? Math.round(mb) + " MiB" : mb >= 1 ? mb.toFixed(1) + " MiB" : Math.ceil(1024 * mb) + " KiB"; }
 
   async function showResults(name) {
     const found = await api.get("/workspaces/" + name + "/results");
