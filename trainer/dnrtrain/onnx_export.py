@@ -253,7 +253,10 @@ class Graph(nn.Module):
         grid = place.permute(0, 2, 3, 1)
         if id(pyramid) in self.tables:
             whole = self.tables[id(pyramid)]
-            return F.grid_sample(whole, grid, mode="bilinear", padding_mode="border", align_corners=True)
+            height, width = whole.shape[-2:]
+            # Corners are aligned by hand: onnxruntime's fast kernel aligns none and has no border.
+            scale = torch.tensor([(width - 1) / width, (height - 1) / height])
+            return F.grid_sample(whole, grid * scale, mode="bilinear", padding_mode="zeros", align_corners=False)
         return pyramid.look_up(grid)
 
 

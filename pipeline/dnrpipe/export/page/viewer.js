@@ -1,31 +1,35 @@
 // The neural view: WebGL2 draws what the network sees (G-buffer and baked light), onnxruntime-web runs the network.
-// World axes are the .blend's (Z up); scene.glb is Y up: a point (x, y, z) there is (x, -z, y) here.
+// World axes are the .blend's: right-handed, Z up.
 "use strict";
 
-const SUPERSAMPLING = 4; // per side, for the coverage of silhouettes
+const FINER = 2, SAMPLES = 4; // coverage of silhouettes: FINER² pixels a pixel, SAMPLES in each
+const MEASURED = 8; // frames that are drawn after a change, so that frames a second are known while nothing moves
 const RECENT = 30; // frames over which times are averaged
 
 const VERTEX = `#version 300 es
-layout(location = 0) in vec3 position;
-layout(location = 1) in vec3 normal;
+layout(location = 0) in vec3 position; // of the mesh's box, 0 to 1
+layout(location = 1) in vec3 normal; // of any length
 layout(location = 2) in vec2 atlas;
-uniform mat4 toClip;
-uniform mat4 placed;
+uniform mat4 toClip, placed;
 uniform mat3 placedNormal;
+uniform vec3 low, extent;
 out vec3 worldPosition, worldNormal;
 out vec2 place;
 void main() {
-  vec3 p = vec3(position.x, -position.z, position.y);
-  vec4 world = placed * vec4(p, 1.0);
+  vec4 world = placed * vec4(low + extent * position, 1.0);
   worldPosition = world.xyz;
-  worldNormal = placedNormal * vec3(normal.x, -normal.z, normal.y);
-  place = vec2(atlas.x, 1.0 - atlas.y);
+  worldNormal = placedNormal * normal;
+  place = atlas;
   gl_Position = toClip * world;
 }`;
 
-const SURFACE = `#version 300 es
+// A shader that may discard tests depth late, so it says so only where the scene has cut-outs.
+const HOLES = (cutouts) => cutouts ? "if (texture(front, place).a < 0.5) discard;" : "";
+
+const SURFACE = (cutouts) => `#version 300 es
 precision highp float;
-uniform sampler2D front, back;
+uniform sampler2D front, back; // radiance as log(1 + curve · x) over range
+uniform float curve, range;
 uniform bool thin;
 uniform vec3 eye;
 in vec3 worldPosition, worldNormal;
@@ -34,24 +38,22 @@ layout(location = 0) out vec4 base;
 layout(location = 1) out vec4 normal;
 layout(location = 2) out vec4 uv;
 void main() {
-  vec4 lit = texture(front, place);
-  if (lit.a < 0.5) discard;
-  if (thin && !gl_FrontFacing) lit.rgb = texture(back, place).rgb;
+  ${HOLES(cutouts)}
+  vec3 code = thin && !gl_FrontFacing ? texture(back, place).rgb : texture(front, place).rgb;
   vec3 n = normalize(worldNormal);
   if (dot(n, eye - worldPosition) < 0.0) n = -n;
-  base = vec4(lit.rgb, 1.0);
+  base = vec4((exp(range * code) - 1.0) / curve, 1.0);
   normal = vec4(n, 1.0);
   uv = vec4(place, 0.0, 1.0);
 }`;
 
-const SILHOUETTE = `#version 300 es
+const SILHOUETTE = (cutouts) => `#version 300 es
 precision highp float;
 uniform sampler2D front;
 in vec2 place;
-in vec3 worldPosition, worldNormal;
 out vec4 covered;
 void main() {
-  if (texture(front, place).a < 0.5) discard;
+  ${HOLES(cutouts)}
   covered = vec4(1.0);
 }`;
 
@@ -63,11 +65,11 @@ precision highp float;
 uniform sampler2D fine;
 out vec4 mean;
 void main() {
-  ivec2 corner = ivec2(gl_FragCoord.xy) * ${SUPERSAMPLING};
+  ivec2 corner = ivec2(gl_FragCoord.xy) * ${FINER};
   float sum = 0.0;
-  for (int y = 0; y < ${SUPERSAMPLING}; y++)
-    for (int x = 0; x < ${SUPERSAMPLING}; x++) sum += texelFetch(fine, corner + ivec2(x, y), 0).r;
-  mean = vec4(sum / float(${SUPERSAMPLING * SUPERSAMPLING}));
+  for (int y = 0; y < ${FINER}; y++)
+    for (int x = 0; x < ${FINER}; x++) sum += texelFetch(fine, corner + ivec2(x, y), 0).r;
+  mean = vec4(sum / float(${FINER * FINER}));
 }`;
 
 // ---- files -------------------------------------------------------------------------------------------------------
@@ -87,6 +89,19 @@ async function file(name) {
   return new Uint8Array(await answer.arrayBuffer());
 }
 
+// NAME.gz, unpacked. Some servers announce it as compressed; then the browser has unpacked it already.
+async function unpacked(name) {
+  const bytes = await file(`${name}.gz`);
+  if (bytes[0] !== 0x1f || bytes[1] !== 0x8b) return bytes;
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+  return new Uint8Array(await new Response(stream).arrayBuffer());
+}
+
+async function picture(name) {
+  const blob = new Blob([await file(name)], { type: "image/webp" });
+  return createImageBitmap(blob, { premultiplyAlpha: "none", colorSpaceConversion: "none" });
+}
+
 function script(name) {
   return new Promise((resolve, reject) => {
     const element = document.createElement("script");
@@ -99,31 +114,20 @@ function script(name) {
 
 // ---- meshes ------------------------------------------------------------------------------------------------------
 
-function readGlb(bytes) {
-  const view = new DataView(bytes.buffer, bytes.byteOffset);
-  const length = view.getUint32(12, true);
-  const document_ = JSON.parse(new TextDecoder().decode(bytes.subarray(20, 20 + length)));
-  const body = bytes.subarray(28 + length);
-  const content = (index) => {
-    const accessor = document_.accessors[index], part = document_.bufferViews[accessor.bufferView];
-    return { data: body.slice(part.byteOffset, part.byteOffset + part.byteLength), count: accessor.count };
+// The arrays of each mesh, as page_data.py packs them; indices are differences, which compress better.
+function readMeshes(bytes, meshes) {
+  let at = bytes.byteOffset;
+  const take = (Kind, count) => {
+    const values = new Kind(bytes.buffer, at, count);
+    at += values.byteLength;
+    return values;
   };
-  const meshes = document_.meshes.map((mesh) => {
-    const primitive = mesh.primitives[0], a = primitive.attributes;
-    return {
-      arrays: [content(a.POSITION), content(a.NORMAL), content(a.TEXCOORD_0)],
-      indices: content(primitive.indices),
-    };
+  return meshes.map(({ vertices, triangles, ...mesh }) => {
+    const indices = take(Int32Array, 3 * triangles);
+    for (let i = 1; i < indices.length; i++) indices[i] += indices[i - 1];
+    const [positions, normals] = [take(Uint16Array, 3 * vertices), take(Int16Array, 3 * vertices)];
+    return { ...mesh, indices, positions, normals, atlas: take(Uint16Array, 2 * vertices) };
   });
-  return document_.nodes.map((node) => ({ mesh: meshes[node.mesh], matrix: node.matrix || null }));
-}
-
-// Column-major 4x4 from glTF's axes to ours: C M C^-1 with C (x, y, z) -> (x, -z, y).
-function worldMatrix(m) {
-  if (!m) return [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
-  const at = (r, c) => m[c * 4 + r], from = [0, 2, 1, 3], sign = [1, -1, 1, 1], result = [];
-  for (let c = 0; c < 4; c++) for (let r = 0; r < 4; r++) result.push(sign[r] * sign[c] * at(from[r], from[c]));
-  return result;
 }
 
 // Inverse transpose of the upper 3x3, column-major: the matrix of cofactors, up to scale.
@@ -141,7 +145,7 @@ function normalMatrix(m) {
 // ---- WebGL2 ------------------------------------------------------------------------------------------------------
 
 class Raster {
-  constructor(nodes, scene, front, back) {
+  constructor(meshes, scene, front, back) {
     const canvas = document.createElement("canvas");
     const gl = canvas.getContext("webgl2", { antialias: false, depth: false, powerPreference: "high-performance" });
     if (!gl) throw new Error("this browser has no WebGL2");
@@ -151,17 +155,15 @@ class Raster {
     const info = gl.getExtension("WEBGL_debug_renderer_info");
     this.name = gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
     this.programs = {
-      surface: this.program(VERTEX, SURFACE),
-      silhouette: this.program(VERTEX, SILHOUETTE),
+      surface: this.program(VERTEX, SURFACE(scene.cutouts)),
+      silhouette: this.program(VERTEX, SILHOUETTE(scene.cutouts)),
       average: this.program(WHOLE, AVERAGE),
     };
-    this.front = this.light(front, scene.texels);
-    this.back = scene.thin ? this.light(back, scene.texels) : this.front;
-    const buffers = new Map();
-    this.nodes = nodes.map(({ mesh, matrix }) => {
-      if (!buffers.has(mesh)) buffers.set(mesh, this.vertices(mesh));
-      const placed = worldMatrix(matrix);
-      return { ...buffers.get(mesh), placed, normal: normalMatrix(placed) };
+    this.front = this.light(front);
+    this.back = back ? this.light(back) : this.front;
+    this.nodes = meshes.flatMap((mesh) => {
+      const shared = { ...this.vertices(mesh), low: mesh.low, extent: mesh.extent };
+      return mesh.placements.map((placed) => ({ ...shared, placed, normal: normalMatrix(placed) }));
     });
     this.empty = gl.createVertexArray();
     this.size = "";
@@ -181,12 +183,13 @@ class Raster {
     return program;
   }
 
-  light(bytes, texels) {
+  light(image) {
     const gl = this.gl, texture = gl.createTexture();
-    if (texels > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error(`textures of ${texels} texels are too large here`);
+    if (image.width > gl.getParameter(gl.MAX_TEXTURE_SIZE))
+      throw new Error(`textures of ${image.width} texels are too large here`);
     gl.bindTexture(gl.TEXTURE_2D, texture);
-    const values = new Uint16Array(bytes.buffer, bytes.byteOffset, bytes.byteLength / 2);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, texels, texels, 0, gl.RGBA, gl.HALF_FLOAT, values);
+    gl.pixelStorei(gl.UNPACK_COLORSPACE_CONVERSION_WEBGL, gl.NONE);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, image);
     for (const [key, value] of [
       [gl.TEXTURE_MIN_FILTER, gl.LINEAR], [gl.TEXTURE_MAG_FILTER, gl.LINEAR],
       [gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE], [gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE],
@@ -197,16 +200,20 @@ class Raster {
   vertices(mesh) {
     const gl = this.gl, array = gl.createVertexArray();
     gl.bindVertexArray(array);
-    mesh.arrays.forEach(({ data }, index) => {
+    [
+      [mesh.positions, 3, gl.UNSIGNED_SHORT, true],
+      [mesh.normals, 3, gl.SHORT, false],
+      [mesh.atlas, 2, gl.UNSIGNED_SHORT, true],
+    ].forEach(([values, count, kind, normalised], index) => {
       gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-      gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
+      gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
       gl.enableVertexAttribArray(index);
-      gl.vertexAttribPointer(index, index === 2 ? 2 : 3, gl.FLOAT, false, 0, 0);
+      gl.vertexAttribPointer(index, count, kind, normalised, 0, 0);
     });
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, mesh.indices.data, gl.STATIC_DRAW);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, mesh.indices, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
-    return { array, count: mesh.indices.count };
+    return { array, count: mesh.indices.length };
   }
 
   target(width, height, formats, depth) {
@@ -242,55 +249,111 @@ class Raster {
       gl.deleteRenderbuffer(old.depths);
       gl.deleteFramebuffer(old.buffer);
     }
+    if (this.samples) {
+      gl.deleteRenderbuffer(this.samples.colours);
+      gl.deleteFramebuffer(this.samples.buffer);
+      this.copies.forEach((copy) => gl.deleteBuffer(copy));
+    }
     this.sharp = this.target(width, height, [gl.RGBA32F, gl.RGBA32F, gl.RGBA32F], true);
-    this.fine = this.target(SUPERSAMPLING * width, SUPERSAMPLING * height, [gl.R8], true);
+    this.samples = this.multisampled(FINER * width, FINER * height);
+    this.fine = this.target(FINER * width, FINER * height, [gl.R8], false);
     this.coarse = this.target(width, height, [gl.RGBA32F], false);
+    this.copies = [0, 1, 2, 3].map(() => {
+      const copy = gl.createBuffer();
+      gl.bindBuffer(gl.PIXEL_PACK_BUFFER, copy);
+      gl.bufferData(gl.PIXEL_PACK_BUFFER, 16 * width * height, gl.STREAM_READ);
+      return copy;
+    });
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
     this.size = `${width}x${height}`;
+  }
+
+  // What is covered needs no depth: whichever surface it is, the sample is covered.
+  multisampled(width, height) {
+    const gl = this.gl, buffer = gl.createFramebuffer(), colours = gl.createRenderbuffer();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
+    gl.bindRenderbuffer(gl.RENDERBUFFER, colours);
+    gl.renderbufferStorageMultisample(gl.RENDERBUFFER, SAMPLES, gl.R8, width, height);
+    gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.RENDERBUFFER, colours);
+    if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE)
+      throw new Error("WebGL2 refused a multisampled frame buffer");
+    return { buffer, colours, width, height, textures: [null] };
   }
 
   draw(program, target, view) {
     const gl = this.gl, at = (name) => gl.getUniformLocation(program, name);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.buffer);
     gl.viewport(0, 0, target.width, target.height);
-    gl.enable(gl.DEPTH_TEST);
     target.textures.forEach((_, index) => gl.clearBufferfv(gl.COLOR, index, [0, 0, 0, 0]));
-    gl.clearBufferfv(gl.DEPTH, 0, [1]);
+    if (target.depths) {
+      gl.enable(gl.DEPTH_TEST);
+      gl.clearBufferfv(gl.DEPTH, 0, [1]);
+    } else gl.disable(gl.DEPTH_TEST);
     gl.useProgram(program);
     gl.uniformMatrix4fv(at("toClip"), false, clipMatrix(view, this.scene));
     gl.uniform3fv(at("eye"), [view.c2w[0][3], view.c2w[1][3], view.c2w[2][3]]);
     gl.uniform1i(at("thin"), this.scene.thin ? 1 : 0);
+    gl.uniform1f(at("curve"), this.scene.light.curve);
+    gl.uniform1f(at("range"), this.scene.light.range);
     [["front", this.front], ["back", this.back]].forEach(([name, texture], unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
       gl.bindTexture(gl.TEXTURE_2D, texture);
       gl.uniform1i(at(name), unit);
     });
+    const [placed, placedNormal, low, extent] = ["placed", "placedNormal", "low", "extent"].map(at);
     for (const node of this.nodes) {
-      gl.uniformMatrix4fv(at("placed"), false, node.placed);
-      gl.uniformMatrix3fv(at("placedNormal"), false, node.normal);
+      gl.uniformMatrix4fv(placed, false, node.placed);
+      gl.uniformMatrix3fv(placedNormal, false, node.normal);
+      gl.uniform3fv(low, node.low);
+      gl.uniform3fv(extent, node.extent);
       gl.bindVertexArray(node.array);
       gl.drawElements(gl.TRIANGLES, node.count, gl.UNSIGNED_INT, 0);
     }
     gl.bindVertexArray(null);
   }
 
-  // The network's inputs for a view, as Float32Arrays [C, H, W] by name, row 0 at the top.
-  inputs(view) {
+  // Starts to draw a view. The GPU works on while the network computes the frame before; one view at a time.
+  begin(view) {
     const gl = this.gl, { width, height } = view;
     this.resize(width, height);
     this.draw(this.programs.surface, this.sharp, view);
-    this.draw(this.programs.silhouette, this.fine, view);
+    this.draw(this.programs.silhouette, this.samples, view);
+    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, this.samples.buffer);
+    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, this.fine.buffer);
+    const whole = [0, 0, this.fine.width, this.fine.height];
+    gl.blitFramebuffer(...whole, ...whole, gl.COLOR_BUFFER_BIT, gl.NEAREST);
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.coarse.buffer);
     gl.viewport(0, 0, width, height);
-    gl.disable(gl.DEPTH_TEST);
     gl.useProgram(this.programs.average);
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, this.fine.textures[0]);
     gl.uniform1i(gl.getUniformLocation(this.programs.average, "fine"), 0);
     gl.bindVertexArray(this.empty);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
-    const [base, normal, uv, coverage] = [
-      this.read(this.sharp, 0), this.read(this.sharp, 1), this.read(this.sharp, 2), this.read(this.coarse, 0),
-    ];
+    [[this.sharp, 0], [this.sharp, 1], [this.sharp, 2], [this.coarse, 0]].forEach(([target, index], copy) => {
+      gl.bindFramebuffer(gl.READ_FRAMEBUFFER, target.buffer);
+      gl.readBuffer(gl.COLOR_ATTACHMENT0 + index);
+      gl.bindBuffer(gl.PIXEL_PACK_BUFFER, this.copies[copy]);
+      gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, 0);
+    });
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
+    const drawn = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    return { view, drawn };
+  }
+
+  // The network's inputs for a view that was begun, as Float32Arrays [C, H, W] by name, row 0 at the top.
+  async inputs({ view, drawn }) {
+    const gl = this.gl, { width, height } = view;
+    while (gl.clientWaitSync(drawn, 0, 0) === gl.TIMEOUT_EXPIRED) await new Promise((done) => setTimeout(done));
+    gl.deleteSync(drawn);
+    const [base, normal, uv, coverage] = this.copies.map((copy) => {
+      const values = new Float32Array(4 * width * height);
+      gl.bindBuffer(gl.PIXEL_PACK_BUFFER, copy);
+      gl.getBufferSubData(gl.PIXEL_PACK_BUFFER, 0, values);
+      return values;
+    });
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
     return {
       uv: planes(uv, width, height, [0, 1]),
       mask: planes(base, width, height, [3]),
@@ -299,14 +362,6 @@ class Raster {
       normal: planes(normal, width, height, [0, 1, 2]),
       base: planes(base, width, height, [0, 1, 2, 3]),
     };
-  }
-
-  read(target, index) {
-    const gl = this.gl, values = new Float32Array(4 * target.width * target.height);
-    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, target.buffer);
-    gl.readBuffer(gl.COLOR_ATTACHMENT0 + index);
-    gl.readPixels(0, 0, target.width, target.height, gl.RGBA, gl.FLOAT, values);
-    return values;
   }
 }
 
@@ -328,7 +383,7 @@ function directions(view) {
   const result = new Float32Array(3 * count);
   for (let y = 0, i = 0; y < height; y++)
     for (let x = 0; x < width; x++, i++) {
-      const a = (x + 0.5 - cx) / fl_x, b = -(y + 0.5 - cy) / fl_y, length = Math.hypot(a, b, 1);
+      const a = (x + 0.5 - cx) / fl_x, b = -(y + 0.5 - cy) / fl_y, length = Math.sqrt(a * a + b * b + 1);
       for (let r = 0; r < 3; r++)
         result[r * count + i] = -(c2w[r][0] * a + c2w[r][1] * b - c2w[r][2]) / length;
     }
@@ -365,32 +420,18 @@ const CHANNELS = { uv: 2, mask: 1, coverage: 1, view_dir: 3, normal: 3, base: 4 
 
 class Network {
   static async load() {
-    const network = new Network();
-    const model = await file("model.onnx");
-    const adapter = !offline && navigator.gpu ? await navigator.gpu.requestAdapter().catch(() => null) : null;
-    if (adapter) {
-      try {
-        await network.open(model, "webgpu", "ort-wasm-simd-threaded.asyncify.wasm");
-        return network;
-      } catch (error) {
-        console.warn("WebGPU failed, WebAssembly instead:", error);
-      }
-    }
-    await network.open(model, "wasm", "ort-wasm-simd-threaded.wasm");
+    const network = new Network(), bundle = "ort/ort.wasm.bundle.min.mjs";
+    const [model, binary] = await Promise.all(["model.onnx", "ort/ort-wasm-simd-threaded.wasm"].map(unpacked));
+    let address = new URL(bundle, location.href).href;
+    if (offline) address = URL.createObjectURL(new Blob([await file(bundle)], { type: "text/javascript" }));
+    network.ort = await import(address);
+    const wasm = network.ort.env.wasm;
+    wasm.wasmBinary = binary.buffer;
+    // Only where the server isolates origins may threads share memory.
+    wasm.numThreads = self.crossOriginIsolated ? Math.min(4, navigator.hardwareConcurrency) : 1;
+    network.session = await network.ort.InferenceSession.create(model, { executionProviders: ["wasm"] });
+    network.provider = `WebAssembly, threads: ${wasm.numThreads}`;
     return network;
-  }
-
-  async open(model, provider, binary) {
-    const base = new URL("ort/", location.href).href, bundle = `ort.${provider}.bundle.min.mjs`;
-    let address = base + bundle;
-    if (offline) address = URL.createObjectURL(new Blob([await file(`ort/${bundle}`)], { type: "text/javascript" }));
-    this.ort = await import(address);
-    const wasm = this.ort.env.wasm;
-    wasm.numThreads = 1; // more need a server that isolates origins
-    if (offline) wasm.wasmBinary = (await file(`ort/${binary}`)).buffer;
-    else wasm.wasmPaths = { wasm: base + binary };
-    this.session = await this.ort.InferenceSession.create(model, { executionProviders: [provider] });
-    this.provider = provider === "webgpu" ? "WebGPU" : "WebAssembly, one thread";
   }
 
   // Display RGB over white, Float32Array [3, H, W].
@@ -398,8 +439,7 @@ class Network {
     const feeds = {};
     for (const name of this.session.inputNames)
       feeds[name] = new this.ort.Tensor("float32", inputs[name], [1, CHANNELS[name], height, width]);
-    const answer = await this.session.run(feeds, ["rgb"]);
-    return answer.rgb.getData ? await answer.rgb.getData() : answer.rgb.data;
+    return (await this.session.run(feeds, ["rgb"])).rgb.data;
   }
 }
 
@@ -409,14 +449,13 @@ const $ = (id) => document.getElementById(id);
 
 class Page {
   constructor(scene, raster, network) {
-    Object.assign(this, { scene, raster, network, times: [], dirty: true, busy: false });
+    Object.assign(this, { scene, raster, network, times: [], left: 0, round: 0, busy: false, probing: false });
     $("title").textContent = `${scene.name}: neural view`;
     const native = scene.size[0];
     for (const side of [...new Set([native / 2, native, native * 1.5, native * 2].map(Math.round))])
-      $("size").add(new Option(`${side}²`, side, side === native, side === native));
+      $("size").add(new Option(this.dimensions(side).join(" × "), side, side === native, side === native));
     this.reset();
-    for (const id of ["show", "size"]) $(id).onchange = () => this.touch(true);
-    $("turn").onchange = () => this.touch(true);
+    for (const id of ["show", "size", "turn"]) $(id).onchange = () => this.touch(true);
     $("reset").onclick = () => this.reset();
     const canvas = $("picture");
     canvas.onpointerdown = (event) => canvas.setPointerCapture(event.pointerId);
@@ -439,68 +478,89 @@ class Page {
       this.elevation += step[1];
       this.touch();
     };
-    requestAnimationFrame(() => this.loop());
+    this.loop();
   }
 
   reset() {
-    const { start, center, distance } = this.scene, to = [0, 1, 2].map((i) => start.c2w[i][3] - center[i]);
-    this.azimuth = Math.atan2(to[1], to[0]);
-    this.elevation = Math.asin(to[2] / Math.hypot(...to));
-    this.distance = distance;
+    Object.assign(this, this.scene.start);
     this.touch(true);
   }
 
+  // Draw again. fresh: what a frame costs has changed.
   touch(fresh = false) {
     const limit = Math.PI / 2 - 0.02;
     this.elevation = Math.min(limit, Math.max(-limit, this.elevation));
-    this.distance = Math.min(6 * this.scene.distance, Math.max(0.1 * this.scene.radius, this.distance));
-    if (fresh) this.times = [];
-    this.dirty = true;
+    this.distance = Math.min(6 * this.scene.start.distance, Math.max(0.1 * this.scene.radius, this.distance));
+    if (fresh) {
+      this.times = [];
+      this.round += 1;
+    }
+    this.left = MEASURED;
   }
 
-  view() {
-    const { start, center, size } = this.scene, side = Number($("size").value), scale = side / size[0];
+  dimensions(side) {
+    const [width, height] = this.scene.size;
+    return [side, Math.round((height * side) / width)];
+  }
+
+  // The orbiting camera: upright whatever its angles, since `right` is horizontal.
+  view(side = Number($("size").value)) {
+    const { center, size, lens } = this.scene, scale = side / size[0], [width, height] = this.dimensions(side);
     const [ca, sa, ce, se] = [this.azimuth, this.elevation].flatMap((t) => [Math.cos(t), Math.sin(t)]);
     const back = [ca * ce, sa * ce, se], right = [-sa, ca, 0], up = [-ca * se, -sa * se, ce];
     const c2w = [0, 1, 2].map((r) => [right[r], up[r], back[r], center[r] + this.distance * back[r]]);
     return {
-      width: side, height: Math.round(size[1] * scale), fl_x: start.fl_x * scale, fl_y: start.fl_y * scale,
-      cx: side / 2, cy: Math.round(size[1] * scale) / 2, c2w: [...c2w, [0, 0, 0, 1]],
+      width, height, fl_x: lens[0] * scale, fl_y: lens[1] * scale, cx: width / 2, cy: height / 2,
+      c2w: [...c2w, [0, 0, 0, 1]],
     };
   }
 
-  async loop() {
+  next() {
     if ($("turn").checked) {
       this.azimuth += 0.02;
-      this.dirty = true;
+      this.left = MEASURED;
     }
-    if (this.dirty && !this.busy && !this.probing) {
-      this.dirty = false;
-      await this.frame(this.view(), $("show").value);
-    }
-    requestAnimationFrame(() => this.loop());
+    if (this.left === 0 || this.probing) return null;
+    this.left -= 1;
+    return { ...this.raster.begin(this.view()), round: this.round };
   }
 
-  async frame(view, show) {
-    this.busy = true;
-    try {
-      const started = performance.now();
-      const inputs = this.raster.inputs(view);
-      const drawn = performance.now();
-      const picture = show === "neural" ? await this.network.run(inputs, view.width, view.height) : plain(inputs, show);
-      const ended = performance.now();
-      this.paint(picture, view.width, view.height);
-      this.times.push([drawn - started, ended - drawn, performance.now() - started, started]);
-      if (this.times.length > RECENT) this.times.shift();
-      this.report();
-      $("message").textContent = "";
-      return { inputs, picture };
-    } catch (error) {
-      fail(error);
-      throw error;
-    } finally {
-      this.busy = false;
+  // Frame after frame while there is something to show. The picture is one frame behind the camera: while the network
+  // computes it, the GPU draws the next one.
+  async loop() {
+    let begun = null, since = null;
+    for (;;) {
+      begun = begun || this.next();
+      this.busy = begun !== null;
+      if (begun) {
+        try {
+          const { round } = begun, started = since || performance.now();
+          ({ begun } = await this.frame(begun, $("show").value, () => this.next()));
+          since = begun ? performance.now() : null;
+          if (round === this.round) this.note([...this.last, performance.now() - started]);
+          $("message").textContent = "";
+        } catch (error) {
+          fail(error);
+          throw error;
+        }
+      }
+      // Also lets the browser show the picture and hear the mouse.
+      await (begun ? new Promise((done) => setTimeout(done)) : new Promise(requestAnimationFrame));
     }
+  }
+
+  // Shows a view that was begun. next: begins another one, or answers null.
+  async frame(begun, show, next) {
+    const started = performance.now(), { view } = begun;
+    const inputs = await this.raster.inputs(begun);
+    const drawn = performance.now();
+    begun = next();
+    const ready = performance.now();
+    const picture = show === "neural" ? await this.network.run(inputs, view.width, view.height) : plain(inputs, show);
+    const ended = performance.now();
+    this.paint(picture, view.width, view.height);
+    this.last = [drawn - started, ended - ready];
+    return { inputs, picture, begun };
   }
 
   paint(picture, width, height) {
@@ -510,30 +570,37 @@ class Page {
       image.data[4 * i + 3] = 255;
     }
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-    canvas.getContext("2d").putImageData(image, 0, 0);
+    // Its pixels stay in main memory: they are written there anew each frame.
+    canvas.getContext("2d", { willReadFrequently: true }).putImageData(image, 0, 0);
   }
 
-  // Milliseconds by stage and frames per second, both over the last frames; the latter only while frames follow.
+  note(times) {
+    this.times.push(times);
+    if (this.times.length > RECENT) this.times.shift();
+    this.report();
+  }
+
+  // Means over the last frames. wait_ms: for the GPU; it draws while the network computes, so little of it may be left.
   figures() {
     const mean = (k) => this.times.reduce((sum, time) => sum + time[k], 0) / this.times.length;
-    const count = this.times.length - 1, whole = count < 1 ? 0 : this.times[count][3] - this.times[0][3];
-    const steady = count >= 5 && whole / count < 2 * mean(2) + 50;
     return {
-      raster_ms: mean(0), network_ms: mean(1), frame_ms: mean(2), fps: steady ? (1000 * count) / whole : null,
-      frames: this.times.length, provider: this.network.provider, gl: this.raster.name,
+      wait_ms: mean(0), network_ms: mean(1), frame_ms: mean(2), fps: 1000 / mean(2), frames: this.times.length,
+      provider: this.network.provider, gl: this.raster.name,
     };
   }
 
   report() {
-    const f = this.figures(), q = this.scene.quality;
+    const f = this.figures(), q = this.scene.quality, decibels = (value) => `${value.toFixed(1)} dB`;
+    $("fps").textContent = `${f.fps.toFixed(1)} frames a second`;
     const rows = [
-      ["frame", `${f.frame_ms.toFixed(1)} ms (drawing and reading back ${f.raster_ms.toFixed(1)}, network ` +
-        `${f.network_ms.toFixed(1)}), mean of ${f.frames}`],
-      ["frames per second", f.fps === null ? "measured while the camera moves" : f.fps.toFixed(1)],
+      ["this page", `${decibels(q.psnr)} PSNR over ${q.test_views} ray-traced held-out views at ` +
+        `${this.scene.size.join(" × ")}; its baked light alone ${decibels(q.psnr_base)}`],
+      ["workspace's renderer", q.psnr_workspace === null ? "not measured (dnrpipe evaluate)"
+        : `${decibels(q.psnr_workspace)} PSNR over the same views, with ray-traced mirrors and highlights`],
+      ["frame", `${f.frame_ms.toFixed(0)} ms: network ${f.network_ms.toFixed(0)}, waiting for WebGL2 ` +
+        `${f.wait_ms.toFixed(0)}; mean of ${f.frames}`],
       ["network runs on", f.provider],
       ["WebGL2", f.gl],
-      ["quality", `${q.psnr.toFixed(1)} dB PSNR over ${q.test_views} ray-traced held-out views at ` +
-        `${this.scene.size.join(" × ")}; baked light alone ${q.psnr_base.toFixed(1)} dB`],
     ];
     $("figures").replaceChildren(...rows.map((row) => {
       const line = document.createElement("tr");
@@ -542,12 +609,20 @@ class Page {
     }));
   }
 
+  // Runs something while the loop rests.
+  async alone(action) {
+    this.probing = true;
+    while (this.busy) await new Promise((done) => setTimeout(done, 5));
+    try {
+      return await action();
+    } finally {
+      this.probing = false;
+    }
+  }
+
   // A frame of a given camera, for checks: inputs and picture as base64 of float32.
   async probe(view) {
-    this.probing = true;
-    while (this.busy) await new Promise((resolve) => setTimeout(resolve, 5));
-    const { inputs, picture } = await this.frame(view, "neural");
-    this.probing = false;
+    const { inputs, picture } = await this.alone(() => this.frame(this.raster.begin(view), "neural", () => null));
     const coded = (values) => {
       const bytes = new Uint8Array(values.buffer, values.byteOffset, values.byteLength);
       let text = "";
@@ -555,7 +630,19 @@ class Page {
       return btoa(text);
     };
     const packed = Object.entries({ ...inputs, rgb: picture }).map(([name, values]) => [name, coded(values)]);
-    return { ...Object.fromEntries(packed), figures: this.figures() };
+    return Object.fromEntries(packed);
+  }
+
+  // Figures of a turntable of that width, for checks.
+  async measure(side) {
+    $("size").add(new Option(this.dimensions(side).join(" × "), side, false, true));
+    $("turn").checked = true;
+    for (let run = 0; run < 2; run++) { // the first one warms up
+      this.touch(true);
+      while (this.times.length < RECENT) await new Promise((done) => setTimeout(done, 50));
+    }
+    $("turn").checked = false;
+    return this.figures();
   }
 }
 
@@ -578,9 +665,10 @@ function fail(error) {
 async function start() {
   if (offline) await script("offline.js");
   const scene = offline ? window.DNR_OFFLINE.scene : JSON.parse(new TextDecoder().decode(await file("scene.json")));
-  const [mesh, front, back] = await Promise.all(["scene.glb", "light-front.bin", "light-back.bin"].map(file));
-  const raster = new Raster(readGlb(mesh), scene, front, back);
-  return new Page(scene, raster, await Network.load());
+  const [mesh, front, back, network] = await Promise.all([
+    unpacked("scene.bin"), picture("light-front.webp"), scene.thin ? picture("light-back.webp") : null, Network.load(),
+  ]);
+  return new Page(scene, new Raster(readMeshes(mesh, scene.meshes), scene, front, back), network);
 }
 
 window.dnr = start();
