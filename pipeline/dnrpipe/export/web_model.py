@@ -42,6 +42,8 @@ from .surface import SurfaceMaps
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
+MODEL = {"base": "raster", "guides": True}
+"""Of the page's network, beside those of the draft preset: a base image without specular part."""
 STEPS = 1500
 """Training takes at least so many, whatever the number of views."""
 SPEED_SIDE = 256
@@ -93,9 +95,8 @@ def train(
     epochs: int | None,
 ) -> DNR:
     """Train the page's network in `folder`, or resume an interrupted training; float32 for inference."""
-    # Draft's sizes (milliseconds count), the scene's texture size, and a base image without specular part.
     draft, size = PRESETS["draft"], min(settings.model.texture_size, 256)
-    model = ModelSettings.model_validate({**draft["model"], "base": "raster", "guides": True, "texture_size": size})
+    model = ModelSettings.model_validate({**draft["model"], **MODEL, "texture_size": size})
     step2 = Step2Settings.model_validate({**draft["finetune"]["step2"], "start": "fresh", "patch": 192})
     step2 = step2.model_copy(update={"epochs": epochs or max(step2.epochs, -(-STEPS // len(views)))})
     data = web_views(workspace, views, "train", maps, light)
