@@ -25,7 +25,7 @@ CURVE = 50.0
 """Of codes log(1 + CURVE · x): at black as fine as sRGB's, at white half as fine."""
 BRIGHTEST = 16.0
 """Times display white; brighter light becomes that. 8 bits for a lamp's thousands would leave too few for the rest."""
-QUALITY = 90
+QUALITY = 95
 """Of the WebP files."""
 NORMAL_STEPS = 1023
 """Per unit: a tenth of a degree, and half of what 15 bits take."""

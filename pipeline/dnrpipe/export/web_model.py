@@ -1,4 +1,4 @@
-"""The network of the page: the default one, over a base image that a browser can draw. Trained, and checked there.
+"""The network of the page: a small one, over a base image that a browser can draw. Trained, and checked there.
 
 A browser has no ray tracer, so its base image is the diffuse outgoing light of the surfaces (`surface`), looked up once
 a pixel; the network learns mirrors, glass and highlights. The workspace's own network corrects a richer base image and
@@ -42,8 +42,10 @@ from .surface import SurfaceMaps
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-MODEL = {"base": "raster", "guides": True}
-"""Of the page's network, beside those of the draft preset: a base image without specular part."""
+MODEL = {"base": "raster", "guides": True, "network": "mlp", "width": 12, "filter": 0, "output": "display"}
+"""Of the page's network, beside the draft preset's. Every pixel by itself: the neural texture tells them apart, and a
+U-Net of the draft preset takes three times as long in WebAssembly and came out worse on the demo scene. Display space
+saves a logarithm and an exponential a pixel; a page shows nothing else."""
 STEPS = 1500
 """Training takes at least so many, whatever the number of views."""
 SPEED_SIDE = 256

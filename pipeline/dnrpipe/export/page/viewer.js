@@ -2,7 +2,7 @@
 // World axes are the .blend's: right-handed, Z up.
 "use strict";
 
-const FINER = 2, SAMPLES = 4; // coverage of silhouettes: FINER² pixels a pixel, SAMPLES in each
+const FINER = 4; // coverage of silhouettes: FINER² samples a pixel
 const MEASURED = 8; // frames that are drawn after a change, so that frames a second are known while nothing moves
 const RECENT = 30; // frames over which times are averaged
 
@@ -10,17 +10,25 @@ const VERTEX = `#version 300 es
 layout(location = 0) in vec3 position; // of the mesh's box, 0 to 1
 layout(location = 1) in vec3 normal; // of any length
 layout(location = 2) in vec2 atlas;
-uniform mat4 toClip, placed;
+uniform mat4 toClip;
 uniform mat3 placedNormal;
-uniform vec3 low, extent;
-out vec3 worldPosition, worldNormal;
+out vec3 worldNormal;
 out vec2 place;
 void main() {
-  vec4 world = placed * vec4(low + extent * position, 1.0);
-  worldPosition = world.xyz;
   worldNormal = placedNormal * normal;
   place = atlas;
-  gl_Position = toClip * world;
+  gl_Position = toClip * vec4(position, 1.0);
+}`;
+
+// The same without what silhouettes do not need: with many small triangles each number that is interpolated counts.
+const OUTLINE = (cutouts) => `#version 300 es
+layout(location = 0) in vec3 position;
+layout(location = 2) in vec2 atlas;
+uniform mat4 toClip;
+${cutouts ? "out vec2 place;" : ""}
+void main() {
+  ${cutouts ? "place = atlas;" : ""}
+  gl_Position = toClip * vec4(position, 1.0);
 }`;
 
 // A shader that may discard tests depth late, so it says so only where the scene has cut-outs.
@@ -31,8 +39,7 @@ precision highp float;
 uniform sampler2D front, back; // radiance as log(1 + curve · x) over range
 uniform float curve, range;
 uniform bool thin;
-uniform vec3 eye;
-in vec3 worldPosition, worldNormal;
+in vec3 worldNormal;
 in vec2 place;
 layout(location = 0) out vec4 base;
 layout(location = 1) out vec4 normal;
@@ -40,17 +47,14 @@ layout(location = 2) out vec4 uv;
 void main() {
   ${HOLES(cutouts)}
   vec3 code = thin && !gl_FrontFacing ? texture(back, place).rgb : texture(front, place).rgb;
-  vec3 n = normalize(worldNormal);
-  if (dot(n, eye - worldPosition) < 0.0) n = -n;
   base = vec4((exp(range * code) - 1.0) / curve, 1.0);
-  normal = vec4(n, 1.0);
+  normal = vec4(normalize(worldNormal), 1.0);
   uv = vec4(place, 0.0, 1.0);
 }`;
 
 const SILHOUETTE = (cutouts) => `#version 300 es
 precision highp float;
-uniform sampler2D front;
-in vec2 place;
+${cutouts ? "uniform sampler2D front; in vec2 place;" : ""}
 out vec4 covered;
 void main() {
   ${HOLES(cutouts)}
@@ -63,7 +67,7 @@ void main() { gl_Position = vec4(vec2(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID
 const AVERAGE = `#version 300 es
 precision highp float;
 uniform sampler2D fine;
-out vec4 mean;
+layout(location = 1) out vec4 mean; // its alpha is kept
 void main() {
   ivec2 corner = ivec2(gl_FragCoord.xy) * ${FINER};
   float sum = 0.0;
@@ -130,7 +134,20 @@ function readMeshes(bytes, meshes) {
   });
 }
 
-// Inverse transpose of the upper 3x3, column-major: the matrix of cofactors, up to scale.
+// Matrices are 4x4, column-major.
+function product(a, b) {
+  const result = new Array(16).fill(0);
+  for (let c = 0; c < 4; c++)
+    for (let r = 0; r < 4; r++) for (let k = 0; k < 4; k++) result[c * 4 + r] += a[k * 4 + r] * b[c * 4 + k];
+  return result;
+}
+
+// The unit cube -> a mesh's box.
+function boxMatrix(low, extent) {
+  return [extent[0], 0, 0, 0, 0, extent[1], 0, 0, 0, 0, extent[2], 0, ...low, 1];
+}
+
+// Inverse transpose of the upper 3x3: the matrix of cofactors, up to scale.
 function normalMatrix(m) {
   const a = (r, c) => m[c * 4 + r], result = [];
   for (let c = 0; c < 3; c++)
@@ -156,14 +173,14 @@ class Raster {
     this.name = gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
     this.programs = {
       surface: this.program(VERTEX, SURFACE(scene.cutouts)),
-      silhouette: this.program(VERTEX, SILHOUETTE(scene.cutouts)),
+      silhouette: this.program(OUTLINE(scene.cutouts), SILHOUETTE(scene.cutouts)),
       average: this.program(WHOLE, AVERAGE),
     };
     this.front = this.light(front);
     this.back = back ? this.light(back) : this.front;
     this.nodes = meshes.flatMap((mesh) => {
-      const shared = { ...this.vertices(mesh), low: mesh.low, extent: mesh.extent };
-      return mesh.placements.map((placed) => ({ ...shared, placed, normal: normalMatrix(placed) }));
+      const shared = this.vertices(mesh), box = boxMatrix(mesh.low, mesh.extent);
+      return mesh.placements.map((m) => ({ ...shared, placed: product(m, box), normal: normalMatrix(m) }));
     });
     this.empty = gl.createVertexArray();
     this.size = "";
@@ -244,21 +261,15 @@ class Raster {
   resize(width, height) {
     if (this.size === `${width}x${height}`) return;
     const gl = this.gl;
-    for (const old of [this.sharp, this.fine, this.coarse].filter(Boolean)) {
+    for (const old of [this.sharp, this.fine].filter(Boolean)) {
       old.textures.forEach((texture) => gl.deleteTexture(texture));
       gl.deleteRenderbuffer(old.depths);
       gl.deleteFramebuffer(old.buffer);
     }
-    if (this.samples) {
-      gl.deleteRenderbuffer(this.samples.colours);
-      gl.deleteFramebuffer(this.samples.buffer);
-      this.copies.forEach((copy) => gl.deleteBuffer(copy));
-    }
+    (this.copies || []).forEach((copy) => gl.deleteBuffer(copy));
     this.sharp = this.target(width, height, [gl.RGBA32F, gl.RGBA32F, gl.RGBA32F], true);
-    this.samples = this.multisampled(FINER * width, FINER * height);
     this.fine = this.target(FINER * width, FINER * height, [gl.R8], false);
-    this.coarse = this.target(width, height, [gl.RGBA32F], false);
-    this.copies = [0, 1, 2, 3].map(() => {
+    this.copies = this.sharp.textures.map(() => {
       const copy = gl.createBuffer();
       gl.bindBuffer(gl.PIXEL_PACK_BUFFER, copy);
       gl.bufferData(gl.PIXEL_PACK_BUFFER, 16 * width * height, gl.STREAM_READ);
@@ -268,30 +279,17 @@ class Raster {
     this.size = `${width}x${height}`;
   }
 
-  // What is covered needs no depth: whichever surface it is, the sample is covered.
-  multisampled(width, height) {
-    const gl = this.gl, buffer = gl.createFramebuffer(), colours = gl.createRenderbuffer();
-    gl.bindFramebuffer(gl.FRAMEBUFFER, buffer);
-    gl.bindRenderbuffer(gl.RENDERBUFFER, colours);
-    gl.renderbufferStorageMultisample(gl.RENDERBUFFER, SAMPLES, gl.R8, width, height);
-    gl.framebufferRenderbuffer(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.RENDERBUFFER, colours);
-    if (gl.checkFramebufferStatus(gl.FRAMEBUFFER) !== gl.FRAMEBUFFER_COMPLETE)
-      throw new Error("WebGL2 refused a multisampled frame buffer");
-    return { buffer, colours, width, height, textures: [null] };
-  }
-
   draw(program, target, view) {
     const gl = this.gl, at = (name) => gl.getUniformLocation(program, name);
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.buffer);
     gl.viewport(0, 0, target.width, target.height);
     target.textures.forEach((_, index) => gl.clearBufferfv(gl.COLOR, index, [0, 0, 0, 0]));
+    // Silhouettes need no depth: whichever surface it is, the sample is covered.
     if (target.depths) {
       gl.enable(gl.DEPTH_TEST);
       gl.clearBufferfv(gl.DEPTH, 0, [1]);
     } else gl.disable(gl.DEPTH_TEST);
     gl.useProgram(program);
-    gl.uniformMatrix4fv(at("toClip"), false, clipMatrix(view, this.scene));
-    gl.uniform3fv(at("eye"), [view.c2w[0][3], view.c2w[1][3], view.c2w[2][3]]);
     gl.uniform1i(at("thin"), this.scene.thin ? 1 : 0);
     gl.uniform1f(at("curve"), this.scene.light.curve);
     gl.uniform1f(at("range"), this.scene.light.range);
@@ -300,12 +298,10 @@ class Raster {
       gl.bindTexture(gl.TEXTURE_2D, texture);
       gl.uniform1i(at(name), unit);
     });
-    const [placed, placedNormal, low, extent] = ["placed", "placedNormal", "low", "extent"].map(at);
+    const clip = clipMatrix(view, this.scene), toClip = at("toClip"), placedNormal = at("placedNormal");
     for (const node of this.nodes) {
-      gl.uniformMatrix4fv(placed, false, node.placed);
+      gl.uniformMatrix4fv(toClip, false, product(clip, node.placed));
       gl.uniformMatrix3fv(placedNormal, false, node.normal);
-      gl.uniform3fv(low, node.low);
-      gl.uniform3fv(extent, node.extent);
       gl.bindVertexArray(node.array);
       gl.drawElements(gl.TRIANGLES, node.count, gl.UNSIGNED_INT, 0);
     }
@@ -317,23 +313,23 @@ class Raster {
     const gl = this.gl, { width, height } = view;
     this.resize(width, height);
     this.draw(this.programs.surface, this.sharp, view);
-    this.draw(this.programs.silhouette, this.samples, view);
-    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, this.samples.buffer);
-    gl.bindFramebuffer(gl.DRAW_FRAMEBUFFER, this.fine.buffer);
-    const whole = [0, 0, this.fine.width, this.fine.height];
-    gl.blitFramebuffer(...whole, ...whole, gl.COLOR_BUFFER_BIT, gl.NEAREST);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.coarse.buffer);
+    this.draw(this.programs.silhouette, this.fine, view);
+    // Their average goes to the normals' alpha: that is one picture less to read back.
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.sharp.buffer);
     gl.viewport(0, 0, width, height);
+    gl.drawBuffers([gl.NONE, gl.COLOR_ATTACHMENT1, gl.NONE]);
+    gl.colorMask(false, false, false, true);
     gl.useProgram(this.programs.average);
     gl.activeTexture(gl.TEXTURE0);
     gl.bindTexture(gl.TEXTURE_2D, this.fine.textures[0]);
     gl.uniform1i(gl.getUniformLocation(this.programs.average, "fine"), 0);
     gl.bindVertexArray(this.empty);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
-    [[this.sharp, 0], [this.sharp, 1], [this.sharp, 2], [this.coarse, 0]].forEach(([target, index], copy) => {
-      gl.bindFramebuffer(gl.READ_FRAMEBUFFER, target.buffer);
+    gl.colorMask(true, true, true, true);
+    gl.drawBuffers([0, 1, 2].map((index) => gl.COLOR_ATTACHMENT0 + index));
+    this.copies.forEach((copy, index) => {
       gl.readBuffer(gl.COLOR_ATTACHMENT0 + index);
-      gl.bindBuffer(gl.PIXEL_PACK_BUFFER, this.copies[copy]);
+      gl.bindBuffer(gl.PIXEL_PACK_BUFFER, copy);
       gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, 0);
     });
     gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
@@ -347,19 +343,20 @@ class Raster {
     const gl = this.gl, { width, height } = view;
     while (gl.clientWaitSync(drawn, 0, 0) === gl.TIMEOUT_EXPIRED) await new Promise((done) => setTimeout(done));
     gl.deleteSync(drawn);
-    const [base, normal, uv, coverage] = this.copies.map((copy) => {
+    const [base, normal, uv] = this.copies.map((copy) => {
       const values = new Float32Array(4 * width * height);
       gl.bindBuffer(gl.PIXEL_PACK_BUFFER, copy);
       gl.getBufferSubData(gl.PIXEL_PACK_BUFFER, 0, values);
       return values;
     });
     gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
+    const directions = towardsCamera(view);
     return {
       uv: planes(uv, width, height, [0, 1]),
       mask: planes(base, width, height, [3]),
-      coverage: planes(coverage, width, height, [0]),
-      view_dir: directions(view),
-      normal: planes(normal, width, height, [0, 1, 2]),
+      coverage: planes(normal, width, height, [3]),
+      view_dir: directions,
+      normal: facing(planes(normal, width, height, [0, 1, 2]), directions),
       base: planes(base, width, height, [0, 1, 2, 3]),
     };
   }
@@ -377,8 +374,20 @@ function planes(values, width, height, channels) {
   return result;
 }
 
+// Turns the normals [3, H, W] that look away from the camera.
+function facing(normals, directions) {
+  const count = normals.length / 3;
+  for (let i = 0, j = count, k = 2 * count; i < count; i++, j++, k++)
+    if (normals[i] * directions[i] + normals[j] * directions[j] + normals[k] * directions[k] < 0) {
+      normals[i] = -normals[i];
+      normals[j] = -normals[j];
+      normals[k] = -normals[k];
+    }
+  return normals;
+}
+
 // Unit vectors from the surface to the camera: minus the ray through each pixel's centre.
-function directions(view) {
+function towardsCamera(view) {
   const { width, height, fl_x, fl_y, cx, cy, c2w } = view, count = width * height;
   const result = new Float32Array(3 * count);
   for (let y = 0, i = 0; y < height; y++)
@@ -390,7 +399,7 @@ function directions(view) {
   return result;
 }
 
-// World -> clip space, column-major; OpenGL's camera axes, pixel (0, 0) at the top left.
+// World -> clip space; OpenGL's camera axes, pixel (0, 0) at the top left.
 function clipMatrix(view, scene) {
   const { width, height, fl_x, fl_y, cx, cy, c2w } = view;
   const eye = [0, 1, 2].map((r) => c2w[r][3]);
@@ -407,11 +416,8 @@ function clipMatrix(view, scene) {
     [0, 0, -(far + near) / (far - near), (-2 * far * near) / (far - near)],
     [0, 0, -1, 0],
   ];
-  const result = new Float32Array(16);
-  for (let r = 0; r < 4; r++)
-    for (let c = 0; c < 4; c++)
-      for (let k = 0; k < 4; k++) result[c * 4 + r] += lens[r][k] * camera[k][c];
-  return result;
+  const columns = (rows) => [0, 1, 2, 3].flatMap((c) => rows.map((row) => row[c]));
+  return product(columns(lens), columns(camera));
 }
 
 // ---- network -----------------------------------------------------------------------------------------------------
@@ -537,8 +543,8 @@ class Page {
           const { round } = begun, started = since || performance.now();
           ({ begun } = await this.frame(begun, $("show").value, () => this.next()));
           since = begun ? performance.now() : null;
-          if (round === this.round) this.note([...this.last, performance.now() - started]);
-          $("message").textContent = "";
+          if (round === this.round) this.note([...this.last, performance.now() - started], !begun);
+          if ($("message").textContent) $("message").textContent = "";
         } catch (error) {
           fail(error);
           throw error;
@@ -574,9 +580,12 @@ class Page {
     canvas.getContext("2d", { willReadFrequently: true }).putImageData(image, 0, 0);
   }
 
-  note(times) {
+  note(times, last) {
     this.times.push(times);
     if (this.times.length > RECENT) this.times.shift();
+    // Laying out text takes time, too.
+    if (!last && performance.now() - (this.reported || 0) < 250) return;
+    this.reported = performance.now();
     this.report();
   }
 
