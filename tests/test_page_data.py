@@ -63,17 +63,22 @@ def test_meshes_unpack_to_what_they_were() -> None:
     """As readMeshes of viewer.js unpacks them."""
     rng = np.random.default_rng(0)
     meshes = []
-    for count, faces in ((100, 50), (7, 4)):
+    for count, triangles in ((100, 50), (7, 4)):
         normals = rng.normal(size=(count, 3))
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         positions = rng.normal(size=(count, 3)).astype(np.float32)
         positions[:, 2] = 3.0  # flat
-        meshes.append(
-            BundleMesh(
-                "m", "default", positions, normals.astype(np.float32), rng.random((count, 2), np.float32), None,
-                rng.integers(0, count, (faces, 3)).astype(np.int32), rng.normal(size=(2, 4, 4)),
-            )  # fmt: skip
+        mesh = BundleMesh(
+            name="mesh",
+            material="default",
+            positions=positions,
+            normals=normals.astype(np.float32),
+            atlas=rng.random((count, 2), np.float32),
+            uv=None,
+            faces=rng.integers(0, count, (triangles, 3)).astype(np.int32),
+            placements=rng.normal(size=(2, 4, 4)),
         )
+        meshes.append(mesh)
     content, records = pack_meshes(meshes)
     at = 0
 

@@ -8,7 +8,6 @@ import json
 import math
 import re
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -156,8 +155,9 @@ def test_the_page_starts_level_and_says_its_figures(exported: tuple[Path, dict[s
         assert fps.is_visible()
         counted = re.fullmatch(r"([\d.]+) frames a second", fps.inner_text())
         assert counted and float(counted[1]) > 0
-        rows = dict(line.split("\t") for line in page.evaluate("document.getElementById('figures').innerText").splitlines())
+        table = page.evaluate("document.getElementById('figures').innerText")
         assert errors == []
+    rows = dict(line.split("\t") for line in table.splitlines())
     right, up, back = pose[:3, :3].T
     assert abs(right[2]) < 1e-9 and up[2] > 0.8
     assert 5 < math.degrees(math.asin(back[2])) < 30

@@ -70,7 +70,7 @@ MADE = {"view_dir": 3, "camera_normal": 3}
 EXAMPLE = (48, 40)
 """Height and width that the graph is traced with; the file has none."""
 MERGED_VALUES = 16 * 128**2
-"""Pyramids whose finest level has no more are merged where the file is loaded, since that part of the graph is constant:
+"""Pyramids whose finest level has no more are merged where the file is loaded, as that part of the graph is constant:
 four times the memory, one look-up a pixel."""
 
 

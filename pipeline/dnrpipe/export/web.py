@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from dnrtrain import onnx_export
 from dnrtrain.atomic import atomic_path, write_text
