@@ -2,7 +2,7 @@
 // World axes are the .blend's: right-handed, Z up.
 "use strict";
 
-const FINER = 4; // coverage of silhouettes: FINER² samples a pixel
+const FINER = 3; // samples along a pixel's side; odd: the middle one is what the pixel shows, all are its coverage
 const MEASURED = 8; // frames that are drawn after a change, so that frames a second are known while nothing moves
 const RECENT = 30; // frames over which times are averaged
 
@@ -20,60 +20,46 @@ void main() {
   gl_Position = toClip * vec4(position, 1.0);
 }`;
 
-// The same without what silhouettes do not need: with many small triangles each number that is interpolated counts.
-const OUTLINE = (cutouts) => `#version 300 es
-layout(location = 0) in vec3 position;
-layout(location = 2) in vec2 atlas;
-uniform mat4 toClip;
-${cutouts ? "out vec2 place;" : ""}
-void main() {
-  ${cutouts ? "place = atlas;" : ""}
-  gl_Position = toClip * vec4(position, 1.0);
-}`;
-
+// The samples are small: only what of a surface is seen; 0 where there is none.
 // A shader that may discard tests depth late, so it says so only where the scene has cut-outs.
-const HOLES = (cutouts) => cutouts ? "if (texture(front, place).a < 0.5) discard;" : "";
-
-const SURFACE = (cutouts) => `#version 300 es
+const SAMPLE = (cutouts) => `#version 300 es
 precision highp float;
-uniform sampler2D front, back; // radiance as log(1 + curve · x) over range
-uniform float curve, range;
-uniform bool thin;
+uniform sampler2D front;
 in vec3 worldNormal;
 in vec2 place;
-layout(location = 0) out vec4 base;
-layout(location = 1) out vec4 normal;
-layout(location = 2) out vec4 uv;
+out uvec4 seen;
 void main() {
-  ${HOLES(cutouts)}
-  vec3 code = thin && !gl_FrontFacing ? texture(back, place).rgb : texture(front, place).rgb;
-  base = vec4((exp(range * code) - 1.0) / curve, 1.0);
-  normal = vec4(normalize(worldNormal), 1.0);
-  uv = vec4(place, 0.0, 1.0);
-}`;
-
-const SILHOUETTE = (cutouts) => `#version 300 es
-precision highp float;
-${cutouts ? "uniform sampler2D front; in vec2 place;" : ""}
-out vec4 covered;
-void main() {
-  ${HOLES(cutouts)}
-  covered = vec4(1.0);
+  ${cutouts ? "if (texture(front, place).a < 0.5) discard;" : ""}
+  vec3 n = normalize(worldNormal);
+  seen = uvec4(floatBitsToUint(place), packHalf2x16(n.xy), packHalf2x16(vec2(n.z, gl_FrontFacing ? 1.0 : -1.0)));
 }`;
 
 const WHOLE = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0), 0.0, 1.0); }`;
 
-const AVERAGE = `#version 300 es
+const PIXEL = `#version 300 es
 precision highp float;
-uniform sampler2D fine;
-layout(location = 1) out vec4 mean; // its alpha is kept
+uniform highp usampler2D samples;
+uniform sampler2D front, back; // radiance as log(1 + curve · x) over range
+uniform float curve, range;
+layout(location = 0) out vec4 base; // and whether there is a surface
+layout(location = 1) out vec4 normal; // and coverage
+layout(location = 2) out vec4 uv;
 void main() {
-  ivec2 corner = ivec2(gl_FragCoord.xy) * ${FINER};
-  float sum = 0.0;
+  ivec2 corner = ${FINER} * ivec2(gl_FragCoord.xy);
+  float covered = 0.0;
   for (int y = 0; y < ${FINER}; y++)
-    for (int x = 0; x < ${FINER}; x++) sum += texelFetch(fine, corner + ivec2(x, y), 0).r;
-  mean = vec4(sum / float(${FINER * FINER}));
+    for (int x = 0; x < ${FINER}; x++) covered += texelFetch(samples, corner + ivec2(x, y), 0).w == 0u ? 0.0 : 1.0;
+  covered /= ${FINER * FINER}.0;
+  base = uv = vec4(0.0);
+  normal = vec4(0.0, 0.0, 0.0, covered);
+  uvec4 seen = texelFetch(samples, corner + ${(FINER - 1) / 2}, 0);
+  if (seen.w == 0u) return;
+  vec2 place = uintBitsToFloat(seen.xy), last = unpackHalf2x16(seen.w);
+  vec3 code = last.y < 0.0 ? textureLod(back, place, 0.0).rgb : textureLod(front, place, 0.0).rgb;
+  base = vec4((exp(range * code) - 1.0) / curve, 1.0);
+  normal.xyz = normalize(vec3(unpackHalf2x16(seen.z), last.x));
+  uv = vec4(place, 0.0, 1.0);
 }`;
 
 // ---- files -------------------------------------------------------------------------------------------------------
@@ -171,11 +157,7 @@ class Raster {
     this.scene = scene;
     const info = gl.getExtension("WEBGL_debug_renderer_info");
     this.name = gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
-    this.programs = {
-      surface: this.program(VERTEX, SURFACE(scene.cutouts)),
-      silhouette: this.program(OUTLINE(scene.cutouts), SILHOUETTE(scene.cutouts)),
-      average: this.program(WHOLE, AVERAGE),
-    };
+    this.programs = { sample: this.program(VERTEX, SAMPLE(scene.cutouts)), pixel: this.program(WHOLE, PIXEL) };
     this.front = this.light(front);
     this.back = back ? this.light(back) : this.front;
     this.nodes = meshes.flatMap((mesh) => {
@@ -261,15 +243,15 @@ class Raster {
   resize(width, height) {
     if (this.size === `${width}x${height}`) return;
     const gl = this.gl;
-    for (const old of [this.sharp, this.fine].filter(Boolean)) {
+    for (const old of [this.fine, this.pixels].filter(Boolean)) {
       old.textures.forEach((texture) => gl.deleteTexture(texture));
       gl.deleteRenderbuffer(old.depths);
       gl.deleteFramebuffer(old.buffer);
     }
     (this.copies || []).forEach((copy) => gl.deleteBuffer(copy));
-    this.sharp = this.target(width, height, [gl.RGBA32F, gl.RGBA32F, gl.RGBA32F], true);
-    this.fine = this.target(FINER * width, FINER * height, [gl.R8], false);
-    this.copies = this.sharp.textures.map(() => {
+    this.fine = this.target(FINER * width, FINER * height, [gl.RGBA32UI], true);
+    this.pixels = this.target(width, height, [gl.RGBA32F, gl.RGBA32F, gl.RGBA32F], false);
+    this.copies = this.pixels.textures.map(() => {
       const copy = gl.createBuffer();
       gl.bindBuffer(gl.PIXEL_PACK_BUFFER, copy);
       gl.bufferData(gl.PIXEL_PACK_BUFFER, 16 * width * height, gl.STREAM_READ);
@@ -279,54 +261,42 @@ class Raster {
     this.size = `${width}x${height}`;
   }
 
-  draw(program, target, view) {
-    const gl = this.gl, at = (name) => gl.getUniformLocation(program, name);
+  use(program, target, textures) {
+    const gl = this.gl;
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.buffer);
     gl.viewport(0, 0, target.width, target.height);
-    target.textures.forEach((_, index) => gl.clearBufferfv(gl.COLOR, index, [0, 0, 0, 0]));
-    // Silhouettes need no depth: whichever surface it is, the sample is covered.
-    if (target.depths) {
-      gl.enable(gl.DEPTH_TEST);
-      gl.clearBufferfv(gl.DEPTH, 0, [1]);
-    } else gl.disable(gl.DEPTH_TEST);
     gl.useProgram(program);
-    gl.uniform1i(at("thin"), this.scene.thin ? 1 : 0);
-    gl.uniform1f(at("curve"), this.scene.light.curve);
-    gl.uniform1f(at("range"), this.scene.light.range);
-    [["front", this.front], ["back", this.back]].forEach(([name, texture], unit) => {
+    Object.entries(textures).forEach(([name, texture], unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
       gl.bindTexture(gl.TEXTURE_2D, texture);
-      gl.uniform1i(at(name), unit);
+      gl.uniform1i(gl.getUniformLocation(program, name), unit);
     });
-    const clip = clipMatrix(view, this.scene), toClip = at("toClip"), placedNormal = at("placedNormal");
+    return (name) => gl.getUniformLocation(program, name);
+  }
+
+  // Starts to draw a view. The GPU works on while the network computes the frame before; one view at a time.
+  begin(view) {
+    const gl = this.gl, { width, height } = view, clip = clipMatrix(view, this.scene);
+    this.resize(width, height);
+    let at = this.use(this.programs.sample, this.fine, { front: this.front });
+    const toClip = at("toClip"), placedNormal = at("placedNormal");
+    gl.enable(gl.DEPTH_TEST);
+    gl.clearBufferuiv(gl.COLOR, 0, [0, 0, 0, 0]);
+    gl.clearBufferfv(gl.DEPTH, 0, [1]);
     for (const node of this.nodes) {
       gl.uniformMatrix4fv(toClip, false, product(clip, node.placed));
       gl.uniformMatrix3fv(placedNormal, false, node.normal);
       gl.bindVertexArray(node.array);
       gl.drawElements(gl.TRIANGLES, node.count, gl.UNSIGNED_INT, 0);
     }
-    gl.bindVertexArray(null);
-  }
-
-  // Starts to draw a view. The GPU works on while the network computes the frame before; one view at a time.
-  begin(view) {
-    const gl = this.gl, { width, height } = view;
-    this.resize(width, height);
-    this.draw(this.programs.surface, this.sharp, view);
-    this.draw(this.programs.silhouette, this.fine, view);
-    // Their average goes to the normals' alpha: that is one picture less to read back.
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.sharp.buffer);
-    gl.viewport(0, 0, width, height);
-    gl.drawBuffers([gl.NONE, gl.COLOR_ATTACHMENT1, gl.NONE]);
-    gl.colorMask(false, false, false, true);
-    gl.useProgram(this.programs.average);
-    gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, this.fine.textures[0]);
-    gl.uniform1i(gl.getUniformLocation(this.programs.average, "fine"), 0);
+    const textures = { samples: this.fine.textures[0], front: this.front, back: this.back };
+    at = this.use(this.programs.pixel, this.pixels, textures);
+    gl.disable(gl.DEPTH_TEST);
+    gl.uniform1f(at("curve"), this.scene.light.curve);
+    gl.uniform1f(at("range"), this.scene.light.range);
     gl.bindVertexArray(this.empty);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
-    gl.colorMask(true, true, true, true);
-    gl.drawBuffers([0, 1, 2].map((index) => gl.COLOR_ATTACHMENT0 + index));
+    gl.bindVertexArray(null);
     this.copies.forEach((copy, index) => {
       gl.readBuffer(gl.COLOR_ATTACHMENT0 + index);
       gl.bindBuffer(gl.PIXEL_PACK_BUFFER, copy);
