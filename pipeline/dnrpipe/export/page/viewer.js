@@ -303,70 +303,59 @@ class Raster {
       gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, 0);
     });
     gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
-    const drawn = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     gl.flush();
-    return { view, drawn };
+    return { view, fence };
   }
 
-  // The network's inputs for a view that was begun, as Float32Arrays [C, H, W] by name, row 0 at the top.
-  async inputs({ view, drawn }) {
-    const gl = this.gl, { width, height } = view;
-    while (gl.clientWaitSync(drawn, 0, 0) === gl.TIMEOUT_EXPIRED) await new Promise((done) => setTimeout(done));
-    gl.deleteSync(drawn);
+  // What was drawn of a view that was begun: three times Float32Array [H, W, 4], row 0 at the bottom; see PIXEL.
+  async drawn({ view, fence }) {
+    const gl = this.gl;
+    while (gl.clientWaitSync(fence, 0, 0) === gl.TIMEOUT_EXPIRED) await new Promise((done) => setTimeout(done));
+    gl.deleteSync(fence);
     const [base, normal, uv] = this.copies.map((copy) => {
-      const values = new Float32Array(4 * width * height);
+      const values = new Float32Array(4 * view.width * view.height);
       gl.bindBuffer(gl.PIXEL_PACK_BUFFER, copy);
       gl.getBufferSubData(gl.PIXEL_PACK_BUFFER, 0, values);
       return values;
     });
     gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
-    const directions = towardsCamera(view);
-    return {
-      uv: planes(uv, width, height, [0, 1]),
-      mask: planes(base, width, height, [3]),
-      coverage: planes(normal, width, height, [3]),
-      view_dir: directions,
-      normal: facing(planes(normal, width, height, [0, 1, 2]), directions),
-      base: planes(base, width, height, [0, 1, 2, 3]),
-    };
+    return { base, normal, uv };
   }
 }
 
-// Interleaved RGBA, bottom row first -> planes, top row first.
-function planes(values, width, height, channels) {
-  const result = new Float32Array(channels.length * width * height);
-  channels.forEach((channel, plane) => {
-    for (let y = 0; y < height; y++) {
-      let from = 4 * width * (height - 1 - y) + channel, to = width * (plane * height + y);
-      for (let x = 0; x < width; x++, from += 4) result[to++] = values[from];
-    }
-  });
-  return result;
+// Numbers of the pixels that surfaces cover, at least in part: row by row from the top.
+function coveredPixels({ normal }, { width, height }) {
+  const found = new Uint32Array(width * height);
+  let count = 0;
+  for (let y = 0, pixel = 0; y < height; y++)
+    for (let x = 0; x < width; x++, pixel++)
+      if (normal[4 * (width * (height - 1 - y) + x) + 3] > 0) found[count++] = pixel;
+  return found.subarray(0, count);
 }
 
-// Turns the normals [3, H, W] that look away from the camera.
-function facing(normals, directions) {
-  const count = normals.length / 3;
-  for (let i = 0, j = count, k = 2 * count; i < count; i++, j++, k++)
-    if (normals[i] * directions[i] + normals[j] * directions[j] + normals[k] * directions[k] < 0) {
-      normals[i] = -normals[i];
-      normals[j] = -normals[j];
-      normals[k] = -normals[k];
+// The network's inputs for those pixels, Float32Array [C, pixels] by name.
+function networkInputs({ base, normal, uv }, view, pixels) {
+  const { width, height, fl_x, fl_y, cx, cy, c2w } = view, count = pixels.length, inputs = {};
+  for (const [name, channels] of Object.entries(CHANNELS)) inputs[name] = new Float32Array(channels * count);
+  for (let i = 0; i < count; i++) {
+    const y = Math.floor(pixels[i] / width), x = pixels[i] - width * y, from = 4 * (width * (height - 1 - y) + x);
+    // From the surface to the camera: minus the ray through the pixel's centre. Normals look that way, too.
+    const a = (x + 0.5 - cx) / fl_x, b = -(y + 0.5 - cy) / fl_y, length = Math.sqrt(a * a + b * b + 1);
+    let cosine = 0;
+    for (let r = 0; r < 3; r++) {
+      const towards = -(c2w[r][0] * a + c2w[r][1] * b - c2w[r][2]) / length;
+      inputs.view_dir[r * count + i] = towards;
+      cosine += towards * normal[from + r];
     }
-  return normals;
-}
-
-// Unit vectors from the surface to the camera: minus the ray through each pixel's centre.
-function towardsCamera(view) {
-  const { width, height, fl_x, fl_y, cx, cy, c2w } = view, count = width * height;
-  const result = new Float32Array(3 * count);
-  for (let y = 0, i = 0; y < height; y++)
-    for (let x = 0; x < width; x++, i++) {
-      const a = (x + 0.5 - cx) / fl_x, b = -(y + 0.5 - cy) / fl_y, length = Math.sqrt(a * a + b * b + 1);
-      for (let r = 0; r < 3; r++)
-        result[r * count + i] = -(c2w[r][0] * a + c2w[r][1] * b - c2w[r][2]) / length;
-    }
-  return result;
+    for (let r = 0; r < 3; r++) inputs.normal[r * count + i] = cosine < 0 ? -normal[from + r] : normal[from + r];
+    for (let c = 0; c < 4; c++) inputs.base[c * count + i] = base[from + c];
+    inputs.uv[i] = uv[from];
+    inputs.uv[count + i] = uv[from + 1];
+    inputs.mask[i] = base[from + 3];
+    inputs.coverage[i] = normal[from + 3];
+  }
+  return inputs;
 }
 
 // World -> clip space; OpenGL's camera axes, pixel (0, 0) at the top left.
@@ -405,16 +394,20 @@ class Network {
     wasm.wasmBinary = binary.buffer;
     // Only where the server isolates origins may threads share memory.
     wasm.numThreads = self.crossOriginIsolated ? Math.min(4, navigator.hardwareConcurrency) : 1;
-    network.session = await network.ort.InferenceSession.create(model, { executionProviders: ["wasm"] });
+    network.session = await network.ort.InferenceSession.create(model, {
+      executionProviders: ["wasm"],
+      enableMemPattern: false, // it would keep one for each number of pixels
+    });
     network.provider = `WebAssembly, threads: ${wasm.numThreads}`;
     return network;
   }
 
-  // Display RGB over white, Float32Array [3, H, W].
-  async run(inputs, width, height) {
-    const feeds = {};
+  // Display RGB over white of any pixels, Float32Array [3, pixels]. The network looks at each by itself, so they need
+  // not be a picture.
+  async run(inputs) {
+    const feeds = {}, count = inputs.mask.length;
     for (const name of this.session.inputNames)
-      feeds[name] = new this.ort.Tensor("float32", inputs[name], [1, CHANNELS[name], height, width]);
+      feeds[name] = new this.ort.Tensor("float32", inputs[name], [1, CHANNELS[name], 1, count]);
     return (await this.session.run(feeds, ["rgb"])).rgb.data;
   }
 }
@@ -527,24 +520,21 @@ class Page {
 
   // Shows a view that was begun. next: begins another one, or answers null.
   async frame(begun, show, next) {
-    const started = performance.now(), { view } = begun;
-    const inputs = await this.raster.inputs(begun);
-    const drawn = performance.now();
+    const started = performance.now(), { view } = begun, drawn = await this.raster.drawn(begun);
+    const waited = performance.now() - started, pixels = coveredPixels(drawn, view);
     begun = next();
-    const ready = performance.now();
-    const picture = show === "neural" ? await this.network.run(inputs, view.width, view.height) : plain(inputs, show);
-    const ended = performance.now();
-    this.paint(picture, view.width, view.height);
-    this.last = [drawn - started, ended - ready];
-    return { inputs, picture, begun };
+    const inputs = networkInputs(drawn, view, pixels), asked = performance.now();
+    const colours = show !== "neural" ? plain(inputs, show) : pixels.length ? await this.network.run(inputs) : [];
+    this.last = [waited, performance.now() - asked];
+    this.paint(pixels, colours, view);
+    return { drawn, pixels, colours, begun };
   }
 
-  paint(picture, width, height) {
-    const canvas = $("picture"), count = width * height, image = new ImageData(width, height);
-    for (let i = 0; i < count; i++) {
-      for (let c = 0; c < 3; c++) image.data[4 * i + c] = 255 * picture[c * count + i] + 0.5;
-      image.data[4 * i + 3] = 255;
-    }
+  paint(pixels, colours, { width, height }) {
+    const canvas = $("picture"), count = pixels.length, image = new ImageData(width, height);
+    image.data.fill(255);
+    for (let i = 0; i < count; i++)
+      for (let c = 0; c < 3; c++) image.data[4 * pixels[i] + c] = 255 * colours[c * count + i] + 0.5;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     // Its pixels stay in main memory: they are written there anew each frame.
     canvas.getContext("2d", { willReadFrequently: true }).putImageData(image, 0, 0);
@@ -599,17 +589,21 @@ class Page {
     }
   }
 
-  // A frame of a given camera, for checks: inputs and picture as base64 of float32.
+  // A frame of a given camera, for checks: inputs and picture of all pixels as base64 of float32 [C, H, W].
   async probe(view) {
-    const { inputs, picture } = await this.alone(() => this.frame(this.raster.begin(view), "neural", () => null));
+    const { drawn, pixels, colours } = await this.alone(() => this.frame(this.raster.begin(view), "neural", () => null));
+    const count = view.width * view.height, rgb = new Float32Array(3 * count).fill(1);
+    pixels.forEach((pixel, i) => {
+      for (let c = 0; c < 3; c++) rgb[c * count + pixel] = colours[c * pixels.length + i];
+    });
     const coded = (values) => {
       const bytes = new Uint8Array(values.buffer, values.byteOffset, values.byteLength);
       let text = "";
       for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
       return btoa(text);
     };
-    const packed = Object.entries({ ...inputs, rgb: picture }).map(([name, values]) => [name, coded(values)]);
-    return Object.fromEntries(packed);
+    const inputs = networkInputs(drawn, view, Uint32Array.from({ length: count }, (_, i) => i));
+    return Object.fromEntries(Object.entries({ ...inputs, rgb }).map(([name, values]) => [name, coded(values)]));
   }
 
   // Figures of a turntable of that width, for checks.
@@ -627,14 +621,14 @@ class Page {
 
 // Baked light (exposed plainly, not by the scene's display transform) or normals over white.
 function plain(inputs, show) {
-  const count = inputs.mask.length, picture = new Float32Array(3 * count);
+  const count = inputs.mask.length, colours = new Float32Array(3 * count);
   for (let i = 0; i < count; i++)
     for (let c = 0; c < 3; c++) {
       const value = show === "normal" ? 0.5 + 0.5 * inputs.normal[c * count + i]
         : Math.min(1, inputs.base[c * count + i]) ** (1 / 2.2);
-      picture[c * count + i] = 1 + inputs.mask[i] * (value - 1);
+      colours[c * count + i] = 1 + inputs.mask[i] * (value - 1);
     }
-  return picture;
+  return colours;
 }
 
 function fail(error) {
