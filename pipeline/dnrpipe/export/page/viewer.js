@@ -20,18 +20,18 @@ void main() {
   gl_Position = toClip * vec4(position, 1.0);
 }`;
 
-// The samples are small: only what of a surface is seen; 0 where there is none.
-// A shader that may discard tests depth late, so it says so only where the scene has cut-outs.
+// Samples are many, so they are small: place in the atlas, 16 bits each; normal, 10 bits each; 1: a front is seen, 2: a
+// back, 0: nothing. A shader that may discard tests depth late, so it says so only where the scene has cut-outs.
 const SAMPLE = (cutouts) => `#version 300 es
 precision highp float;
 uniform sampler2D front;
 in vec3 worldNormal;
 in vec2 place;
-out uvec4 seen;
+out uvec2 seen;
 void main() {
   ${cutouts ? "if (texture(front, place).a < 0.5) discard;" : ""}
-  vec3 n = normalize(worldNormal);
-  seen = uvec4(floatBitsToUint(place), packHalf2x16(n.xy), packHalf2x16(vec2(n.z, gl_FrontFacing ? 1.0 : -1.0)));
+  uvec3 n = uvec3(512.0 + 511.0 * normalize(worldNormal) + 0.5);
+  seen = uvec2(packUnorm2x16(place), n.x | n.y << 10 | n.z << 20 | (gl_FrontFacing ? 1u : 2u) << 30);
 }`;
 
 const WHOLE = `#version 300 es
@@ -49,16 +49,16 @@ void main() {
   ivec2 corner = ${FINER} * ivec2(gl_FragCoord.xy);
   float covered = 0.0;
   for (int y = 0; y < ${FINER}; y++)
-    for (int x = 0; x < ${FINER}; x++) covered += texelFetch(samples, corner + ivec2(x, y), 0).w == 0u ? 0.0 : 1.0;
+    for (int x = 0; x < ${FINER}; x++) covered += texelFetch(samples, corner + ivec2(x, y), 0).y == 0u ? 0.0 : 1.0;
   covered /= ${FINER * FINER}.0;
   base = uv = vec4(0.0);
   normal = vec4(0.0, 0.0, 0.0, covered);
   uvec4 seen = texelFetch(samples, corner + ${(FINER - 1) / 2}, 0);
-  if (seen.w == 0u) return;
-  vec2 place = uintBitsToFloat(seen.xy), last = unpackHalf2x16(seen.w);
-  vec3 code = last.y < 0.0 ? textureLod(back, place, 0.0).rgb : textureLod(front, place, 0.0).rgb;
+  if (seen.y == 0u) return;
+  vec2 place = unpackUnorm2x16(seen.x);
+  vec3 code = seen.y >> 30 == 2u ? textureLod(back, place, 0.0).rgb : textureLod(front, place, 0.0).rgb;
   base = vec4((exp(range * code) - 1.0) / curve, 1.0);
-  normal.xyz = normalize(vec3(unpackHalf2x16(seen.z), last.x));
+  normal.xyz = normalize(vec3(uvec3(seen.y, seen.y >> 10, seen.y >> 20) & 1023u) - 512.0);
   uv = vec4(place, 0.0, 1.0);
 }`;
 
@@ -249,7 +249,7 @@ class Raster {
       gl.deleteFramebuffer(old.buffer);
     }
     (this.copies || []).forEach((copy) => gl.deleteBuffer(copy));
-    this.fine = this.target(FINER * width, FINER * height, [gl.RGBA32UI], true);
+    this.fine = this.target(FINER * width, FINER * height, [gl.RG32UI], true);
     this.pixels = this.target(width, height, [gl.RGBA32F, gl.RGBA32F, gl.RGBA32F], false);
     this.copies = this.pixels.textures.map(() => {
       const copy = gl.createBuffer();
