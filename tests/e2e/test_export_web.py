@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import functools
-import http.server
 import json
 import math
 import re
-import threading
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from e2e_harness import run
+from tools.bench_page import StaticServer, bench
 
 from dnrpipe.core.errors import UserError
 from dnrpipe.export.browser import find_chromium, open_page, wait_for
@@ -44,40 +42,6 @@ def exported(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
     out = tmp_path_factory.mktemp("web") / "page"
     done = run("export-web", str(tiny), "--out", str(out), "--epochs", "3", "--check", "--json", folder=tiny.parent)
     return out, json.loads(done.stdout)
-
-
-class Server(http.server.ThreadingHTTPServer):
-    """A static server of one folder that counts the bytes of each file it sends."""
-
-    def __init__(self, folder: Path, headers: dict[str, str]) -> None:
-        sent = self.sent = dict[str, int]()
-
-        class Handler(http.server.SimpleHTTPRequestHandler):
-            def end_headers(self) -> None:
-                for name, value in headers.items():
-                    self.send_header(name, value)
-                super().end_headers()
-
-            def copyfile(self, source: Any, outputfile: Any) -> None:
-                content = source.read()
-                sent[self.path] = len(content)
-                outputfile.write(content)
-
-            def log_message(self, *_: Any) -> None: ...
-
-        super().__init__(("127.0.0.1", 0), functools.partial(Handler, directory=str(folder)))
-
-    def __enter__(self) -> Server:
-        threading.Thread(target=self.serve_forever, daemon=True).start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.shutdown()
-        self.server_close()
-
-    @property
-    def address(self) -> str:
-        return f"http://127.0.0.1:{self.server_address[1]}/index.html"
 
 
 def test_the_browser_computes_what_torch_computes(exported: tuple[Path, dict[str, Any]]) -> None:
@@ -132,16 +96,16 @@ def test_a_static_server_sends_little(exported: tuple[Path, dict[str, Any]]) -> 
     pictures = []
     isolation = {"Cross-Origin-Opener-Policy": "same-origin", "Cross-Origin-Embedder-Policy": "require-corp"}
     for headers, several in (({}, False), (isolation, True)):
-        with Server(out, headers) as server, open_page(server.address) as (page, _):
+        with StaticServer(out, headers) as server, open_page(server.address) as (page, _):
             wait_for(page, SETTLED)
             pictures.append(page.evaluate(PIXELS))
             assert page.evaluate("document.getElementById('message').textContent") == ""
             threads = int(page.evaluate("document.getElementById('figures').innerText.match(/threads: (\\d+)/)[1]"))
             assert threads == (min(4, page.evaluate("navigator.hardwareConcurrency")) if several else 1)
-            assert "/offline.js" not in server.sent
-            sent = sum(count for path, count in server.sent.items() if path != "/favicon.ico")
-            assert sent == answer["bytes_first_load"] <= LIMIT
     assert max(abs(a - b) for a, b in zip(*pictures, strict=True)) <= 2
+    found = bench(out, 64)
+    assert found["first_load"] == answer["bytes_first_load"] <= LIMIT
+    assert found["fps"] > 0 and found["offline"] == answer["bytes_offline"]
 
 
 def test_the_page_starts_level_and_says_its_figures(exported: tuple[Path, dict[str, Any]], tiny: Path) -> None:

@@ -80,11 +80,12 @@ def pack_meshes(meshes: Sequence[BundleMesh]) -> tuple[bytes, list[dict[str, Any
     for mesh in meshes:
         low, extent = mesh.positions.min(axis=0), np.ptp(mesh.positions, axis=0)
         places = (mesh.positions - low) / np.where(extent > 0, extent, 1)
+        normals = np.where(mesh.normals.any(axis=1, keepdims=True), mesh.normals, (0, 0, 1))  # shaders divide by length
         indices = np.diff(mesh.faces.ravel(), prepend=0)
         parts += [
             indices.astype("<i4"),
             (65535 * places + 0.5).astype("<u2"),
-            np.rint(NORMAL_STEPS * mesh.normals).astype("<i2"),
+            np.rint(NORMAL_STEPS * normals).astype("<i2"),
             (65535 * mesh.atlas.clip(0, 1) + 0.5).astype("<u2"),
         ]
         records.append(

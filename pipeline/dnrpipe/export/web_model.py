@@ -43,9 +43,9 @@ if TYPE_CHECKING:
     from playwright.sync_api import Page
 
 MODEL = {"base": "raster", "guides": True, "network": "mlp", "width": 12, "filter": 0, "output": "display"}
-"""Of the page's network, beside the draft preset's. Every pixel by itself: the neural texture tells them apart, and a
-U-Net of the draft preset takes three times as long in WebAssembly and came out worse on the demo scene. Display space
-saves a logarithm and an exponential a pixel; a page shows nothing else."""
+"""Of the page's network, beside the draft preset's. It sees every pixel by itself, so the page asks it for covered ones
+only; a U-Net takes several times as long in WebAssembly and came out worse on the demo scene. Display space saves a
+logarithm and an exponential a pixel: a page shows nothing else."""
 STEPS = 1500
 """Training takes at least so many, whatever the number of views."""
 SPEED_SIDE = 256
@@ -103,7 +103,7 @@ def train(
     step2 = step2.model_copy(update={"epochs": epochs or max(step2.epochs, -(-STEPS // len(views)))})
     data = web_views(workspace, views, "train", maps, light)
     weights = perceptual_weights(console)
-    fingerprint = digest([sha256(light.codes).hexdigest(), [view.model_dump(mode="json") for view in views]])
+    fingerprint = digest([sha256(light.codes.tobytes()).hexdigest(), [view.model_dump(mode="json") for view in views]])
     events = run_step2(
         data, None, folder, model, step2,
         seed=settings.finetune.seed, device=torch_device(settings), checkpoints=folder, fingerprint=fingerprint,
