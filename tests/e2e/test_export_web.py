@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import math
 import re
@@ -93,7 +94,7 @@ def test_normals_turn_by_the_inverse_transpose(exported: tuple[Path, dict[str, A
 def test_a_static_server_sends_little(exported: tuple[Path, dict[str, Any]]) -> None:
     """File by file, without offline.js; one that isolates origins gets threads, and the same picture."""
     out, answer = exported
-    pictures = []
+    meshes, pictures = gzip.decompress((out / "scene.bin.gz").read_bytes()), []
     isolation = {"Cross-Origin-Opener-Policy": "same-origin", "Cross-Origin-Embedder-Policy": "require-corp"}
     for headers, several in (({}, False), (isolation, True)):
         with StaticServer(out, headers) as server, open_page(server.address) as (page, _):
@@ -102,6 +103,10 @@ def test_a_static_server_sends_little(exported: tuple[Path, dict[str, Any]]) -> 
             assert page.evaluate("document.getElementById('message').textContent") == ""
             threads = int(page.evaluate("document.getElementById('figures').innerText.match(/threads: (\\d+)/)[1]"))
             assert threads == (min(4, page.evaluate("navigator.hardwareConcurrency")) if several else 1)
+            # A server that says "Content-Encoding: gzip" makes the browser unpack the file before the page sees it.
+            assert page.evaluate("unpacked('scene.bin').then(bytes => bytes.length)") == len(meshes)
+            page.route("**/scene.bin.gz", lambda route: route.fulfill(body=meshes))
+            assert page.evaluate("unpacked('scene.bin').then(bytes => bytes.length)") == len(meshes)
     assert max(abs(a - b) for a, b in zip(*pictures, strict=True)) <= 2
     found = bench(out, 64)
     assert found["first_load"] == answer["bytes_first_load"] <= LIMIT
