@@ -2,30 +2,32 @@
 
 from __future__ import annotations
 
-import functools
-import http.server
+import gzip
 import json
-import threading
-from collections.abc import Iterator
+import math
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from e2e_harness import run
+from tools.bench_page import StaticServer, bench
 
 from dnrpipe.core.errors import UserError
 from dnrpipe.export.browser import find_chromium, open_page, wait_for
-from dnrpipe.export.gltf import Y_UP
 from dnrpipe.export.web import runtime
 
 pytestmark = [pytest.mark.slow, pytest.mark.e2e]
+
+LIMIT = 8_000_000
+"""Bytes of the folder without offline.js, and of what a server sends."""
 
 PIXELS = "Array.from(document.querySelector('canvas').getContext('2d').getImageData(0, 0, 64, 64).data)"
 
 SETTLED = (
     "window.dnr.then(async page => { do await new Promise(done => setTimeout(done, 100));"
-    " while (page.dirty || page.busy); return true })"
+    " while (page.left || page.busy); return true })"
 )
 
 
@@ -43,20 +45,6 @@ def exported(tiny: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
     return out, json.loads(done.stdout)
 
 
-@pytest.fixture
-def server(exported: tuple[Path, dict[str, Any]]) -> Iterator[str]:
-    """The folder on a static server without any headers of its own."""
-
-    class Quiet(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, *_: Any) -> None: ...
-
-    handler = functools.partial(Quiet, directory=str(exported[0]))
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as found:
-        threading.Thread(target=found.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{found.server_address[1]}/index.html"
-        found.shutdown()
-
-
 def test_the_browser_computes_what_torch_computes(exported: tuple[Path, dict[str, Any]]) -> None:
     _, answer = exported
     check = answer["check"]
@@ -66,6 +54,8 @@ def test_the_browser_computes_what_torch_computes(exported: tuple[Path, dict[str
     assert check["psnr_files"] > 30  # other sub-pixel rules at edges, 64 x 64 pixels
     assert abs(check["psnr_truth"] - answer["psnr"]) < 0.5
     assert answer["psnr"] > answer["psnr_base"]
+    assert abs(answer["psnr"] - answer["psnr_unpacked"]) < 0.2
+    assert check["side"] == 256 and check["fps"] > 0
 
 
 def test_dragging_and_choosing_change_the_picture_from_disk(exported: tuple[Path, dict[str, Any]]) -> None:
@@ -89,33 +79,60 @@ def test_dragging_and_choosing_change_the_picture_from_disk(exported: tuple[Path
         assert page.evaluate(PIXELS) != after
         figures = page.evaluate("document.getElementById('figures').innerText")
         assert errors == []
-        assert "WebAssembly" in figures and "dB PSNR over 2 ray-traced" in figures
+        assert "WebAssembly" in figures
 
 
-def test_instances_stand_where_gltf_puts_them(exported: tuple[Path, dict[str, Any]]) -> None:
-    """The page's own matrices: back from glTF's axes, and normals by the inverse transpose."""
-    rng = np.random.default_rng(1)
+def test_normals_turn_by_the_inverse_transpose(exported: tuple[Path, dict[str, Any]]) -> None:
     placement = np.eye(4)
-    placement[:3] = rng.normal(size=(3, 4))
-    stored = (Y_UP @ placement @ np.linalg.inv(Y_UP)).T.ravel().tolist()
+    placement[:3] = np.random.default_rng(1).normal(size=(3, 4))
     with open_page((exported[0] / "index.html").as_uri()) as (page, _):
-        world = page.evaluate(f"worldMatrix({stored})")
-        turned = np.array(page.evaluate(f"normalMatrix({world})")).reshape(3, 3).T
-    assert np.allclose(np.array(world).reshape(4, 4).T, placement)
+        turned = np.array(page.evaluate(f"normalMatrix({placement.T.ravel().tolist()})")).reshape(3, 3).T
     linear = placement[:3, :3]
     assert np.allclose(turned, abs(np.linalg.det(linear)) * np.linalg.inv(linear).T)
 
 
-def test_a_static_server_serves_it_too(exported: tuple[Path, dict[str, Any]], server: str) -> None:
-    """Without offline.js, file by file."""
-    (exported[0] / "offline.js").rename(exported[0] / "away.js")
-    try:
-        with open_page(server) as (page, _):
-            assert wait_for(page, "window.dnr.then(page => page.scene.size)") == [64, 64]
-            wait_for(page, "window.dnr.then(page => page.frame(page.view(), 'neural')).then(() => true)")
+def test_a_static_server_sends_little(exported: tuple[Path, dict[str, Any]]) -> None:
+    """File by file, without offline.js; one that isolates origins gets threads, and the same picture."""
+    out, answer = exported
+    meshes, pictures = gzip.decompress((out / "scene.bin.gz").read_bytes()), []
+    isolation = {"Cross-Origin-Opener-Policy": "same-origin", "Cross-Origin-Embedder-Policy": "require-corp"}
+    for headers, several in (({}, False), (isolation, True)):
+        with StaticServer(out, headers) as server, open_page(server.address) as (page, _):
+            wait_for(page, SETTLED)
+            pictures.append(page.evaluate(PIXELS))
             assert page.evaluate("document.getElementById('message').textContent") == ""
-    finally:
-        (exported[0] / "away.js").rename(exported[0] / "offline.js")
+            threads = int(page.evaluate("document.getElementById('figures').innerText.match(/threads: (\\d+)/)[1]"))
+            assert threads == (min(4, page.evaluate("navigator.hardwareConcurrency")) if several else 1)
+            # A server that says "Content-Encoding: gzip" makes the browser unpack the file before the page sees it.
+            assert page.evaluate("unpacked('scene.bin').then(bytes => bytes.length)") == len(meshes)
+            page.route("**/scene.bin.gz", lambda route: route.fulfill(body=meshes))
+            assert page.evaluate("unpacked('scene.bin').then(bytes => bytes.length)") == len(meshes)
+    assert max(abs(a - b) for a, b in zip(*pictures, strict=True)) <= 2
+    found = bench(out, 64)
+    assert found["first_load"] == answer["bytes_first_load"] <= LIMIT
+    assert found["fps"] > 0 and found["offline"] == answer["bytes_offline"]
+
+
+def test_the_page_starts_level_and_says_its_figures(exported: tuple[Path, dict[str, Any]], tiny: Path) -> None:
+    """Up is up, the camera a bit above the horizon; both renderers' PSNR and the frames a second are there at once."""
+    out, answer = exported
+    own = json.loads((tiny / "evaluation" / "metrics.json").read_text())["mean"]["psnr"]
+    with open_page((out / "index.html").as_uri()) as (page, errors):
+        wait_for(page, SETTLED)
+        pose = np.array(page.evaluate("window.dnr.then(page => page.view().c2w)"))
+        fps = page.locator("#fps")
+        assert fps.is_visible()
+        counted = re.fullmatch(r"([\d.]+) frames a second", fps.inner_text())
+        assert counted and float(counted[1]) > 0
+        table = page.evaluate("document.getElementById('figures').innerText")
+        assert errors == []
+    rows = dict(line.split("\t") for line in table.splitlines())
+    right, up, back = pose[:3, :3].T
+    assert abs(right[2]) < 1e-9 and up[2] > 0.8
+    assert 5 < math.degrees(math.asin(back[2])) < 30
+    assert rows["this page"].startswith(f"{answer['psnr']:.1f} dB PSNR over 2 ray-traced held-out views")
+    assert rows["workspace's renderer"].startswith(f"{own:.1f} dB PSNR")
+    assert answer["psnr_workspace"] == own
 
 
 def test_the_base_image_is_the_ray_traced_diffuse_light(tiny: Path) -> None:
@@ -123,6 +140,7 @@ def test_the_base_image_is_the_ray_traced_diffuse_light(tiny: Path) -> None:
     from dnrpipe.core.console import Console
     from dnrpipe.core.workspace import Workspace
     from dnrpipe.export.nerf import raytraced_views
+    from dnrpipe.export.page_data import pack_light
     from dnrpipe.export.surface import surface_maps
     from dnrpipe.export.web_model import web_views
     from dnrpipe.stages.base_images import base_path
@@ -130,7 +148,8 @@ def test_the_base_image_is_the_ray_traced_diffuse_light(tiny: Path) -> None:
 
     workspace = Workspace.open(tiny)
     views = raytraced_views(workspace)["test"]
-    data = web_views(workspace, views, "test", surface_maps(workspace, Console(quiet=True)))
+    maps = surface_maps(workspace, Console(quiet=True))
+    data = web_views(workspace, views, "test", maps, pack_light(maps, 1.0))
     assert data.tensors.base is not None
     for view, image in zip(views, data.tensors.base.numpy(), strict=True):
         channels, _ = read_exr(base_path(workspace, "test", view.name))
@@ -145,12 +164,13 @@ def test_what_lies_in_the_folder(exported: tuple[Path, dict[str, Any]]) -> None:
     out, answer = exported
     assert "MIT License" in (out / "ort" / "LICENSE").read_text()
     listed = (out / ".dnrpipe-export").read_text().splitlines()
-    assert listed[0] == "web" and sum((out / name).stat().st_size for name in listed[1:]) == answer["bytes"]
-    assert (out / "scene.glb").read_bytes()[:4] == b"glTF"
+    whole = {path.relative_to(out).as_posix(): path.stat().st_size for path in out.rglob("*") if path.is_file()}
+    assert listed[0] == "web" and {*listed[1:], ".dnrpipe-export"} == whole.keys()
+    assert answer["bytes"] == sum(whole.values()) - whole[".dnrpipe-export"]
+    assert answer["bytes_offline"] == whole["offline.js"]
+    assert sum(whole.values()) - whole["offline.js"] <= LIMIT
     page = (out / "index.html").read_text() + (out / "viewer.js").read_text()
     assert "https://" not in page and "http://" not in page  # nothing from elsewhere
-    scene = json.loads((out / "scene.json").read_text())
-    assert (out / "light-front.bin").stat().st_size == 8 * scene["texels"] ** 2
 
 
 def test_a_page_that_fails_is_an_error(tmp_path: Path) -> None:

@@ -70,7 +70,8 @@ MADE = {"view_dir": 3, "camera_normal": 3}
 EXAMPLE = (48, 40)
 """Height and width that the graph is traced with; the file has none."""
 MERGED_VALUES = 16 * 128**2
-"""Pyramids whose finest level has no more are stored as one texture: four times the memory, one look-up a pixel."""
+"""Pyramids whose finest level has no more are merged where the file is loaded, as that part of the graph is constant:
+four times the memory, one look-up a pixel."""
 
 
 def input_names(settings: ModelSettings) -> list[str]:
@@ -167,12 +168,12 @@ class Graph(nn.Module):
         self.near, self.range = frame.near, frame.far - frame.near
         self.display = _GatheredDisplay(frame, folder)
         self.names = input_names(model.settings)
-        self.tables: dict[int, Tensor] = {}
-        """Pyramids as one texture [1, C, height, width] each, whose outermost texel centres lie on the border."""
+        self.knots: dict[int, Tensor] = {}
+        """Where small pyramids are bilinear in between (see `TexturePyramid.merged`): [1, height, width, 2] each."""
         for part in model.modules():
             if isinstance(part, TexturePyramid) and part.mergeable and part.levels[0].numel() <= MERGED_VALUES:
-                table, width, height = part.merged()
-                self.tables[id(part)] = table.view(1, height, width, -1).permute(0, 3, 1, 2).contiguous()
+                y, x = (torch.linspace(-1.0, 1.0, 2 * side + 1) for side in part.levels[0].shape[-2:])
+                self.knots[id(part)] = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)[None]
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         batch = self.batch(dict(zip(self.names, inputs, strict=True)))
@@ -251,9 +252,12 @@ class Graph(nn.Module):
     def _look_up(self, pyramid: TexturePyramid, place: Tensor) -> Tensor:
         """Coordinates [1, 2, H, W] in [-1, 1] -> features [1, C, H, W]."""
         grid = place.permute(0, 2, 3, 1)
-        if id(pyramid) in self.tables:
-            whole = self.tables[id(pyramid)]
-            return F.grid_sample(whole, grid, mode="bilinear", padding_mode="border", align_corners=True)
+        if id(pyramid) in self.knots:
+            whole = pyramid.look_up(self.knots[id(pyramid)])
+            _, height, width, _ = self.knots[id(pyramid)].shape
+            # The outermost knots lie on the border. Aligned by hand: onnxruntime's fast kernel aligns no corners.
+            scale = torch.tensor([(width - 1) / width, (height - 1) / height])
+            return F.grid_sample(whole, grid * scale, mode="bilinear", padding_mode="zeros", align_corners=False)
         return pyramid.look_up(grid)
 
 

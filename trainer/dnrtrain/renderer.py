@@ -139,6 +139,8 @@ def add_pointwise(total: Tensor, layer: nn.Conv2d, maps: Tensor) -> Tensor:
     As a product of matrices it reads the maps as they lie, plane by plane: a convolution turns them around first,
     which takes three times as long as its arithmetic.
     """
+    if torch.jit.is_tracing():  # other runtimes have no channels-last memory
+        return total + layer(maps)
     count, channels, height, width = total.shape
     weights = layer.weight.flatten(1).t().expand(count, -1, -1)
     rows = total.permute(0, 2, 3, 1).reshape(count, height * width, channels)
@@ -148,6 +150,8 @@ def add_pointwise(total: Tensor, layer: nn.Conv2d, maps: Tensor) -> Tensor:
 
 def planes(layer: nn.Conv2d, x: Tensor) -> Tensor:
     """``layer(x)`` for a 1×1 convolution of channels-last ``x``, channel by channel in memory: they part ways now."""
+    if torch.jit.is_tracing():
+        return layer(x)
     assert layer.bias is not None
     count, channels, height, width = x.shape
     rows = x.permute(0, 2, 3, 1).reshape(count, height * width, channels)
@@ -157,14 +161,10 @@ def planes(layer: nn.Conv2d, x: Tensor) -> Tensor:
 
 def pad_to_multiple(x: Tensor, multiple: int) -> Tensor:
     """Replicate the right and bottom border until both sides are multiples."""
-    if torch.jit.is_tracing():  # an exported graph takes pictures of any size: how much is missing is part of it
-        for axis in (-2, -1):
-            side = x.shape[axis]
-            last = torch.arange(side + -side % multiple, device=x.device).clamp(max=side - 1)
-            x = x.index_select(axis, last)
-        return x
     right, bottom = -x.shape[-1] % multiple, -x.shape[-2] % multiple
-    return F.pad(x, (0, right, 0, bottom), mode="replicate") if right or bottom else x
+    # An exported graph takes pictures of any size: how much is missing is part of it.
+    missing = torch.jit.is_tracing() or right or bottom
+    return F.pad(x, (0, right, 0, bottom), mode="replicate") if missing else x
 
 
 def build_renderer(groups: Sequence[int], settings: ModelSettings) -> UNet | HalfUNet | PixelMLP:

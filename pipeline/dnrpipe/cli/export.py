@@ -146,7 +146,7 @@ def export_web(out: Path | None, epochs: int | None, check: bool, **options: Any
 
     WebGL2 draws G-buffer and baked light, onnxruntime-web (fetched from npm once) runs a network that is trained for
     them on the ray-traced views: a browser has no ray tracer for the base image of the workspace's own. Open index.html
-    from disk, or put the folder on any static server: WebGPU is used there where the browser has it.
+    from disk, or put the folder on any static server, which needs no offline.js.
 
     \b
     Examples:
@@ -158,14 +158,22 @@ def export_web(out: Path | None, epochs: int | None, check: bool, **options: Any
 
     workspace, console = _opened(**options)
     answer = export(workspace, out or Path(f"{workspace.root.stem}-web"), console, epochs=epochs, check=check)
+    own = answer["psnr_workspace"]
     console.say(
         f"{answer['folder']}/index.html: {answer['psnr']:.2f} dB over {answer['test_views']} held-out views"
-        f" (baked light alone {answer['psnr_base']:.2f} dB)"
+        f" ({answer['psnr_unpacked']:.2f} before weights and light were packed, baked light alone"
+        f" {answer['psnr_base']:.2f}" + (")" if own is None else f", the workspace's own renderer {own:.2f})")
+    )
+    offline, first = answer["bytes_offline"] / 1e6, answer["bytes_first_load"] / 1e6
+    console.say(
+        f"{answer['bytes'] / 1e6 - offline:.1f} MB, {first:.1f} MB to load from a server; {offline:.1f} MB more in"
+        " offline.js, for pages opened from disk"
     )
     if check:
         found = answer["check"]
         console.say(
             f"in Chromium ({found['provider']}, {found['gl']}): {found['psnr_torch']:.1f} dB against torch on the same"
-            f" inputs, {found['psnr_truth']:.2f} dB against ray tracing; {found['frame_ms']:.0f} ms a frame"
+            f" inputs, {found['psnr_truth']:.2f} dB against ray tracing; {found['side']}²: {found['fps']:.1f} frames a"
+            f" second, {found['frame_ms']:.0f} ms a frame, {found['network_ms']:.0f} of them the network"
         )
     console.result(answer)

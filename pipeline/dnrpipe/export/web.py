@@ -1,12 +1,14 @@
 """`dnrpipe export-web`: a folder whose page renders the neural view in a browser, without a server.
 
-index.html, viewer.js   the page
-scene.json              cameras, sizes, display figures
-scene.glb               meshes with atlas coordinates (see `gltf`)
-light-front.bin, -back  what surfaces send back diffusely: RGBA float16 [n, n, 4], row 0 at V = 0, A = opacity
-model.onnx              the network (see `web_model`)
-ort/                    onnxruntime-web and its licence
-offline.js              all of the above once more as text: pages opened from disk may not read files
+index.html, viewer.js    the page
+scene.json               where the camera begins, what the packed files mean, figures of quality
+scene.bin.gz             meshes (see `page_data`)
+light-front.webp, -back  what surfaces send back diffusely (see `page_data`)
+model.onnx.gz            the network (see `web_model`)
+ort/                     onnxruntime-web for WebAssembly, and its licence
+offline.js               all of the above once more as text: pages opened from disk may not read files
+
+The page itself unpacks what ends in .gz: any static server will do, whatever it knows of compression.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import math
 import shutil
 import subprocess
 import tarfile
@@ -24,42 +27,41 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from dnrtrain import onnx_export
-from dnrtrain.atomic import atomic_path, write_json, write_text
+from dnrtrain.atomic import atomic_path, write_text
 from dnrtrain.contract import View
 from dnrtrain.metrics import psnr
-from dnrtrain.model import DNR, compose, render_views
+from dnrtrain.model import DNR, base_picture, render_views
 from dnrtrain.records import read
 
 from .. import __version__
 from ..core.console import Console
 from ..core.errors import UserError
 from ..core.machine import cache_root
-from ..core.scene_files import read_frame, read_selection
+from ..core.scene_files import read_frame, read_summary
 from ..core.workspace import Workspace
 from ..stages.records import METRICS, Metrics
 from ..stages.session import resolve_settings
 from .browser import require_chromium
 from .folder import claim, finish
-from .gltf import glb
 from .meshes import read_meshes
 from .nerf import raytraced_views
+from .page_data import PageLight, halved, pack_light, pack_meshes, packed, round_weights
 from .surface import SurfaceMaps, read_baked_light, surface_maps
-from .web_model import check_page, half, train, web_views
+from .web_model import check_page, train, web_views
 
 TRAINING = ".training"
-"""Of the export's folder: the checkpoint, so that an interrupted export goes on where it stopped."""
-EMBEDDED = ("scene.glb", "light-front.bin", "light-back.bin", "model.onnx")
+"""Of the export's folder, until it is done: the checkpoint. An interrupted export goes on where it stopped."""
+OFFLINE = "offline.js"
+LICENCE = "ort/LICENSE"
 ORT_VERSION = "1.30.0"
 ORT_SHA256 = "d2228df7e4616bc3348bf504ee888f3bec43789a273f0a63f3e68d203ce3bf71"
-ORT_FILES = (
-    "ort.wasm.bundle.min.mjs",
-    "ort-wasm-simd-threaded.wasm",
-    "ort.webgpu.bundle.min.mjs",
-    "ort-wasm-simd-threaded.asyncify.wasm",
-)
+ORT_SCRIPT = "ort.wasm.bundle.min.mjs"
+ORT_BINARY = "ort-wasm-simd-threaded.wasm"
+"""The smallest one in the package; those that know WebGPU, too, have 17 to 28 MB instead of 14."""
+START_ELEVATION = 20.0
+"""Degrees above the horizon where the page's camera begins, if training views stand there."""
 
 
 def export_web(
@@ -68,7 +70,10 @@ def export_web(
     """Train the page's network, write the folder, and measure the network on the held-out views (by torch).
 
     out: new, or an earlier export of the same kind. epochs: of training; None: 40, more for few views. check: also
-    open the page in a browser. Returns folder, bytes, the figures of `held_out`, with `check` those of `check_page`.
+    open the page in a browser.
+
+    Returns folder, the bytes of `folder_sizes`, the figures of `held_out`, `psnr_unpacked` (the same network before
+    weights and light were packed, dB), and with `check` those of `check_page`.
 
     Raises UserError: no baked light, no ray-traced views, no npm, or a folder that is not ours to write; with `check`
     also no Chromium.
@@ -76,82 +81,111 @@ def export_web(
     settings = resolve_settings(workspace, {}, None)
     views = raytraced_views(workspace)
     read_baked_light(workspace)
-    meshes = read_meshes(workspace.scene)
+    meshes, records = pack_meshes(read_meshes(workspace.scene))
     vendored = runtime()
     if check:
         require_chromium()
     claim(out, "web")
+    frame, training = read_frame(workspace), out / TRAINING
     maps = surface_maps(workspace, console)
-    model = train(workspace, settings, console, views["train"], maps, out / TRAINING, epochs)
-    quality = held_out(workspace, model, views["test"], maps)
-    front, back = half(maps.radiance)
-    contents = {
-        "scene.glb": glb(meshes, None),
-        "light-front.bin": front.tobytes(),
-        "light-back.bin": back.tobytes() if maps.thin else b"",
-        **{name: (files("dnrpipe.export") / "page" / name).read_bytes() for name in ("index.html", "viewer.js")},
-        **{f"ort/{name}": (vendored / name).read_bytes() for name in (*ORT_FILES, "LICENSE")},
-    }
-    for name, content in contents.items():
-        with atomic_path(out / name) as temporary:
-            temporary.write_bytes(content)
-    frame, scene = read_frame(workspace), _scene(workspace, views, maps, quality)
-    onnx_export.export_onnx(out / "model.onnx", model, frame, workspace.scene, {"dnrpipe": __version__})
-    write_json(out / "scene.json", scene)
-    embedded = (*EMBEDDED, *(f"ort/{name}" for name in ORT_FILES[:2]))
-    encoded = {name: base64.b64encode((out / name).read_bytes()).decode("ascii") for name in embedded}
-    write_text(out / "offline.js", f"window.DNR_OFFLINE = {json.dumps({'scene': scene, 'files': encoded})};\n")
-    written = [out / name for name in (*contents, "model.onnx", "scene.json", "offline.js")]
-    finish(out, "web", written)
-    answer = {"folder": str(out), "bytes": sum(path.stat().st_size for path in written), **quality}
-    if check:
-        data = web_views(workspace, views["test"], "test", maps)
-        answer["check"] = check_page(out, views["test"], data, model, console)
-    return answer
-
-
-def held_out(workspace: Workspace, model: DNR, views: Sequence[View], maps: SurfaceMaps) -> dict[str, Any]:
-    """Mean PSNR of the page's network and of its base image on the held-out views, over white, dB; by torch."""
-    data = web_views(workspace, views, "test", maps)
-    tensors = data.tensors
-    assert tensors.target is not None and tensors.base is not None and tensors.display is not None
-    with torch.no_grad():
-        shown = render_views(model, data)
-        base = compose(tensors.display(tensors.base), tensors.coverage)
-    own = workspace.evaluation / METRICS
-    return {
-        "test_views": len(views),
-        "psnr": float(psnr(shown, tensors.target).mean()),
-        "psnr_base": float(psnr(base, tensors.target).mean()),
-        "psnr_workspace": read(own, Metrics).mean["psnr"] if own.is_file() else None,
-    }
-
-
-def _scene(workspace: Workspace, views: dict[str, list[View]], maps: SurfaceMaps, quality: dict[str, Any]) -> Any:
-    frame = read_frame(workspace)
-    first = views["train"][0]
-    return {
+    light = pack_light(maps, 2.0**frame.exposure)
+    model = train(workspace, settings, console, views["train"], maps, light, training, epochs)
+    unpacked = held_out(workspace, model, views["test"], maps, None)["psnr"]
+    round_weights(model)
+    quality = held_out(workspace, model, views["test"], maps, light)
+    onnx_export.export_onnx(training / "model.onnx", model, frame, workspace.scene, {"dnrpipe": __version__})
+    scene = {
         "name": workspace.root.stem,
         "dnrpipe": __version__,
         "center": list(frame.center),
         "radius": frame.radius,
-        "texels": maps.radiance.shape[1],
+        "size": [views["train"][0].width, views["train"][0].height],
+        "lens": [views["train"][0].fl_x, views["train"][0].fl_y],
+        "start": start(workspace, views["train"]),
+        "light": {"curve": light.curve, "range": light.range},
+        "cutouts": light.cutouts,
         "thin": maps.thin,
-        "size": [first.width, first.height],
+        "meshes": records,
         "quality": quality,
-        "start": first.model_dump(mode="json"),
-        "distance": float(np.median([np.linalg.norm(view.position - frame.center) for view in views["train"]])),
-        "trained_on": len(read_selection(workspace).views),
+    }
+    loaded = {
+        "scene.bin.gz": packed(meshes),
+        **dict(zip(("light-front.webp", "light-back.webp"), light.files, strict=False)),
+        "model.onnx.gz": packed(halved((training / "model.onnx").read_bytes())),
+        f"ort/{ORT_SCRIPT}": (vendored / ORT_SCRIPT).read_bytes(),
+        f"ort/{ORT_BINARY}.gz": packed((vendored / ORT_BINARY).read_bytes()),
+    }
+    encoded = {name: base64.b64encode(content).decode("ascii") for name, content in loaded.items()}
+    contents = {
+        **{name: (files("dnrpipe.export") / "page" / name).read_bytes() for name in ("index.html", "viewer.js")},
+        "scene.json": json.dumps(scene, separators=(",", ":"), allow_nan=False).encode(),
+        **loaded,
+        LICENCE: (vendored / "LICENSE").read_bytes(),
+        OFFLINE: f"window.DNR_OFFLINE = {json.dumps({'scene': scene, 'files': encoded})};\n".encode(),
+    }
+    for name, content in contents.items():
+        with atomic_path(out / name) as temporary:
+            temporary.write_bytes(content)
+    finish(out, "web", [out / name for name in contents])
+    answer = {"folder": str(out), **folder_sizes(contents), **quality, "psnr_unpacked": unpacked}
+    if check:
+        data = web_views(workspace, views["test"], "test", maps, light)
+        answer["check"] = check_page(out, views["test"], data, model, console)
+    shutil.rmtree(training)
+    return answer
+
+
+def folder_sizes(contents: dict[str, bytes]) -> dict[str, int]:
+    """Bytes of all files, of those that only a page opened from disk reads, and of those that a server sends."""
+    whole = sum(map(len, contents.values()))
+    offline = len(contents[OFFLINE])
+    return {"bytes": whole, "bytes_offline": offline, "bytes_first_load": whole - offline - len(contents[LICENCE])}
+
+
+def held_out(
+    workspace: Workspace, model: DNR, views: Sequence[View], maps: SurfaceMaps, light: PageLight | None
+) -> dict[str, Any]:
+    """Mean PSNR of the page's network and of its base image on the held-out views, over white, dB; by torch.
+
+    Also `psnr_workspace`: of the workspace's own renderer by ``evaluation/metrics.json``; None without that file.
+    """
+    data = web_views(workspace, views, "test", maps, light)
+    target = data.tensors.target
+    assert target is not None
+    own = workspace.evaluation / METRICS
+    return {
+        "test_views": len(views),
+        "psnr": float(psnr(render_views(model, data), target).mean()),
+        "psnr_base": float(psnr(base_picture(data.tensors), target).mean()),
+        "psnr_workspace": read(own, Metrics).mean["psnr"] if own.is_file() else None,
+    }
+
+
+def start(workspace: Workspace, views: Sequence[View]) -> dict[str, float]:
+    """Where the page's camera begins on its orbit: azimuth and elevation, radians; distance, scene units.
+
+    A bit above the horizon, as far as the network was trained for that, and on the side of the scene's own camera.
+    """
+    center = np.array(read_frame(workspace).center)
+    trained = np.stack([view.position for view in views]) - center
+    distance = np.linalg.norm(trained, axis=1)
+    elevation = np.arcsin(trained[:, 2] / distance)
+    own = [camera for camera in read_summary(workspace.scene).cameras if camera.active]
+    aside = np.array(own[0].c2w)[:3, 3] - center if own else trained[0]
+    return {
+        "azimuth": math.atan2(aside[1], aside[0]),
+        "elevation": float(np.clip(math.radians(START_ELEVATION), elevation.min(), elevation.max())),
+        "distance": float(np.median(distance)),
     }
 
 
 def runtime() -> Path:
-    """The folder of onnxruntime-web (ORT_FILES, ``LICENSE``) in the cache; fetched by npm the first time, and checked.
+    """The folder of onnxruntime-web (script, binary, ``LICENSE``) in the cache; fetched by npm once, and checked.
 
     Raises UserError: no npm, no network, or other bytes than expected.
     """
     folder = cache_root() / f"onnxruntime-web-{ORT_VERSION}"
-    if all((folder / name).is_file() for name in (*ORT_FILES, "LICENSE")):
+    if all((folder / name).is_file() for name in (ORT_SCRIPT, ORT_BINARY, "LICENSE")):
         return folder
     npm = shutil.which("npm")
     if npm is None:
@@ -167,7 +201,7 @@ def runtime() -> Path:
         if found != ORT_SHA256:
             raise UserError(f"onnxruntime-web {ORT_VERSION} from npm has other bytes than expected (sha256 {found})")
         with tarfile.open(archive) as content:
-            for name in ORT_FILES:
+            for name in (ORT_SCRIPT, ORT_BINARY):
                 member = content.extractfile(f"package/dist/{name}")
                 assert member is not None
                 with atomic_path(folder / name) as temporary:

@@ -1,73 +1,65 @@
 // The neural view: WebGL2 draws what the network sees (G-buffer and baked light), onnxruntime-web runs the network.
-// World axes are the .blend's (Z up); scene.glb is Y up: a point (x, y, z) there is (x, -z, y) here.
+// World axes are the .blend's: right-handed, Z up.
 "use strict";
 
-const SUPERSAMPLING = 4; // per side, for the coverage of silhouettes
+const FINER = 3; // samples along a pixel's side; odd: the middle one is what the pixel shows, all are its coverage
+const MEASURED = 8; // frames that are drawn after a change, so that frames a second are known while nothing moves
 const RECENT = 30; // frames over which times are averaged
 
 const VERTEX = `#version 300 es
-layout(location = 0) in vec3 position;
-layout(location = 1) in vec3 normal;
+layout(location = 0) in vec3 position; // of the mesh's box, 0 to 1
+layout(location = 1) in vec3 normal; // of any length
 layout(location = 2) in vec2 atlas;
 uniform mat4 toClip;
-uniform mat4 placed;
 uniform mat3 placedNormal;
-out vec3 worldPosition, worldNormal;
+out vec3 worldNormal;
 out vec2 place;
 void main() {
-  vec3 p = vec3(position.x, -position.z, position.y);
-  vec4 world = placed * vec4(p, 1.0);
-  worldPosition = world.xyz;
-  worldNormal = placedNormal * vec3(normal.x, -normal.z, normal.y);
-  place = vec2(atlas.x, 1.0 - atlas.y);
-  gl_Position = toClip * world;
+  worldNormal = placedNormal * normal;
+  place = atlas;
+  gl_Position = toClip * vec4(position, 1.0);
 }`;
 
-const SURFACE = `#version 300 es
-precision highp float;
-uniform sampler2D front, back;
-uniform bool thin;
-uniform vec3 eye;
-in vec3 worldPosition, worldNormal;
-in vec2 place;
-layout(location = 0) out vec4 base;
-layout(location = 1) out vec4 normal;
-layout(location = 2) out vec4 uv;
-void main() {
-  vec4 lit = texture(front, place);
-  if (lit.a < 0.5) discard;
-  if (thin && !gl_FrontFacing) lit.rgb = texture(back, place).rgb;
-  vec3 n = normalize(worldNormal);
-  if (dot(n, eye - worldPosition) < 0.0) n = -n;
-  base = vec4(lit.rgb, 1.0);
-  normal = vec4(n, 1.0);
-  uv = vec4(place, 0.0, 1.0);
-}`;
-
-const SILHOUETTE = `#version 300 es
+// Samples are many, so they are small: place in the atlas, 16 bits each; normal, 10 bits each; 1: a front is seen, 2: a
+// back, 0: nothing. A shader that may discard tests depth late, so it says so only where the scene has cut-outs.
+const SAMPLE = (cutouts) => `#version 300 es
 precision highp float;
 uniform sampler2D front;
+in vec3 worldNormal;
 in vec2 place;
-in vec3 worldPosition, worldNormal;
-out vec4 covered;
+out uvec2 seen;
 void main() {
-  if (texture(front, place).a < 0.5) discard;
-  covered = vec4(1.0);
+  ${cutouts ? "if (texture(front, place).a < 0.5) discard;" : ""}
+  uvec3 n = uvec3(512.0 + 511.0 * normalize(worldNormal) + 0.5);
+  seen = uvec2(packUnorm2x16(place), n.x | n.y << 10 | n.z << 20 | (gl_FrontFacing ? 1u : 2u) << 30);
 }`;
 
 const WHOLE = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0), 0.0, 1.0); }`;
 
-const AVERAGE = `#version 300 es
+const PIXEL = `#version 300 es
 precision highp float;
-uniform sampler2D fine;
-out vec4 mean;
+uniform highp usampler2D samples;
+uniform sampler2D front, back; // radiance as log(1 + curve · x) over range
+uniform float curve, range;
+layout(location = 0) out vec4 base; // and whether there is a surface
+layout(location = 1) out vec4 normal; // and coverage
+layout(location = 2) out vec4 uv;
 void main() {
-  ivec2 corner = ivec2(gl_FragCoord.xy) * ${SUPERSAMPLING};
-  float sum = 0.0;
-  for (int y = 0; y < ${SUPERSAMPLING}; y++)
-    for (int x = 0; x < ${SUPERSAMPLING}; x++) sum += texelFetch(fine, corner + ivec2(x, y), 0).r;
-  mean = vec4(sum / float(${SUPERSAMPLING * SUPERSAMPLING}));
+  ivec2 corner = ${FINER} * ivec2(gl_FragCoord.xy);
+  float covered = 0.0;
+  for (int y = 0; y < ${FINER}; y++)
+    for (int x = 0; x < ${FINER}; x++) covered += texelFetch(samples, corner + ivec2(x, y), 0).y == 0u ? 0.0 : 1.0;
+  covered /= ${FINER * FINER}.0;
+  base = uv = vec4(0.0);
+  normal = vec4(0.0, 0.0, 0.0, covered);
+  uvec4 seen = texelFetch(samples, corner + ${(FINER - 1) / 2}, 0);
+  if (seen.y == 0u) return;
+  vec2 place = unpackUnorm2x16(seen.x);
+  vec3 code = seen.y >> 30 == 2u ? textureLod(back, place, 0.0).rgb : textureLod(front, place, 0.0).rgb;
+  base = vec4((exp(range * code) - 1.0) / curve, 1.0);
+  normal.xyz = normalize(vec3(uvec3(seen.y, seen.y >> 10, seen.y >> 20) & 1023u) - 512.0);
+  uv = vec4(place, 0.0, 1.0);
 }`;
 
 // ---- files -------------------------------------------------------------------------------------------------------
@@ -87,6 +79,19 @@ async function file(name) {
   return new Uint8Array(await answer.arrayBuffer());
 }
 
+// NAME.gz, unpacked. Some servers announce it as compressed; then the browser has unpacked it already.
+async function unpacked(name) {
+  const bytes = await file(`${name}.gz`);
+  if (bytes[0] !== 0x1f || bytes[1] !== 0x8b) return bytes;
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+  return new Uint8Array(await new Response(stream).arrayBuffer());
+}
+
+async function picture(name) {
+  const blob = new Blob([await file(name)], { type: "image/webp" });
+  return createImageBitmap(blob, { premultiplyAlpha: "none", colorSpaceConversion: "none" });
+}
+
 function script(name) {
   return new Promise((resolve, reject) => {
     const element = document.createElement("script");
@@ -99,34 +104,36 @@ function script(name) {
 
 // ---- meshes ------------------------------------------------------------------------------------------------------
 
-function readGlb(bytes) {
-  const view = new DataView(bytes.buffer, bytes.byteOffset);
-  const length = view.getUint32(12, true);
-  const document_ = JSON.parse(new TextDecoder().decode(bytes.subarray(20, 20 + length)));
-  const body = bytes.subarray(28 + length);
-  const content = (index) => {
-    const accessor = document_.accessors[index], part = document_.bufferViews[accessor.bufferView];
-    return { data: body.slice(part.byteOffset, part.byteOffset + part.byteLength), count: accessor.count };
+// The arrays of each mesh, as page_data.py packs them; indices are differences, which compress better.
+function readMeshes(bytes, meshes) {
+  let at = bytes.byteOffset;
+  const take = (Kind, count) => {
+    const values = new Kind(bytes.buffer, at, count);
+    at += values.byteLength;
+    return values;
   };
-  const meshes = document_.meshes.map((mesh) => {
-    const primitive = mesh.primitives[0], a = primitive.attributes;
-    return {
-      arrays: [content(a.POSITION), content(a.NORMAL), content(a.TEXCOORD_0)],
-      indices: content(primitive.indices),
-    };
+  return meshes.map(({ vertices, triangles, ...mesh }) => {
+    const indices = take(Int32Array, 3 * triangles);
+    for (let i = 1; i < indices.length; i++) indices[i] += indices[i - 1];
+    const [positions, normals] = [take(Uint16Array, 3 * vertices), take(Int16Array, 3 * vertices)];
+    return { ...mesh, indices, positions, normals, atlas: take(Uint16Array, 2 * vertices) };
   });
-  return document_.nodes.map((node) => ({ mesh: meshes[node.mesh], matrix: node.matrix || null }));
 }
 
-// Column-major 4x4 from glTF's axes to ours: C M C^-1 with C (x, y, z) -> (x, -z, y).
-function worldMatrix(m) {
-  if (!m) return [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1];
-  const at = (r, c) => m[c * 4 + r], from = [0, 2, 1, 3], sign = [1, -1, 1, 1], result = [];
-  for (let c = 0; c < 4; c++) for (let r = 0; r < 4; r++) result.push(sign[r] * sign[c] * at(from[r], from[c]));
+// Matrices are 4x4, column-major.
+function product(a, b) {
+  const result = new Array(16).fill(0);
+  for (let c = 0; c < 4; c++)
+    for (let r = 0; r < 4; r++) for (let k = 0; k < 4; k++) result[c * 4 + r] += a[k * 4 + r] * b[c * 4 + k];
   return result;
 }
 
-// Inverse transpose of the upper 3x3, column-major: the matrix of cofactors, up to scale.
+// The unit cube -> a mesh's box.
+function boxMatrix(low, extent) {
+  return [extent[0], 0, 0, 0, 0, extent[1], 0, 0, 0, 0, extent[2], 0, ...low, 1];
+}
+
+// Inverse transpose of the upper 3x3: the matrix of cofactors, up to scale.
 function normalMatrix(m) {
   const a = (r, c) => m[c * 4 + r], result = [];
   for (let c = 0; c < 3; c++)
@@ -141,7 +148,7 @@ function normalMatrix(m) {
 // ---- WebGL2 ------------------------------------------------------------------------------------------------------
 
 class Raster {
-  constructor(nodes, scene, front, back) {
+  constructor(meshes, scene, front, back) {
     const canvas = document.createElement("canvas");
     const gl = canvas.getContext("webgl2", { antialias: false, depth: false, powerPreference: "high-performance" });
     if (!gl) throw new Error("this browser has no WebGL2");
@@ -150,18 +157,12 @@ class Raster {
     this.scene = scene;
     const info = gl.getExtension("WEBGL_debug_renderer_info");
     this.name = gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
-    this.programs = {
-      surface: this.program(VERTEX, SURFACE),
-      silhouette: this.program(VERTEX, SILHOUETTE),
-      average: this.program(WHOLE, AVERAGE),
-    };
-    this.front = this.light(front, scene.texels);
-    this.back = scene.thin ? this.light(back, scene.texels) : this.front;
-    const buffers = new Map();
-    this.nodes = nodes.map(({ mesh, matrix }) => {
-      if (!buffers.has(mesh)) buffers.set(mesh, this.vertices(mesh));
-      const placed = worldMatrix(matrix);
-      return { ...buffers.get(mesh), placed, normal: normalMatrix(placed) };
+    this.programs = { sample: this.program(VERTEX, SAMPLE(scene.cutouts)), pixel: this.program(WHOLE, PIXEL) };
+    this.front = this.light(front);
+    this.back = back ? this.light(back) : this.front;
+    this.nodes = meshes.flatMap((mesh) => {
+      const shared = this.vertices(mesh), box = boxMatrix(mesh.low, mesh.extent);
+      return mesh.placements.map((m) => ({ ...shared, placed: product(m, box), normal: normalMatrix(m) }));
     });
     this.empty = gl.createVertexArray();
     this.size = "";
@@ -181,12 +182,13 @@ class Raster {
     return program;
   }
 
-  light(bytes, texels) {
+  light(image) {
     const gl = this.gl, texture = gl.createTexture();
-    if (texels > gl.getParameter(gl.MAX_TEXTURE_SIZE)) throw new Error(`textures of ${texels} texels are too large here`);
+    if (image.width > gl.getParameter(gl.MAX_TEXTURE_SIZE))
+      throw new Error(`textures of ${image.width} texels are too large here`);
     gl.bindTexture(gl.TEXTURE_2D, texture);
-    const values = new Uint16Array(bytes.buffer, bytes.byteOffset, bytes.byteLength / 2);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA16F, texels, texels, 0, gl.RGBA, gl.HALF_FLOAT, values);
+    gl.pixelStorei(gl.UNPACK_COLORSPACE_CONVERSION_WEBGL, gl.NONE);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE, image);
     for (const [key, value] of [
       [gl.TEXTURE_MIN_FILTER, gl.LINEAR], [gl.TEXTURE_MAG_FILTER, gl.LINEAR],
       [gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE], [gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE],
@@ -197,16 +199,20 @@ class Raster {
   vertices(mesh) {
     const gl = this.gl, array = gl.createVertexArray();
     gl.bindVertexArray(array);
-    mesh.arrays.forEach(({ data }, index) => {
+    [
+      [mesh.positions, 3, gl.UNSIGNED_SHORT, true],
+      [mesh.normals, 3, gl.SHORT, false],
+      [mesh.atlas, 2, gl.UNSIGNED_SHORT, true],
+    ].forEach(([values, count, kind, normalised], index) => {
       gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-      gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW);
+      gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
       gl.enableVertexAttribArray(index);
-      gl.vertexAttribPointer(index, index === 2 ? 2 : 3, gl.FLOAT, false, 0, 0);
+      gl.vertexAttribPointer(index, count, kind, normalised, 0, 0);
     });
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, mesh.indices.data, gl.STATIC_DRAW);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, mesh.indices, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
-    return { array, count: mesh.indices.count };
+    return { array, count: mesh.indices.length };
   }
 
   target(width, height, formats, depth) {
@@ -237,105 +243,122 @@ class Raster {
   resize(width, height) {
     if (this.size === `${width}x${height}`) return;
     const gl = this.gl;
-    for (const old of [this.sharp, this.fine, this.coarse].filter(Boolean)) {
+    for (const old of [this.fine, this.pixels].filter(Boolean)) {
       old.textures.forEach((texture) => gl.deleteTexture(texture));
       gl.deleteRenderbuffer(old.depths);
       gl.deleteFramebuffer(old.buffer);
     }
-    this.sharp = this.target(width, height, [gl.RGBA32F, gl.RGBA32F, gl.RGBA32F], true);
-    this.fine = this.target(SUPERSAMPLING * width, SUPERSAMPLING * height, [gl.R8], true);
-    this.coarse = this.target(width, height, [gl.RGBA32F], false);
+    (this.copies || []).forEach((copy) => gl.deleteBuffer(copy));
+    this.fine = this.target(FINER * width, FINER * height, [gl.RG32UI], true);
+    this.pixels = this.target(width, height, [gl.RGBA32F, gl.RGBA32F, gl.RGBA32F], false);
+    this.copies = this.pixels.textures.map(() => {
+      const copy = gl.createBuffer();
+      gl.bindBuffer(gl.PIXEL_PACK_BUFFER, copy);
+      gl.bufferData(gl.PIXEL_PACK_BUFFER, 16 * width * height, gl.STREAM_READ);
+      return copy;
+    });
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
     this.size = `${width}x${height}`;
   }
 
-  draw(program, target, view) {
-    const gl = this.gl, at = (name) => gl.getUniformLocation(program, name);
+  use(program, target, textures) {
+    const gl = this.gl;
     gl.bindFramebuffer(gl.FRAMEBUFFER, target.buffer);
     gl.viewport(0, 0, target.width, target.height);
-    gl.enable(gl.DEPTH_TEST);
-    target.textures.forEach((_, index) => gl.clearBufferfv(gl.COLOR, index, [0, 0, 0, 0]));
-    gl.clearBufferfv(gl.DEPTH, 0, [1]);
     gl.useProgram(program);
-    gl.uniformMatrix4fv(at("toClip"), false, clipMatrix(view, this.scene));
-    gl.uniform3fv(at("eye"), [view.c2w[0][3], view.c2w[1][3], view.c2w[2][3]]);
-    gl.uniform1i(at("thin"), this.scene.thin ? 1 : 0);
-    [["front", this.front], ["back", this.back]].forEach(([name, texture], unit) => {
+    Object.entries(textures).forEach(([name, texture], unit) => {
       gl.activeTexture(gl.TEXTURE0 + unit);
       gl.bindTexture(gl.TEXTURE_2D, texture);
-      gl.uniform1i(at(name), unit);
+      gl.uniform1i(gl.getUniformLocation(program, name), unit);
     });
+    return (name) => gl.getUniformLocation(program, name);
+  }
+
+  // Starts to draw a view. The GPU works on while the network computes the frame before; one view at a time.
+  begin(view) {
+    const gl = this.gl, { width, height } = view, clip = clipMatrix(view, this.scene);
+    this.resize(width, height);
+    let at = this.use(this.programs.sample, this.fine, { front: this.front });
+    const toClip = at("toClip"), placedNormal = at("placedNormal");
+    gl.enable(gl.DEPTH_TEST);
+    gl.clearBufferuiv(gl.COLOR, 0, [0, 0, 0, 0]);
+    gl.clearBufferfv(gl.DEPTH, 0, [1]);
     for (const node of this.nodes) {
-      gl.uniformMatrix4fv(at("placed"), false, node.placed);
-      gl.uniformMatrix3fv(at("placedNormal"), false, node.normal);
+      gl.uniformMatrix4fv(toClip, false, product(clip, node.placed));
+      gl.uniformMatrix3fv(placedNormal, false, node.normal);
       gl.bindVertexArray(node.array);
       gl.drawElements(gl.TRIANGLES, node.count, gl.UNSIGNED_INT, 0);
     }
-    gl.bindVertexArray(null);
-  }
-
-  // The network's inputs for a view, as Float32Arrays [C, H, W] by name, row 0 at the top.
-  inputs(view) {
-    const gl = this.gl, { width, height } = view;
-    this.resize(width, height);
-    this.draw(this.programs.surface, this.sharp, view);
-    this.draw(this.programs.silhouette, this.fine, view);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, this.coarse.buffer);
-    gl.viewport(0, 0, width, height);
+    const textures = { samples: this.fine.textures[0], front: this.front, back: this.back };
+    at = this.use(this.programs.pixel, this.pixels, textures);
     gl.disable(gl.DEPTH_TEST);
-    gl.useProgram(this.programs.average);
-    gl.activeTexture(gl.TEXTURE0);
-    gl.bindTexture(gl.TEXTURE_2D, this.fine.textures[0]);
-    gl.uniform1i(gl.getUniformLocation(this.programs.average, "fine"), 0);
+    gl.uniform1f(at("curve"), this.scene.light.curve);
+    gl.uniform1f(at("range"), this.scene.light.range);
     gl.bindVertexArray(this.empty);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
-    const [base, normal, uv, coverage] = [
-      this.read(this.sharp, 0), this.read(this.sharp, 1), this.read(this.sharp, 2), this.read(this.coarse, 0),
-    ];
-    return {
-      uv: planes(uv, width, height, [0, 1]),
-      mask: planes(base, width, height, [3]),
-      coverage: planes(coverage, width, height, [0]),
-      view_dir: directions(view),
-      normal: planes(normal, width, height, [0, 1, 2]),
-      base: planes(base, width, height, [0, 1, 2, 3]),
-    };
+    gl.bindVertexArray(null);
+    this.copies.forEach((copy, index) => {
+      gl.readBuffer(gl.COLOR_ATTACHMENT0 + index);
+      gl.bindBuffer(gl.PIXEL_PACK_BUFFER, copy);
+      gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, 0);
+    });
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    return { view, fence };
   }
 
-  read(target, index) {
-    const gl = this.gl, values = new Float32Array(4 * target.width * target.height);
-    gl.bindFramebuffer(gl.READ_FRAMEBUFFER, target.buffer);
-    gl.readBuffer(gl.COLOR_ATTACHMENT0 + index);
-    gl.readPixels(0, 0, target.width, target.height, gl.RGBA, gl.FLOAT, values);
-    return values;
+  // What was drawn of a view that was begun: three times Float32Array [H, W, 4], row 0 at the bottom; see PIXEL.
+  async drawn({ view, fence }) {
+    const gl = this.gl;
+    while (gl.clientWaitSync(fence, 0, 0) === gl.TIMEOUT_EXPIRED) await new Promise((done) => setTimeout(done));
+    gl.deleteSync(fence);
+    const [base, normal, uv] = this.copies.map((copy) => {
+      const values = new Float32Array(4 * view.width * view.height);
+      gl.bindBuffer(gl.PIXEL_PACK_BUFFER, copy);
+      gl.getBufferSubData(gl.PIXEL_PACK_BUFFER, 0, values);
+      return values;
+    });
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
+    return { base, normal, uv };
   }
 }
 
-// Interleaved RGBA, bottom row first -> planes, top row first.
-function planes(values, width, height, channels) {
-  const result = new Float32Array(channels.length * width * height);
-  channels.forEach((channel, plane) => {
-    for (let y = 0; y < height; y++) {
-      let from = 4 * width * (height - 1 - y) + channel, to = width * (plane * height + y);
-      for (let x = 0; x < width; x++, from += 4) result[to++] = values[from];
-    }
-  });
-  return result;
+// Numbers of the pixels that surfaces cover, at least in part: row by row from the top.
+function coveredPixels({ normal }, { width, height }) {
+  const found = new Uint32Array(width * height);
+  let count = 0;
+  for (let y = 0, pixel = 0; y < height; y++)
+    for (let x = 0; x < width; x++, pixel++)
+      if (normal[4 * (width * (height - 1 - y) + x) + 3] > 0) found[count++] = pixel;
+  return found.subarray(0, count);
 }
 
-// Unit vectors from the surface to the camera: minus the ray through each pixel's centre.
-function directions(view) {
-  const { width, height, fl_x, fl_y, cx, cy, c2w } = view, count = width * height;
-  const result = new Float32Array(3 * count);
-  for (let y = 0, i = 0; y < height; y++)
-    for (let x = 0; x < width; x++, i++) {
-      const a = (x + 0.5 - cx) / fl_x, b = -(y + 0.5 - cy) / fl_y, length = Math.hypot(a, b, 1);
-      for (let r = 0; r < 3; r++)
-        result[r * count + i] = -(c2w[r][0] * a + c2w[r][1] * b - c2w[r][2]) / length;
+// The network's inputs for those pixels, Float32Array [C, pixels] by name.
+function networkInputs({ base, normal, uv }, view, pixels) {
+  const { width, height, fl_x, fl_y, cx, cy, c2w } = view, count = pixels.length, inputs = {};
+  for (const [name, channels] of Object.entries(CHANNELS)) inputs[name] = new Float32Array(channels * count);
+  for (let i = 0; i < count; i++) {
+    const y = Math.floor(pixels[i] / width), x = pixels[i] - width * y, from = 4 * (width * (height - 1 - y) + x);
+    // From the surface to the camera: minus the ray through the pixel's centre. Normals look that way, too.
+    const a = (x + 0.5 - cx) / fl_x, b = -(y + 0.5 - cy) / fl_y, length = Math.sqrt(a * a + b * b + 1);
+    let cosine = 0;
+    for (let r = 0; r < 3; r++) {
+      const towards = -(c2w[r][0] * a + c2w[r][1] * b - c2w[r][2]) / length;
+      inputs.view_dir[r * count + i] = towards;
+      cosine += towards * normal[from + r];
     }
-  return result;
+    for (let r = 0; r < 3; r++) inputs.normal[r * count + i] = cosine < 0 ? -normal[from + r] : normal[from + r];
+    for (let c = 0; c < 4; c++) inputs.base[c * count + i] = base[from + c];
+    inputs.uv[i] = uv[from];
+    inputs.uv[count + i] = uv[from + 1];
+    inputs.mask[i] = base[from + 3];
+    inputs.coverage[i] = normal[from + 3];
+  }
+  return inputs;
 }
 
-// World -> clip space, column-major; OpenGL's camera axes, pixel (0, 0) at the top left.
+// World -> clip space; OpenGL's camera axes, pixel (0, 0) at the top left.
 function clipMatrix(view, scene) {
   const { width, height, fl_x, fl_y, cx, cy, c2w } = view;
   const eye = [0, 1, 2].map((r) => c2w[r][3]);
@@ -352,11 +375,8 @@ function clipMatrix(view, scene) {
     [0, 0, -(far + near) / (far - near), (-2 * far * near) / (far - near)],
     [0, 0, -1, 0],
   ];
-  const result = new Float32Array(16);
-  for (let r = 0; r < 4; r++)
-    for (let c = 0; c < 4; c++)
-      for (let k = 0; k < 4; k++) result[c * 4 + r] += lens[r][k] * camera[k][c];
-  return result;
+  const columns = (rows) => [0, 1, 2, 3].flatMap((c) => rows.map((row) => row[c]));
+  return product(columns(lens), columns(camera));
 }
 
 // ---- network -----------------------------------------------------------------------------------------------------
@@ -365,41 +385,30 @@ const CHANNELS = { uv: 2, mask: 1, coverage: 1, view_dir: 3, normal: 3, base: 4 
 
 class Network {
   static async load() {
-    const network = new Network();
-    const model = await file("model.onnx");
-    const adapter = !offline && navigator.gpu ? await navigator.gpu.requestAdapter().catch(() => null) : null;
-    if (adapter) {
-      try {
-        await network.open(model, "webgpu", "ort-wasm-simd-threaded.asyncify.wasm");
-        return network;
-      } catch (error) {
-        console.warn("WebGPU failed, WebAssembly instead:", error);
-      }
-    }
-    await network.open(model, "wasm", "ort-wasm-simd-threaded.wasm");
+    const network = new Network(), bundle = "ort/ort.wasm.bundle.min.mjs";
+    const [model, binary] = await Promise.all(["model.onnx", "ort/ort-wasm-simd-threaded.wasm"].map(unpacked));
+    let address = new URL(bundle, location.href).href;
+    if (offline) address = URL.createObjectURL(new Blob([await file(bundle)], { type: "text/javascript" }));
+    network.ort = await import(address);
+    const wasm = network.ort.env.wasm;
+    wasm.wasmBinary = binary.buffer;
+    // Only where the server isolates origins may threads share memory.
+    wasm.numThreads = self.crossOriginIsolated ? Math.min(4, navigator.hardwareConcurrency) : 1;
+    network.session = await network.ort.InferenceSession.create(model, {
+      executionProviders: ["wasm"],
+      enableMemPattern: false, // it would keep one for each number of pixels
+    });
+    network.provider = `WebAssembly, threads: ${wasm.numThreads}`;
     return network;
   }
 
-  async open(model, provider, binary) {
-    const base = new URL("ort/", location.href).href, bundle = `ort.${provider}.bundle.min.mjs`;
-    let address = base + bundle;
-    if (offline) address = URL.createObjectURL(new Blob([await file(`ort/${bundle}`)], { type: "text/javascript" }));
-    this.ort = await import(address);
-    const wasm = this.ort.env.wasm;
-    wasm.numThreads = 1; // more need a server that isolates origins
-    if (offline) wasm.wasmBinary = (await file(`ort/${binary}`)).buffer;
-    else wasm.wasmPaths = { wasm: base + binary };
-    this.session = await this.ort.InferenceSession.create(model, { executionProviders: [provider] });
-    this.provider = provider === "webgpu" ? "WebGPU" : "WebAssembly, one thread";
-  }
-
-  // Display RGB over white, Float32Array [3, H, W].
-  async run(inputs, width, height) {
-    const feeds = {};
+  // Display RGB over white of any pixels, Float32Array [3, pixels]. The network looks at each by itself, so they need
+  // not be a picture.
+  async run(inputs) {
+    const feeds = {}, count = inputs.mask.length;
     for (const name of this.session.inputNames)
-      feeds[name] = new this.ort.Tensor("float32", inputs[name], [1, CHANNELS[name], height, width]);
-    const answer = await this.session.run(feeds, ["rgb"]);
-    return answer.rgb.getData ? await answer.rgb.getData() : answer.rgb.data;
+      feeds[name] = new this.ort.Tensor("float32", inputs[name], [1, CHANNELS[name], 1, count]);
+    return (await this.session.run(feeds, ["rgb"])).rgb.data;
   }
 }
 
@@ -409,14 +418,13 @@ const $ = (id) => document.getElementById(id);
 
 class Page {
   constructor(scene, raster, network) {
-    Object.assign(this, { scene, raster, network, times: [], dirty: true, busy: false });
+    Object.assign(this, { scene, raster, network, times: [], left: 0, round: 0, busy: false, probing: false });
     $("title").textContent = `${scene.name}: neural view`;
     const native = scene.size[0];
     for (const side of [...new Set([native / 2, native, native * 1.5, native * 2].map(Math.round))])
-      $("size").add(new Option(`${side}²`, side, side === native, side === native));
+      $("size").add(new Option(this.dimensions(side).join(" × "), side, side === native, side === native));
     this.reset();
-    for (const id of ["show", "size"]) $(id).onchange = () => this.touch(true);
-    $("turn").onchange = () => this.touch(true);
+    for (const id of ["show", "size", "turn"]) $(id).onchange = () => this.touch(true);
     $("reset").onclick = () => this.reset();
     const canvas = $("picture");
     canvas.onpointerdown = (event) => canvas.setPointerCapture(event.pointerId);
@@ -439,101 +447,129 @@ class Page {
       this.elevation += step[1];
       this.touch();
     };
-    requestAnimationFrame(() => this.loop());
+    this.loop();
   }
 
   reset() {
-    const { start, center, distance } = this.scene, to = [0, 1, 2].map((i) => start.c2w[i][3] - center[i]);
-    this.azimuth = Math.atan2(to[1], to[0]);
-    this.elevation = Math.asin(to[2] / Math.hypot(...to));
-    this.distance = distance;
+    Object.assign(this, this.scene.start);
     this.touch(true);
   }
 
+  // Draw again. fresh: what a frame costs has changed.
   touch(fresh = false) {
     const limit = Math.PI / 2 - 0.02;
     this.elevation = Math.min(limit, Math.max(-limit, this.elevation));
-    this.distance = Math.min(6 * this.scene.distance, Math.max(0.1 * this.scene.radius, this.distance));
-    if (fresh) this.times = [];
-    this.dirty = true;
+    this.distance = Math.min(6 * this.scene.start.distance, Math.max(0.1 * this.scene.radius, this.distance));
+    if (fresh) {
+      this.times = [];
+      this.round += 1;
+    }
+    this.left = MEASURED;
   }
 
-  view() {
-    const { start, center, size } = this.scene, side = Number($("size").value), scale = side / size[0];
+  dimensions(side) {
+    const [width, height] = this.scene.size;
+    return [side, Math.round((height * side) / width)];
+  }
+
+  // The orbiting camera: upright whatever its angles, since `right` is horizontal.
+  view(side = Number($("size").value)) {
+    const { center, size, lens } = this.scene, scale = side / size[0], [width, height] = this.dimensions(side);
     const [ca, sa, ce, se] = [this.azimuth, this.elevation].flatMap((t) => [Math.cos(t), Math.sin(t)]);
     const back = [ca * ce, sa * ce, se], right = [-sa, ca, 0], up = [-ca * se, -sa * se, ce];
     const c2w = [0, 1, 2].map((r) => [right[r], up[r], back[r], center[r] + this.distance * back[r]]);
     return {
-      width: side, height: Math.round(size[1] * scale), fl_x: start.fl_x * scale, fl_y: start.fl_y * scale,
-      cx: side / 2, cy: Math.round(size[1] * scale) / 2, c2w: [...c2w, [0, 0, 0, 1]],
+      width, height, fl_x: lens[0] * scale, fl_y: lens[1] * scale, cx: width / 2, cy: height / 2,
+      c2w: [...c2w, [0, 0, 0, 1]],
     };
   }
 
-  async loop() {
+  next() {
     if ($("turn").checked) {
       this.azimuth += 0.02;
-      this.dirty = true;
+      this.left = MEASURED;
     }
-    if (this.dirty && !this.busy && !this.probing) {
-      this.dirty = false;
-      await this.frame(this.view(), $("show").value);
-    }
-    requestAnimationFrame(() => this.loop());
+    if (this.left === 0 || this.probing) return null;
+    this.left -= 1;
+    return { ...this.raster.begin(this.view()), round: this.round };
   }
 
-  async frame(view, show) {
-    this.busy = true;
-    try {
-      const started = performance.now();
-      const inputs = this.raster.inputs(view);
-      const drawn = performance.now();
-      const picture = show === "neural" ? await this.network.run(inputs, view.width, view.height) : plain(inputs, show);
-      const ended = performance.now();
-      this.paint(picture, view.width, view.height);
-      this.times.push([drawn - started, ended - drawn, performance.now() - started, started]);
-      if (this.times.length > RECENT) this.times.shift();
-      this.report();
-      $("message").textContent = "";
-      return { inputs, picture };
-    } catch (error) {
-      fail(error);
-      throw error;
-    } finally {
-      this.busy = false;
+  // Frame after frame while there is something to show. The picture is one frame behind the camera: while the network
+  // computes it, the GPU draws the next one.
+  async loop() {
+    let begun = null, since = null;
+    for (;;) {
+      begun = begun || this.next();
+      this.busy = begun !== null;
+      if (begun) {
+        try {
+          const { round } = begun, started = since || performance.now();
+          ({ begun } = await this.frame(begun, $("show").value, () => this.next()));
+          since = begun ? performance.now() : null;
+          if (round === this.round) this.note([...this.last, performance.now() - started], !begun);
+          if ($("message").textContent) $("message").textContent = "";
+        } catch (error) {
+          fail(error);
+          throw error;
+        }
+      }
+      // Also lets the browser show the picture and hear the mouse.
+      await (begun ? new Promise((done) => setTimeout(done)) : new Promise(requestAnimationFrame));
     }
   }
 
-  paint(picture, width, height) {
-    const canvas = $("picture"), count = width * height, image = new ImageData(width, height);
-    for (let i = 0; i < count; i++) {
-      for (let c = 0; c < 3; c++) image.data[4 * i + c] = 255 * picture[c * count + i] + 0.5;
-      image.data[4 * i + 3] = 255;
-    }
+  // Shows a view that was begun. next: begins another one, or answers null.
+  async frame(begun, show, next) {
+    const started = performance.now(), { view } = begun, drawn = await this.raster.drawn(begun);
+    const waited = performance.now() - started, pixels = coveredPixels(drawn, view);
+    begun = next();
+    const inputs = networkInputs(drawn, view, pixels), asked = performance.now();
+    const colours = show !== "neural" ? plain(inputs, show) : pixels.length ? await this.network.run(inputs) : [];
+    this.last = [waited, performance.now() - asked];
+    this.paint(pixels, colours, view);
+    return { drawn, pixels, colours, begun };
+  }
+
+  paint(pixels, colours, { width, height }) {
+    const canvas = $("picture"), count = pixels.length, image = new ImageData(width, height);
+    image.data.fill(255);
+    for (let i = 0; i < count; i++)
+      for (let c = 0; c < 3; c++) image.data[4 * pixels[i] + c] = 255 * colours[c * count + i] + 0.5;
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
-    canvas.getContext("2d").putImageData(image, 0, 0);
+    // Its pixels stay in main memory: they are written there anew each frame.
+    canvas.getContext("2d", { willReadFrequently: true }).putImageData(image, 0, 0);
   }
 
-  // Milliseconds by stage and frames per second, both over the last frames; the latter only while frames follow.
+  note(times, last) {
+    this.times.push(times);
+    if (this.times.length > RECENT) this.times.shift();
+    // Laying out text takes time, too.
+    if (!last && performance.now() - (this.reported || 0) < 250) return;
+    this.reported = performance.now();
+    this.report();
+  }
+
+  // Means over the last frames. wait_ms: for the GPU; it draws while the network computes, so little of it may be left.
   figures() {
     const mean = (k) => this.times.reduce((sum, time) => sum + time[k], 0) / this.times.length;
-    const count = this.times.length - 1, whole = count < 1 ? 0 : this.times[count][3] - this.times[0][3];
-    const steady = count >= 5 && whole / count < 2 * mean(2) + 50;
     return {
-      raster_ms: mean(0), network_ms: mean(1), frame_ms: mean(2), fps: steady ? (1000 * count) / whole : null,
-      frames: this.times.length, provider: this.network.provider, gl: this.raster.name,
+      wait_ms: mean(0), network_ms: mean(1), frame_ms: mean(2), fps: 1000 / mean(2), frames: this.times.length,
+      provider: this.network.provider, gl: this.raster.name,
     };
   }
 
   report() {
-    const f = this.figures(), q = this.scene.quality;
+    const f = this.figures(), q = this.scene.quality, decibels = (value) => `${value.toFixed(1)} dB`;
+    $("fps").textContent = `${f.fps.toFixed(1)} frames a second`;
     const rows = [
-      ["frame", `${f.frame_ms.toFixed(1)} ms (drawing and reading back ${f.raster_ms.toFixed(1)}, network ` +
-        `${f.network_ms.toFixed(1)}), mean of ${f.frames}`],
-      ["frames per second", f.fps === null ? "measured while the camera moves" : f.fps.toFixed(1)],
+      ["this page", `${decibels(q.psnr)} PSNR over ${q.test_views} ray-traced held-out views at ` +
+        `${this.scene.size.join(" × ")}; its baked light alone ${decibels(q.psnr_base)}`],
+      ["workspace's renderer", q.psnr_workspace === null ? "not measured (dnrpipe evaluate)"
+        : `${decibels(q.psnr_workspace)} PSNR over the same views, with ray-traced mirrors and highlights`],
+      ["frame", `${f.frame_ms.toFixed(0)} ms: network ${f.network_ms.toFixed(0)}, waiting for WebGL2 ` +
+        `${f.wait_ms.toFixed(0)}; mean of ${f.frames}`],
       ["network runs on", f.provider],
       ["WebGL2", f.gl],
-      ["quality", `${q.psnr.toFixed(1)} dB PSNR over ${q.test_views} ray-traced held-out views at ` +
-        `${this.scene.size.join(" × ")}; baked light alone ${q.psnr_base.toFixed(1)} dB`],
     ];
     $("figures").replaceChildren(...rows.map((row) => {
       const line = document.createElement("tr");
@@ -542,33 +578,57 @@ class Page {
     }));
   }
 
-  // A frame of a given camera, for checks: inputs and picture as base64 of float32.
-  async probe(view) {
+  // Runs something while the loop rests.
+  async alone(action) {
     this.probing = true;
-    while (this.busy) await new Promise((resolve) => setTimeout(resolve, 5));
-    const { inputs, picture } = await this.frame(view, "neural");
-    this.probing = false;
+    while (this.busy) await new Promise((done) => setTimeout(done, 5));
+    try {
+      return await action();
+    } finally {
+      this.probing = false;
+    }
+  }
+
+  // A frame of a given camera, for checks: inputs and picture of all pixels as base64 of float32 [C, H, W].
+  async probe(view) {
+    const { drawn, pixels, colours } = await this.alone(() => this.frame(this.raster.begin(view), "neural", () => null));
+    const count = view.width * view.height, rgb = new Float32Array(3 * count).fill(1);
+    pixels.forEach((pixel, i) => {
+      for (let c = 0; c < 3; c++) rgb[c * count + pixel] = colours[c * pixels.length + i];
+    });
     const coded = (values) => {
       const bytes = new Uint8Array(values.buffer, values.byteOffset, values.byteLength);
       let text = "";
       for (let i = 0; i < bytes.length; i += 8192) text += String.fromCharCode(...bytes.subarray(i, i + 8192));
       return btoa(text);
     };
-    const packed = Object.entries({ ...inputs, rgb: picture }).map(([name, values]) => [name, coded(values)]);
-    return { ...Object.fromEntries(packed), figures: this.figures() };
+    const inputs = networkInputs(drawn, view, Uint32Array.from({ length: count }, (_, i) => i));
+    return Object.fromEntries(Object.entries({ ...inputs, rgb }).map(([name, values]) => [name, coded(values)]));
+  }
+
+  // Figures of a turntable of that width, for checks.
+  async measure(side) {
+    $("size").add(new Option(this.dimensions(side).join(" × "), side, false, true));
+    $("turn").checked = true;
+    for (let run = 0; run < 2; run++) { // the first one warms up
+      this.touch(true);
+      while (this.times.length < RECENT) await new Promise((done) => setTimeout(done, 50));
+    }
+    $("turn").checked = false;
+    return this.figures();
   }
 }
 
 // Baked light (exposed plainly, not by the scene's display transform) or normals over white.
 function plain(inputs, show) {
-  const count = inputs.mask.length, picture = new Float32Array(3 * count);
+  const count = inputs.mask.length, colours = new Float32Array(3 * count);
   for (let i = 0; i < count; i++)
     for (let c = 0; c < 3; c++) {
       const value = show === "normal" ? 0.5 + 0.5 * inputs.normal[c * count + i]
         : Math.min(1, inputs.base[c * count + i]) ** (1 / 2.2);
-      picture[c * count + i] = 1 + inputs.mask[i] * (value - 1);
+      colours[c * count + i] = 1 + inputs.mask[i] * (value - 1);
     }
-  return picture;
+  return colours;
 }
 
 function fail(error) {
@@ -578,9 +638,10 @@ function fail(error) {
 async function start() {
   if (offline) await script("offline.js");
   const scene = offline ? window.DNR_OFFLINE.scene : JSON.parse(new TextDecoder().decode(await file("scene.json")));
-  const [mesh, front, back] = await Promise.all(["scene.glb", "light-front.bin", "light-back.bin"].map(file));
-  const raster = new Raster(readGlb(mesh), scene, front, back);
-  return new Page(scene, raster, await Network.load());
+  const [mesh, front, back, network] = await Promise.all([
+    unpacked("scene.bin"), picture("light-front.webp"), scene.thin ? picture("light-back.webp") : null, Network.load(),
+  ]);
+  return new Page(scene, new Raster(readMeshes(mesh, scene.meshes), scene, front, back), network);
 }
 
 window.dnr = start();
