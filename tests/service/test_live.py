@@ -408,6 +408,55 @@ def test_an_empty_server_says_what_to_do_and_its_viewer_gives_up(tmp_path: Path)
 
 
 @needs_chromium
+def test_a_tour_by_keyboard_alone(server: Server, trained: str) -> None:
+    """From the search to a job, a workspace, its deletion (refused), the viewer, another camera and another mode."""
+
+    def tab_to(what: str) -> None:
+        for _ in range(80):
+            page.keyboard.press("Tab")
+            if page.evaluate(f"document.activeElement.matches({what!r})"):
+                return
+        raise AssertionError(f"Tab never comes to {what}")
+
+    def picture() -> str:
+        return page.evaluate("document.querySelector('#picture').toDataURL()")
+
+    with open_page(server.url, width=1280) as (page, errors):
+        wait_for(page, "document.querySelectorAll('#jobs tbody tr').length > 0")
+        tab_to("#search")
+        page.keyboard.type(f"run {trained}")
+        wait_for(page, "document.querySelectorAll('#jobs tbody tr').length === 1")
+        tab_to("#jobs button.link")
+        page.keyboard.press("Enter")
+        wait_for(page, f"document.querySelector('#job-title').textContent.endsWith('run {trained}')")
+        wait_for(page, f"document.querySelector('#workspaces li[data-key={trained}]') !== null")
+        tab_to(f"#workspaces li[data-key={trained}] button")
+        page.keyboard.press("Enter")
+        wait_for(page, f"document.querySelector('#detail-title').textContent === '{trained}'")
+        tab_to("#delete")
+        page.keyboard.press("Enter")
+        assert page.evaluate("document.activeElement.id") == "sure-no"
+        page.keyboard.press("Enter")
+        assert page.evaluate("document.activeElement.id") == "delete"
+        page.keyboard.press("Shift+Tab")
+        page.keyboard.press("Shift+Tab")
+        assert page.evaluate("document.activeElement.id") == "open-viewer"
+        page.keyboard.press("Enter")
+        wait_for(page, "document.querySelector('#picture')?.dataset.fine === 'yes'")
+        tab_to("#picture")
+        before, frames = picture(), int(page.evaluate("document.querySelector('#picture').dataset.frames"))
+        for _ in range(5):
+            page.keyboard.press("ArrowLeft")
+        wait_for(page, f"Number(document.querySelector('#picture').dataset.frames) > {frames}")
+        wait_for(page, "document.querySelector('#picture').dataset.fine === 'yes'")
+        assert picture() != before
+        tab_to("#modes input")
+        page.keyboard.press("ArrowDown")
+        wait_for(page, "document.querySelector('#picture').dataset.mode === 'base'")
+        assert errors == []
+
+
+@needs_chromium
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (390, "dark")])
 def test_no_serious_violation_of_accessibility(
     server: Server, trained: str, width: int, scheme: Literal["light", "dark"]
