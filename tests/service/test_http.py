@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
 import json
+import random
 import sqlite3
 import subprocess
 import sys
@@ -17,7 +19,7 @@ from tests.service.harness import TINY, Server, empty_workspace, processes_of
 
 from dnrpipe.core.workspace import file_sha256
 from dnrpipe.service.client import Client, Refused
-from dnrpipe.service.models import Job, JobRequest, Limits
+from dnrpipe.service.models import FINAL, Job, JobRequest, Limits
 from dnrpipe.service.root import ServiceRoot
 from dnrpipe.service.state import Remembered
 
@@ -254,4 +256,54 @@ def test_many_clients_lose_nothing(tmp_path: Path) -> None:
         ended = [job for job in jobs if job.state == "failed"]
         assert all(job.exit_code == 2 for job in ended)
     finally:
+        server.stop()
+
+
+@pytest.mark.robustness
+def test_fifty_kills_under_load_lose_nothing(tmp_path: Path) -> None:
+    """kill -9 of the server, 50 times at any moment, while eight clients submit and its worker works.
+
+    What was answered is in the queue once, all of it ends, and no job ended twice.
+    """
+    server, dice, over = Server(tmp_path / "root", "--rate", "5000"), random.Random(0), threading.Event()
+    try:
+        for number in range(8):
+            empty_workspace(server.root, f"w{number}")
+
+        def submitting(number: int) -> list[int]:
+            answered = []
+            with Client(server.url, retry_seconds=120) as client:
+                while not over.is_set():
+                    answered.append(client.submit(_failing(f"w{number}")).id)
+                    over.wait(0.5)
+            return answered
+
+        with concurrent.futures.ThreadPoolExecutor(8) as pool:
+            found = [pool.submit(submitting, number) for number in range(8)]
+            for _ in range(50):
+                time.sleep(dice.uniform(0.0, 1.5))
+                server.kill()
+                server.start()
+            over.set()
+            ids = [job for answer in found for job in answer.result()]
+        assert len(ids) == len(set(ids)) > 100
+        with server.client() as client:
+            jobs = list(client.jobs())
+            assert sorted(job.id for job in jobs) == sorted(ids)
+            for job in jobs:
+                if job.state == "queued":
+                    with contextlib.suppress(Refused):  # it began, or ended, meanwhile
+                        client.cancel(job.id)
+            deadline = time.monotonic() + 120
+            while {job.state for job in client.jobs()} - set(FINAL):
+                assert time.monotonic() < deadline
+                time.sleep(0.5)
+            ended = [job for job in client.jobs() if job.state == "failed"]
+            assert len(ended) > 20
+            for job in ended:
+                assert job.exit_code == 2 or "was lost" in str(job.error), job
+                states = [event.data["state"] for event in client.events(job.id) if event.kind == "state"]
+                assert states[0] == "queued" and sum(state in FINAL for state in states) == 1, states
+    finally:
+        over.set()
         server.stop()
