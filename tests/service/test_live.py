@@ -441,7 +441,8 @@ def test_a_tour_by_keyboard_alone(server: Server, trained: str) -> None:
         page.keyboard.press("Shift+Tab")
         page.keyboard.press("Shift+Tab")
         assert page.evaluate("document.activeElement.id") == "open-viewer"
-        page.keyboard.press("Enter")
+        with page.expect_navigation():
+            page.keyboard.press("Enter")
         wait_for(page, "document.querySelector('#picture')?.dataset.fine === 'yes'")
         tab_to("#picture")
         before, frames = picture(), int(page.evaluate("document.querySelector('#picture').dataset.frames"))
