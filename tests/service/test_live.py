@@ -187,7 +187,7 @@ def _children(parent: int) -> list[tuple[int, bytes]]:
 def test_pace() -> None:
     """Slow frames make it coarser, quick ones finer, and it settles where frames fit into the budget."""
     pace = Pace()
-    cost = {0: 400.0, 1: 150.0, 2: 80.0, 3: 40.0, 4: 25.0, 5: 20.0}
+    cost = {0: 400.0, 1: 150.0, 2: 80.0, 3: 40.0, 4: 25.0, 5: 20.0, 6: 18.0}
     for _ in range(10 * MIN_FRAMES):
         pace.record(256, cost[pace.level])
     assert pace.level == 2
@@ -200,6 +200,13 @@ def test_pace() -> None:
     first = Pace()
     first.record(256, 100 * BUDGET)  # compiles the kernels
     assert first.level == START and first._mean is None
+    for _ in range(MIN_FRAMES):
+        first.record(256, 0.6 * BUDGET)
+        first.record(256, 2.5 * BUDGET if _ == 0 else 0.6 * BUDGET)  # one more that compiled
+    assert first.level == START
+    first.record(256, 2.5 * BUDGET)
+    first.record(256, 2.5 * BUDGET)  # two on end: at once
+    assert first.level == START + 1
 
 
 def wait_for(page: Page, expression: str, seconds: float = 120) -> None:

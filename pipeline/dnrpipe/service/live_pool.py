@@ -28,7 +28,15 @@ MOST_SPP, MOST_RAYS = 1024, 64
 """Per pixel, of a reference and of a base image at rest."""
 BUDGET = 90.0
 """Milliseconds that a moving frame may take."""
-LEVELS: tuple[tuple[float, int | None], ...] = ((1.0, None), (1.0, 2), (1.0, 1), (0.5, 2), (0.5, 1), (0.25, 1))
+LEVELS: tuple[tuple[float, int | None], ...] = (
+    (1.0, None),
+    (1.0, 2),
+    (1.0, 1),
+    (0.5, 2),
+    (0.5, 1),
+    (0.375, 1),
+    (0.25, 1),
+)
 """(share of the side, rays per pixel of the base image; None: the model's own)."""
 START = 2
 STEP = 32
@@ -40,8 +48,8 @@ SLACK = 0.45
 """Below this share of the budget the pace tries a finer level, which costs about twice as much."""
 MIN_FRAMES = 8
 """Frames at a level before it may change."""
-HASTY_FRAMES, HASTY = 2, 2.0
-"""Frames after which it may already become coarser, where they take so many times the budget."""
+HASTY = 2.0
+"""Two frames on end that take so many times the budget make it coarser at once; one alone may compile a kernel."""
 
 
 @dataclass
@@ -52,6 +60,7 @@ class Pace:
     level: int = START
     _mean: float | None = None
     _frames: int = 0
+    _slow: int = 0
     _known: set[tuple[int, int]] = field(default_factory=set)
 
     def pick(self, size: int) -> tuple[int, int | None]:
@@ -64,10 +73,12 @@ class Pace:
         if (self.level, size) not in self._known:
             self._known.add((self.level, size))
             return
-        mean = self._mean
-        self._mean = milliseconds if mean is None else mean + SMOOTHING * (milliseconds - mean)
+        mean, most = self._mean, HASTY * self.budget
+        told = min(milliseconds, most)  # else one frame that compiled weighs as many slow ones
+        self._mean = told if mean is None else mean + SMOOTHING * (told - mean)
         self._frames += 1
-        too_slow = self._frames >= HASTY_FRAMES and self._mean > HASTY * self.budget
+        self._slow = self._slow + 1 if milliseconds > most else 0
+        too_slow = self._slow >= 2
         if self._frames < MIN_FRAMES and not too_slow:
             return
         if self._mean > self.budget and self.level + 1 < len(LEVELS):
@@ -77,7 +88,7 @@ class Pace:
 
     def _move(self, step: int) -> None:
         self.level += step
-        self._mean, self._frames = None, 0
+        self._mean, self._frames, self._slow = None, 0, 0
 
 
 class LiveSession:
