@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import gzip
 import json
 import math
@@ -80,6 +81,31 @@ def test_dragging_and_choosing_change_the_picture_from_disk(exported: tuple[Path
         figures = page.evaluate("document.getElementById('figures').innerText")
         assert errors == []
         assert "WebAssembly" in figures
+
+
+def test_browsers_unpack_light_as_torch_sees_it(exported: tuple[Path, dict[str, Any]]) -> None:
+    """Also beside and below the holes of a cut-out: colours are not multiplied by opacity on the way to the texture."""
+    from dnrpipe.export.page_data import pack_light
+    from dnrpipe.export.surface import SurfaceMaps
+
+    v, u = np.mgrid[0:32, 0:32] / 31
+    opacity = np.where(u + v < 1, 0.0, np.where(u < 0.5, 0.6, 1.0))
+    radiance = np.stack([u, v, 0.3 + 0.5 * u, opacity], axis=-1)[None].astype(np.float32)
+    light = pack_light(SurfaceMaps(radiance, np.zeros((32, 32, 3), np.float32), False), 1.0)
+    read = """async (text) => {
+        const raster = (await window.dnr).raster, gl = raster.gl, values = new Uint8Array(4096);
+        window.DNR_OFFLINE.files["test.webp"] = text;
+        const texture = raster.light(await picture("test.webp"));
+        gl.bindFramebuffer(gl.FRAMEBUFFER, gl.createFramebuffer());
+        gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
+        gl.readPixels(0, 0, 32, 32, gl.RGBA, gl.UNSIGNED_BYTE, values);
+        return Array.from(values);
+    }"""
+    with open_page((exported[0] / "index.html").as_uri()) as (page, _):
+        wait_for(page, SETTLED)
+        found = np.array(page.evaluate(read, base64.b64encode(light.files[0]).decode())).reshape(32, 32, 4)
+    assert light.cutouts and np.ptp(light.codes[..., 3]) == 255
+    assert np.abs(found - light.codes[0].astype(int)).max() <= 2
 
 
 def test_normals_turn_by_the_inverse_transpose(exported: tuple[Path, dict[str, Any]]) -> None:
