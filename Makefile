@@ -42,6 +42,7 @@ test: setup browser lint types imports docs-check  ## lint, types, import rules,
 
 browser:
 	@sh tools/system-libraries.sh $(APT_DEV)
+	@sh tools/unpacked-nginx.sh .cache/nginx
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

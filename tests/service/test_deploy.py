@@ -21,8 +21,10 @@ from websockets.typing import Origin, Subprotocol
 
 from dnrpipe.service.guard import MAX_BODY
 
-NGINX = shutil.which("nginx") or shutil.which("nginx", path="/usr/sbin")
-RECIPE = Path(__file__).resolve().parents[2] / "deploy" / "nginx.conf"
+REPO = Path(__file__).resolve().parents[2]
+PLACES = (f"{REPO}/.cache/nginx/usr/sbin", "/usr/sbin")  # unpacked by `make browser`, or installed
+NGINX = shutil.which("nginx") or shutil.which("nginx", path=":".join(PLACES))
+RECIPE = REPO / "deploy" / "nginx.conf"
 NAME, TOKEN = "render.example.org", "a-token-of-some-length"
 SELF_SIGNED = f"req -x509 -newkey rsa:2048 -nodes -days 2 -subj /CN={NAME} -addext subjectAltName=DNS:{NAME}"
 
