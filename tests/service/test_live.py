@@ -145,6 +145,7 @@ def test_bad_requests_do_no_harm(server: Server, trained: str) -> None:
         assert viewer.frame()[0]["mode"] == "neural"
 
 
+@pytest.mark.robustness
 def test_a_viewer_stays_connected(server: Server, trained: str) -> None:
     """Longer than a slow sender may take: a socket is no request that does not come."""
     with connect(server.url.replace("http", "ws") + f"/workspaces/{trained}/live", max_size=None) as socket:

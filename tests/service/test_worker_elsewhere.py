@@ -100,6 +100,7 @@ def _states(client: Client, job: int) -> list[str]:
     return [event.data["state"] for event in client.events(job) if event.kind == "state"]
 
 
+@pytest.mark.robustness
 def test_two_workers_share_a_queue_and_one_is_killed(
     server: Server, start: Callable[..., Elsewhere], tmp_path: Path
 ) -> None:
