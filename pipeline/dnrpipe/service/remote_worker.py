@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
 from pydantic import ValidationError
 
 from ..core.errors import UserError
@@ -229,11 +228,7 @@ def _own(root: ServiceRoot) -> Iterator[None]:
     root.private.mkdir(mode=0o700, exist_ok=True)
     marker.touch()
     root.create()
-    try:
-        lock = FileLock(root.private / "lock", timeout=10).acquire()  # a killed worker may take a moment to end
-    except Timeout:
-        raise UserError(f"--root {root.folder}: another worker works here; choose another") from None
-    with lock:
+    with root.held(f"--root {root.folder}: another worker works here; choose another"):
         root.clear()
         for folder in root.folder.glob(f"*{SUFFIX}"):
             shutil.rmtree(folder)

@@ -18,8 +18,10 @@ import re
 import secrets
 import shutil
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 from ..core.errors import UserError
 from ..core.workspace import LOCK_FILES, SUFFIX, Workspace, file_sha256, locked
@@ -50,6 +52,16 @@ class ServiceRoot:
         for folder in (self.scenes, *private):
             folder.mkdir(exist_ok=True)
         return self
+
+    @contextlib.contextmanager
+    def held(self, taken: str) -> Iterator[None]:
+        """Hold the folder for one server or worker. Raises UserError with ``taken``: another has it."""
+        try:  # one that was killed may take a moment to end
+            lock = FileLock(self.private / "lock", timeout=10).acquire()
+        except Timeout:
+            raise UserError(taken) from None
+        with lock:
+            yield
 
     def clear(self) -> None:
         """Remove what a former server left of requests that it did not finish."""

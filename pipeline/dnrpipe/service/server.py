@@ -14,7 +14,6 @@ from typing import Any
 
 import h11
 import uvicorn
-from filelock import FileLock, Timeout
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ..core.errors import UserError
@@ -51,11 +50,7 @@ def serve(config: ServerConfig, users: Mapping[str, User] | None, *, ready: Call
     config = config.model_copy(update={"root": root.folder})
     os.chdir(root.folder)  # a dnrpipe.toml there counts for the pages as it does for the jobs, and no other
     _log_as_json()
-    try:
-        lock = FileLock(root.private / "lock", timeout=10).acquire()  # a killed server may take a moment to end
-    except Timeout:
-        raise UserError(f"{root.folder}: another server works here; stop it or choose another --root") from None
-    with lock:
+    with root.held(f"{root.folder}: another server works here; stop it or choose another --root"):
         root.clear()
         queue = Queue(root.queue)
         queue.recover()
