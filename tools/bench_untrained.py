@@ -1,8 +1,9 @@
 """The shipped corrector beside trained renderers, scene by scene: quality, and seconds before the first frame.
 
-python -m tools.bench_untrained FOLDER [SCENE.blend ...] [--variants untrained,fresh] [--out RESULTS.json]
+python -m tools.bench_untrained FOLDER [SCENE.blend ...] [--variants untrained,fresh] [--seed 1] [--out RESULTS.json]
 
 FOLDER keeps the workspaces; rows that are in the results are not measured again. Without scenes: the example scenes.
+`--seed` is of the trainings; the table has means over the seeds, and a renderer is paired with the one of its seed.
 Variants, at the draft preset with 8 test views:
 
     untrained   --budget 0
@@ -31,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from dnrpipe.studies.selectbench.figures import summarise
+from dnrpipe.studies.selectbench.figures import Difference, summarise
 from dnrtrain.atomic import write_json
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -53,6 +54,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("scenes", type=Path, nargs="*")
     parser.add_argument("--variants", default=",".join(VARIANTS), help="in their order; untrained is always among them")
+    parser.add_argument("--seed", type=int, default=0, help="of the trainings")
     parser.add_argument("--evaluation-spp", type=int, default=256, help="of the test views (before denoising)")
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args()
@@ -60,32 +62,34 @@ def main() -> None:
     chosen = [name for name in VARIANTS if name in ("untrained", *options.variants.split(","))]
     rows: list[dict[str, Any]] = json.loads(options.out.read_text())["rows"] if options.out.exists() else []
     for scene in options.scenes or sorted((ROOT / "blender_scenes").glob("*.blend")):
-        if {row["variant"] for row in rows if row["scene"] == scene.stem} >= set(chosen):
+        own = [row for row in rows if (row["scene"], row["seed"]) == (scene.stem, options.seed)]
+        if {row["variant"] for row in own} >= set(chosen):
             continue
-        rows = [row for row in rows if row["scene"] != scene.stem]  # its seconds belong together
-        rows += measured(scene.resolve(), options.folder / f"{scene.stem}.dnr", chosen, options.evaluation_spp)
+        rows = [row for row in rows if row not in own]  # its seconds belong together
+        rows += measured(scene.resolve(), options.folder / f"{scene.stem}.dnr", chosen, options)
         write_json(options.out, {"machine": f"{os.cpu_count()} cores", "rows": rows})
     print(markdown({"rows": rows}))
 
 
-def measured(scene: Path, root: Path, variants: list[str], evaluation_spp: int) -> list[dict[str, Any]]:
+def measured(scene: Path, root: Path, variants: list[str], options: argparse.Namespace) -> list[dict[str, Any]]:
     """A row per variant."""
+    seed, evaluation_spp = options.seed, options.evaluation_spp
     rows: list[dict[str, Any]] = []
     shutil.rmtree(root, ignore_errors=True)
-    tests = (*TESTS, "--set", f"raytrace.evaluation_spp={evaluation_spp}")
-    prepared = run(root, "prepare", str(scene), "--set", "select.budget=0", *tests)
+    chosen = (*TESTS, "--set", f"raytrace.evaluation_spp={evaluation_spp}", "--set", f"finetune.seed={seed}")
+    prepared = run(root, "prepare", str(scene), "--set", "select.budget=0", *chosen)
     shared = 0.0
     for variant in variants:
-        chosen = run(root, "select", *VARIANTS[variant])
-        spent = chosen + run(root, "raytrace-selected", "--force") + run(root, "finetune")
+        selecting = run(root, "select", *VARIANTS[variant])
+        spent = selecting + run(root, "raytrace-selected", "--force") + run(root, "finetune")
         run(root, "evaluate")
         mean = json.loads((root / "evaluation" / "metrics.json").read_text())["mean"]
         figures = {name: mean[name] for name in FIGURES}
         seconds = round(prepared + shared + spent, 1)
-        facts = {"scene": scene.stem, "variant": variant, "evaluation_spp": evaluation_spp}
+        facts = {"scene": scene.stem, "variant": variant, "seed": seed, "evaluation_spp": evaluation_spp}
         rows.append({**facts, "base": mean["psnr_base"], **figures, "seconds": seconds})
         if variant == "6 views":
-            shared += chosen
+            shared += selecting
         elif variant == "untrained":
             ledger = [json.loads(line) for line in (root / "costs.jsonl").read_text().splitlines()]
             shared = sum(r["cpu_seconds"] for r in ledger if r["name"] in ("light", "path depth pilot")) / CORES
@@ -106,38 +110,46 @@ def run(root: Path, command: str, *options: str) -> float:
 
 def markdown(results: dict[str, Any]) -> str:
     """PSNR and seconds of every scene, and the mean differences over scenes with their 95% intervals."""
-    rows = {(row["scene"], row["variant"]): row for row in results["rows"]}
-    scenes = sorted({scene for scene, _ in rows})
+    rows = {(row["scene"], row["variant"], row["seed"]): row for row in results["rows"]}
+    scenes = sorted({scene for scene, _, _ in rows})
+    seeds = sorted({seed for _, _, seed in rows})
+
+    def mean(scene: str, variant: str, figure: str) -> float | None:
+        own = [rows[scene, variant, seed][figure] for seed in seeds if (scene, variant, seed) in rows]
+        return float(np.mean(own)) if own else None
+
     heads = [*VARIANTS, *(f"{name}, s" for name in VARIANTS), "trial", "auto"]
     lines = [f"| scene | base image | {' | '.join(heads)} |", "|---" * (2 + len(heads)) + "|"]
     for scene in scenes:
-        own = [rows.get((scene, variant)) for variant in VARIANTS]
-        untrained = rows[scene, "untrained"]
-        shown = ["-" if row is None else f"{row['psnr']:.2f}" for row in own]
-        shown += ["-" if row is None else f"{row['seconds']:.0f}" for row in own]
-        worth = untrained.get("worth")
+        shown = [f"{mean(scene, 'untrained', 'base'):.2f}"]
+        for figure, digits in (("psnr", 2), ("seconds", 0)):
+            values = [mean(scene, variant, figure) for variant in VARIANTS]
+            shown += ["-" if value is None else f"{value:.{digits}f}" for value in values]
+        worth = rows[scene, "untrained", 0].get("worth")
         shown += ["-", "-"] if worth is None else [f"{worth['gain']:+.2f} dB", f"{worth['views']} views"]
-        lines.append(f"| {scene} | {untrained['base']:.2f} | {' | '.join(shown)} |")
+        lines.append(f"| {scene} | {' | '.join(shown)} |")
     lines.append("")
-    figures = {**rows, **{(scene, "base image"): {"psnr": rows[scene, "untrained"]["base"]} for scene in scenes}}
+    psnr = {key: row["psnr"] for key, row in rows.items()}
+    for scene, variant, seed in rows:
+        if variant == "untrained":
+            psnr[scene, "base image", seed] = rows[scene, variant, seed]["base"]
     pairs = [("untrained", "base image"), *((name, "fresh") for name in ("untrained", "6 views", "25 views"))]
     for name, other in pairs:
-        both = [scene for scene in scenes if (scene, name) in figures and (scene, other) in figures]
-        values = {scene: figures[scene, name]["psnr"] - figures[scene, other]["psnr"] for scene in both}
-        if values:
-            worst = min(values, key=lambda scene: values[scene])
-            told = f"{interval(values)} dB over {len(both)} scenes, worst {values[worst]:+.2f} ({worst})"
-            lines.append(f"- {name} to {other}: {told}")
-    shares = [rows[s, "untrained"]["seconds"] / rows[s, "fresh"]["seconds"] for s in scenes if (s, "fresh") in rows]
-    if shares:
+        both = [(s, seed) for s in scenes for seed in seeds if {(s, name, seed), (s, other, seed)} <= set(psnr)]
+        found = summarise({(s, seed): psnr[s, name, seed] - psnr[s, other, seed] for s, seed in both})
+        if found is not None:
+            worst, least = min(found.scenes.items(), key=lambda item: item[1])
+            told = f"over {len(found.scenes)} scenes, {len(both)} pairs, worst {least:+.2f} ({worst})"
+            lines.append(f"- {name} to {other}: {interval(found)} dB {told}")
+    timed = [(s, seed) for s in scenes for seed in seeds if {(s, "untrained", seed), (s, "fresh", seed)} <= set(rows)]
+    if timed:
+        shares = [rows[s, "untrained", seed]["seconds"] / rows[s, "fresh", seed]["seconds"] for s, seed in timed]
         lines.append(f"- untrained, of fresh's seconds before the first frame: {np.mean(shares):.0%}")
     return "\n".join(lines)
 
 
-def interval(differences: dict[str, float]) -> str:
+def interval(found: Difference) -> str:
     """Mean over scenes and its 95% interval (Student)."""
-    found = summarise({(scene, 0): value for scene, value in differences.items()})
-    assert found is not None
     if found.half is None:
         return f"{found.mean:+.2f}"
     return f"{found.mean:+.2f} [{found.mean - found.half:+.2f}, {found.mean + found.half:+.2f}]"
