@@ -90,6 +90,22 @@ class InspectAnswer(SceneRecord):
     warnings: list[str]
 
 
+# -- shot: the frames of a shot ---------------------------------------------------------------------------------
+
+
+class ShotTask(Task):
+    """Say what a shot of ``source`` sees. Answers `core.shot_records.ShotFacts`.
+
+    Args:
+        frames: rising; None for the file's own range.
+        camera: name of one; None for the one that Blender renders each frame with.
+    """
+
+    source: Path
+    frames: tuple[int, ...] | None = None
+    camera: str | None = None
+
+
 # -- baking.bake: values of sockets over the atlas --------------------------------------------------------------
 
 
