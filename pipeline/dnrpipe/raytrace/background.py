@@ -23,22 +23,23 @@ class Background:
 
     def __init__(self, engine: Engine, bundle: Path) -> None:
         self.engine, self.mi = engine, engine.mi
-        self.environment = engine.scenes[str(bundle)].environment()
-        self.kernel = Recorded(self._kernel)
+        self.scene = engine.scenes[str(bundle)]
+        self.kernel = Recorded(self._kernel, self.scene)
 
     def frame(self, view: View) -> np.ndarray:
         """Linear Rec.709, float32 [H, W, 3]."""
         import drjit as dr
 
-        if self.environment is None:
+        if self.scene.environment() is None:
             return np.zeros((view.height, view.width, 3), np.float32)
         mi, moved = self.mi, scaled_view(view, self.engine.unit_scale)
         numbers = (*moved.matrix[:3].ravel(), moved.fl_x, moved.cx, moved.cy)
         camera = [dr.opaque(mi.Float, float(number)) for number in numbers]
-        values = self.kernel(camera, view.width, view.height)
-        return np.stack([np.array(value) for value in values], axis=-1).reshape(view.height, view.width, 3)
+        values = self.kernel(self.scene, camera, view.width, view.height)
+        planes = [np.broadcast_to(np.array(value), view.width * view.height) for value in values]  # a colour may be one
+        return np.stack(planes, axis=-1).reshape(view.height, view.width, 3)
 
-    def _kernel(self, camera: list[Any], width: int, height: int) -> list[Any]:
+    def _kernel(self, scene: Any, camera: list[Any], width: int, height: int) -> list[Any]:
         import drjit as dr
 
         mi = self.mi
@@ -48,5 +49,5 @@ class Background:
             offset = mi.Point2f((cell % CELLS + 0.5) / CELLS, (cell // CELLS + 0.5) / CELLS)
             hit = dr.zeros(mi.SurfaceInteraction3f, width * height)
             hit.wi = -pinhole(mi, camera, pixel, offset, width).d
-            total += mi.Color3f(self.environment.eval(hit)) / (CELLS * CELLS)
+            total += mi.Color3f(scene.environment().eval(hit)) / (CELLS * CELLS)
         return [total.x, total.y, total.z]

@@ -14,7 +14,7 @@ from ..stage import Run
 from .frame_tasks import FrameCommon, FrameTask, Way
 from .pilot import REFERENCE_SEED, shown
 from .render_frames import frame_path, render_frames
-from .shot_records import Check, ShotFrame
+from .records import Check, ShotFrame
 
 SPP = 256
 

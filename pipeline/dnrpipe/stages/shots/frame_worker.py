@@ -76,9 +76,10 @@ class Worker:
 
     def __call__(self, asked: dict[str, Any]) -> FrameAnswer:
         task = FrameTask.model_validate(asked)
-        kernel = (task.way.name, task.way.spp, task.view.width, task.view.height)
+        kernel = (task.way.name, _at_once(task), task.view.width, task.view.height)
         if kernel not in self.warm:  # compiles the kernels, which is no cost of a frame
-            self.render(task.model_copy(update={"earlier": task.earlier and task.earlier[-1:]}), {})
+            way = task.way.model_copy(update={"spp": _at_once(task)})
+            self.render(task.model_copy(update={"way": way, "earlier": task.earlier and task.earlier[-1:]}), {})
             if self.base is not None:
                 self.base.seen = []
             self.warm.add(kernel)
@@ -182,10 +183,16 @@ class Worker:
             sensor = self.engine.sensor(view, task.lens)
             image, _ = self.engine.frame(self.common.bundle, integrator, sensor, view, spp, task.seed)
             return image.astype(np.float32)
-        each = 1 << max(0, min(spp, MAX_RAYS // (view.width * view.height)).bit_length() - 1)
+        each = _at_once(task)
         launches = -(-spp // each)
         total = sum(frames.path(view, each, task.seed * 4096 + launch) for launch in range(launches))
         return np.asarray(total, np.float32) / launches
+
+
+def _at_once(task: FrameTask) -> int:
+    """Samples per pixel of one launch: a power of two, so that few kernels are compiled."""
+    most = min(task.way.spp, MAX_RAYS // (task.view.width * task.view.height))
+    return 1 << max(0, most.bit_length() - 1)
 
 
 def _denoised(image: np.ndarray, guide: Any, way: Way) -> np.ndarray:

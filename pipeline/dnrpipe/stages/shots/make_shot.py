@@ -26,7 +26,8 @@ from .frame_tasks import Way
 from .plan_shot import equal_rung_of, lines, weigh
 from .render_frames import frame_tasks, picture_path, render_frames, write_movie
 from .renderers import Renderer, path_tracer, shipped_renderer, trained_renderer
-from .shot_records import RECORD, Option, ShotFrame, ShotRecord, Wanted, choose, facts
+from .options import Option, Wanted, choose
+from .records import RECORD, ShotFrame, ShotRecord, facts
 
 CHECKED = 2
 """Frames of a shot that are traced to check it."""

@@ -24,9 +24,9 @@ from ...workers.view_tasks import warn_of_retries
 from ..stage import Run
 from .frame_tasks import FrameCommon, FrameTask, Way
 from .frame_worker import COLOUR
-from .shot_records import ShotFrame
+from .records import ShotFrame
 
-FRAMES, SIDE = 2, 384
+FRAMES, SIDE = 2, 256
 """Frames of the pilot, and pixels of their longer side."""
 LADDER = (1, 4, 16, 64)
 """Samples per pixel of the path-traced pictures; those between are interpolated."""

@@ -18,7 +18,8 @@ from ..worth import worth
 from .frame_tasks import Way
 from .pilot import LADDER, Measured, Pilot, between
 from .renderers import Renderer, shipped_renderer
-from .shot_records import Option, ShotFrame, Wanted
+from .options import Option, Wanted
+from .records import ShotFrame
 
 OURS = (Way(name="base"), Way(name="neural"))
 LIGHT_PATH = 8.0

@@ -16,7 +16,7 @@ from ...workers.placement import HERE
 from ..base_images import CHUNK, WARM_UP
 from ..stage import Run
 from .frame_tasks import FrameCommon, FrameTask, Way
-from .shot_records import ShotFrame
+from .records import ShotFrame
 
 FRAMES_VERSION = 1
 

@@ -1,20 +1,15 @@
-"""What a shot is, what was expected of it, and what it became: ``shots/NAME/shot.json``."""
+"""Ways to make a shot, what they are expected to give and cost, and which is taken."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
-from dnrtrain.contract import View
 from dnrtrain.records import Record
 
-from ...core.scene_records import Lens
 from .frame_tasks import Way
-
-RECORD = "shot.json"
 
 
 class Wanted(BaseModel):
@@ -26,24 +21,6 @@ class Wanted(BaseModel):
     psnr: float | None = None
     lpips: float | None = None
     way: str | None = None
-
-
-class ShotFrame(BaseModel):
-    """A frame of the shot.
-
-    Args:
-        number: of the scene's timeline. camera: its name.
-        lens: of a camera with depth of field, scene units.
-        moving: names of what is elsewhere, or otherwise, than in the frame that was converted.
-    """
-
-    model_config = ConfigDict(frozen=True)
-
-    number: int
-    camera: str
-    view: View
-    lens: Lens | None = None
-    moving: tuple[str, ...] = ()
 
 
 class Option(Record):
@@ -71,51 +48,6 @@ class Option(Record):
         """Whether the quality is expected to be at least so good. What is None does not count."""
         enough = psnr is None or (self.psnr is not None and self.psnr >= psnr)
         return enough and (lpips is None or self.lpips is None or self.lpips <= lpips)
-
-
-class Check(Record):
-    """Held-out frames against references that were traced for it, over white; means over the frames.
-
-    spp: of the references. flip: LDR-FLIP. seconds: what it took.
-    """
-
-    frames: tuple[int, ...]
-    spp: int
-    psnr: float
-    ssim: float
-    lpips: float | None
-    flip: float
-    seconds: float
-
-
-class ShotRecord(Record):
-    """A shot as it was made.
-
-    Args:
-        options: what was weighed. chosen: of them. why: in a sentence.
-        still_way, moving_way: how frames were rendered that stand still, and that do not.
-        expected, spent: seconds from the plan on. spent_before: seconds of the conversion, the pilot and baked light.
-    """
-
-    name: str
-    scene: str
-    frames: tuple[int, ...]
-    cameras: tuple[str, ...]
-    width: int
-    height: int
-    fps: float
-    moving: dict[str, str]
-    moving_frames: tuple[int, ...]
-    options: tuple[Option, ...]
-    chosen: Option
-    why: str
-    still_way: Way
-    moving_way: Way | None
-    expected: float
-    spent_before: float
-    spent: float
-    check: Check | None
-    movie: str | None
 
 
 def choose(options: Sequence[Option], wanted: Wanted) -> tuple[Option, str]:
@@ -154,15 +86,3 @@ def choose(options: Sequence[Option], wanted: Wanted) -> tuple[Option, str]:
     if found is aim:
         return aim, "nothing cheaper has its quality"
     return found, "it has the quality of the neural renderer, and is cheaper here"
-
-
-def facts(frames: Sequence[ShotFrame]) -> dict[str, Any]:
-    """Frames, cameras and size for a `ShotRecord`."""
-    view = frames[0].view
-    return {
-        "frames": tuple(frame.number for frame in frames),
-        "cameras": tuple(dict.fromkeys(frame.camera for frame in frames)),
-        "width": view.width,
-        "height": view.height,
-        "moving_frames": tuple(frame.number for frame in frames if frame.moving),
-    }
