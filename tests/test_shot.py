@@ -13,6 +13,7 @@ bpy = pytest.importorskip("bpy")
 
 from tests import shot_scenes  # noqa: E402
 
+from dnrpipe.blender.motion import changes  # noqa: E402
 from dnrpipe.blender.shot import Worker  # noqa: E402
 from dnrpipe.blender.tasks import ShotTask  # noqa: E402
 from dnrpipe.core.cameras import shot_views  # noqa: E402
@@ -76,3 +77,55 @@ def test_any_camera_by_name(tmp_path: Path) -> None:
     assert str(path) in str(raised.value)
     with pytest.raises(UserError, match="'flat' is orthographic"):
         ask(path, camera="flat")
+
+
+def test_only_the_rolling_sphere_is_named(tmp_path: Path) -> None:
+    """Its camera moves too, on an empty of its own."""
+    shot = ask(shot_scenes.rolling(tmp_path))
+    (change,) = shot.changes
+    assert (change.name, change.kind, change.surfaces, change.frames) == ("ball", "moves", ("ball",), (3, 4, 5))
+    assert (shot.converted, shot.still, shot.changing(2), shot.changing(3)) == (1, [1, 2], [], ["ball"])
+
+
+def test_a_shot_of_which_only_the_cameras_move_evaluates_nothing(tmp_path: Path) -> None:
+    shot = ask(shot_scenes.cameras(tmp_path))
+    assert shot.changes == [] and shot.examined == 0 and shot.still == [1, 2, 3, 4, 5]
+
+
+def test_what_changes_is_named_with_its_kind_and_frames(tmp_path: Path) -> None:
+    shot = ask(shot_scenes.menagerie(tmp_path))
+    assert shot.examined == 4
+    assert {(change.name, change.kind): change.frames for change in shot.changes} == {
+        ("bending", "deforms"): (3, 4),
+        ("blinking", "appears or disappears"): (2,),
+        ("child", "moves"): (2, 3, 4),
+        ("copies", "moves"): (4,),
+        ("driven", "moves"): (2, 3, 4),
+        ("falling", "moves"): (2, 3, 4),
+        ("lamp", "light changes"): (4,),
+        ("nodes", "deforms"): (3, 4),
+        ("painted", "changes its material"): (3, 4),
+        ("shaped", "deforms"): (3, 4),
+        ("sign", "moves"): (3, 4),
+        ("sky", "world changes"): (2, 3, 4),
+        ("waving", "deforms"): (2, 3, 4),
+    }
+    assert next(change.surfaces for change in shot.changes if change.name == "copies") == ("member",)
+
+
+def test_frames_that_there_is_no_time_for_count_as_their_neighbours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Never fewer changes than all frames have; keys are among the frames that are looked at."""
+    path = shot_scenes.rolling(tmp_path)
+    every = ask(path, "-20-40")
+    monkeypatch.setattr(changes, "SECONDS", 0.0)
+    monkeypatch.setattr(changes, "LEAST", 6)
+    some = ask(path, "-20-40")
+    assert every.examined == 61 and some.examined < 10
+    assert set(every.changes[0].frames) <= set(some.changes[0].frames) and some.still
+
+
+def test_a_camera_that_a_simulation_carries_falls_with_it(tmp_path: Path) -> None:
+    heights = [camera.c2w[2][3] for camera in ask(shot_scenes.menagerie(tmp_path), camera="rider").cameras]
+    assert heights[0] == pytest.approx(9) and heights == sorted(heights, reverse=True) and heights[3] < 8.99

@@ -12,6 +12,7 @@ import bpy
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.scene_records import SceneCamera
 
+from .geometry.render_graph import with_render_graph
 from .passes.camera import describe
 from .reading.framing import usable
 
@@ -86,6 +87,31 @@ def shot_cameras(scene: bpy.types.Scene, frames: Sequence[int], name: str | None
             raise UserError(f"camera '{camera.name}' cannot see at frame {frame}: its lens or scale is 0 or not finite")
         cameras.append(seen)
     return cameras
+
+
+def cameras_in_place(scene: bpy.types.Scene, cameras: Sequence[SceneCamera]) -> list[SceneCamera]:
+    """The cameras of a shot once more, evaluated with their whole scene: simulations may carry them."""
+    found: dict[int | None, SceneCamera] = {}
+    active: Any = scene.camera
+    for name in dict.fromkeys(camera.name for camera in cameras):
+        own: Any = _named(scene, name)
+        frames = [camera.frame for camera in cameras if camera.name == name]
+        scene.camera = own  # what pictures are taken with is evaluated, wherever it lies
+        found |= with_render_graph(
+            scene, lambda engine, graph, own=own, frames=frames: _seen(engine, graph, own, frames)
+        )
+    scene.camera = active
+    return [found[camera.frame] for camera in cameras]
+
+
+def _seen(engine: Any, graph: Any, camera: Any, frames: Sequence[int | None]) -> dict[int | None, SceneCamera]:
+    now, subframe = graph.scene.frame_current, graph.scene.frame_subframe
+    found = {}
+    for frame in frames:
+        engine.frame_set(frame, 0.0)
+        found[frame] = describe(camera.evaluated_get(graph)).model_copy(update={"frame": frame})
+    engine.frame_set(now, subframe)
+    return found
 
 
 def _named(scene: bpy.types.Scene, name: str) -> Any:

@@ -10,7 +10,10 @@ from dnrpipe.core.cameras import require_perspective
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.shot_records import ShotFacts
 
-from .cameras import picture_size, shot_cameras
+from .cameras import cameras_in_place, picture_size, shot_cameras
+from .motion.changes import find_changes
+from .motion.simulations import is_simulated
+from .motion.suspects import settings_with_keys
 from .reading.opening import open_scene
 from .tasks import ShotTask
 
@@ -39,8 +42,11 @@ def look_at_shot(task: ShotTask) -> ShotFacts:
     try:
         cameras = shot_cameras(scene, frames, task.camera)
         require_perspective(cameras)
+        changes, examined = find_changes(scene, frames)
+        if is_simulated(scene):
+            cameras = cameras_in_place(scene, cameras)
     except UserError as error:
-        raise UserError(f"{task.source}: {error}") from None
+        raise type(error)(f"{task.source}: {error}") from None
     return ShotFacts(
         cameras=cameras,
         fps=render.fps / render.fps_base,
@@ -48,4 +54,15 @@ def look_at_shot(task: ShotTask) -> ShotFacts:
         frame_end=scene.frame_end,
         resolution=picture_size(scene),
         pixel_aspect=render.pixel_aspect_y / render.pixel_aspect_x,
+        converted=scene.frame_current,
+        changes=changes,
+        examined=examined,
+        warnings=_warnings(scene),
     )
+
+
+def _warnings(scene: Any) -> list[str]:
+    keyed = settings_with_keys(scene)
+    if not keyed:
+        return []
+    return [f"settings of the scene with keys stay as at frame {scene.frame_current}: {', '.join(keyed)}"]

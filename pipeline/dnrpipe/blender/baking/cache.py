@@ -172,7 +172,7 @@ def _warn_of_image(node: Any, material: str, findings: Findings) -> None:
     if image.source in {"SEQUENCE", "MOVIE"}:
         findings.add("approximated", f"animated {name}", "one frame is used", material=material)
     if image.source == "SEQUENCE":  # Blender counts only while it draws
-        node.image_user.frame_current = _frame_shown(node.image_user, bpy.context.scene.frame_current)
+        node.image_user.frame_current = frame_shown(node.image_user, bpy.context.scene.frame_current)
     path = Path(bpy.path.abspath(image.filepath_from_user(image_user=node.image_user), library=image.library))
     lost = image.source == "SEQUENCE" and not image.packed_files and not is_file(path)
     if lost or (image.source != "TILED" and not _is_readable(image)):
@@ -180,7 +180,7 @@ def _warn_of_image(node: Any, material: str, findings: Findings) -> None:
         findings.add("missing", name, note, material=material)
 
 
-def _frame_shown(user: Any, now: int) -> int:
+def frame_shown(user: Any, now: int) -> int:
     """Number in the file name of a sequence's image at a frame of the scene (Blender's BKE_image_user_frame_get)."""
     count, frame = max(user.frame_duration, 1), now - user.frame_start
     return user.frame_offset + 1 + (frame % count if user.use_cyclic else min(max(frame, 0), count - 1))
