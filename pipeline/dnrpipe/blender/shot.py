@@ -54,6 +54,7 @@ def look_at_shot(task: ShotTask) -> ShotFacts:
         frame_end=scene.frame_end,
         resolution=picture_size(scene),
         pixel_aspect=render.pixel_aspect_y / render.pixel_aspect_x,
+        film_transparent=render.film_transparent,
         converted=scene.frame_current,
         changes=changes,
         examined=examined,

@@ -25,7 +25,9 @@ from .options import amount, common, open_session
 )
 @click.option("--name", metavar="NAME", help="Of the shot's folder (default: the camera's name).")
 @click.option("--transparent", is_flag=True, help="The world behind everything is left out, and alpha says so.")
-@click.option("--dry-run", is_flag=True, help="Say which way is chosen and what it is expected to take; render nothing.")
+@click.option(
+    "--dry-run", is_flag=True, help="Say which way is chosen and what it is expected to take; render nothing."
+)
 @common
 def shot(
     scene: Path | None,
@@ -75,9 +77,7 @@ def shot(
         size=None if size is None else parse_size(size),
         camera=camera,
         camera_file=camera_file,
-        wanted=Wanted(
-            seconds=amount("--time", duration, parse_seconds), psnr=target_psnr, lpips=target_lpips, way=way
-        ),
+        wanted=Wanted(seconds=amount("--time", duration, parse_seconds), psnr=target_psnr, lpips=target_lpips, way=way),
         name=name,
         transparent=transparent,
         only_plan=dry_run,

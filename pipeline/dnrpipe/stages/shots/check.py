@@ -13,8 +13,8 @@ from ...core.images import flip_error, picture_of, write_png
 from ..stage import Run
 from .frame_tasks import FrameCommon, FrameTask, Way
 from .pilot import REFERENCE_SEED, shown
-from .render_frames import frame_path, render_frames
 from .records import Check, ShotFrame
+from .render_frames import frame_path, render_frames
 
 SPP = 256
 

@@ -26,6 +26,7 @@ from dnrtrain.contract import View
 from dnrtrain.dataset import view_in_memory
 from dnrtrain.display import DisplayTransform
 from dnrtrain.exr import write_exr
+from dnrtrain.model import render
 
 from ..trainer import torch_device
 from .frame_tasks import FrameAnswer, FrameCommon, FrameTask, Way
@@ -152,14 +153,11 @@ class Worker:
 
     def _corrected(self, view: View, channels: dict[str, np.ndarray]) -> np.ndarray:
         """The network's radiance, linear Rec.709, straight, float32 [H, W, 3]."""
-        import torch
-
         data = view_in_memory(channels, self.common.frame, view, display=self.display, base="baked")
-        with torch.inference_mode():
-            radiance = self.model(data.tensors.to(next(self.model.parameters()).device)).radiance
+        radiance = render(self.model, data.to(next(self.model.parameters()).device)).radiance
         if radiance is None:
             raise UserError("shots need a model whose output is radiance: type --set model.output=log")
-        return radiance[0].float().permute(1, 2, 0).cpu().numpy()
+        return radiance[0].permute(1, 2, 0).numpy()
 
     def _path(self, task: FrameTask, timed: Callable[..., Any]) -> tuple[dict[str, np.ndarray], int]:
         view, way = task.view, task.way
@@ -177,9 +175,7 @@ class Worker:
         """Path-traced RGBA, premultiplied, float32 [H, W, 4], in launches that fit in memory."""
         view, spp = task.view, task.way.spp
         if task.lens is not None:
-            integrator, _ = self.engine.integrator(
-                self.common.bundle, self.common.integrator, self.common.max_depth
-            )
+            integrator, _ = self.engine.integrator(self.common.bundle, self.common.integrator, self.common.max_depth)
             sensor = self.engine.sensor(view, task.lens)
             image, _ = self.engine.frame(self.common.bundle, integrator, sensor, view, spp, task.seed)
             return image.astype(np.float32)

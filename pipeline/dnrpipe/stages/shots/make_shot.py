@@ -22,12 +22,11 @@ from ..session import Session
 from ..stage import Run
 from ..trainer import perceptual_weights
 from .check import check, held_out
-from .frame_tasks import Way
+from .options import Option, Wanted, choose
 from .plan_shot import equal_rung_of, lines, weigh
+from .records import RECORD, ShotFrame, ShotRecord, facts
 from .render_frames import frame_tasks, picture_path, render_frames, write_movie
 from .renderers import Renderer, path_tracer, shipped_renderer, trained_renderer
-from .options import Option, Wanted, choose
-from .records import RECORD, ShotFrame, ShotRecord, facts
 
 CHECKED = 2
 """Frames of a shot that are traced to check it."""

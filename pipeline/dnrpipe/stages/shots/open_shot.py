@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +27,19 @@ FPS = 24.0
 
 @dataclass(frozen=True)
 class ShotFile:
-    """A shot as its file has it. moving: what changes over its frames, in words, by name."""
+    """A shot as its file has it.
+
+    Args:
+        moving: what changes over its frames, in words, by name.
+        transparent: the world behind everything is left out.
+        warnings: lines for the user.
+    """
 
     frames: list[ShotFrame]
     fps: float
-    moving: dict[str, str]
+    moving: dict[str, str] = field(default_factory=dict)
+    transparent: bool = False
+    warnings: tuple[str, ...] = ()
 
 
 def parse_size(text: str) -> tuple[int, int]:
@@ -51,12 +59,26 @@ def shot_of_scene(
     views = shot_views(found, *(size or found.resolution))
     return ShotFile(
         [
-            ShotFrame(number=int(own.frame or 0), camera=own.name, view=view, lens=own.dof)
-            for own, view in zip(found.cameras, views, strict=True)
+            ShotFrame(number=number, camera=own.name, view=view, lens=own.dof, moving=tuple(found.changing(number)))
+            for number, own, view in zip(found.frames, found.cameras, views, strict=True)
         ],
         found.fps,
-        {},
+        {change.name: f"{change.kind} in {told_frames(change.frames)}" for change in found.changes},
+        found.film_transparent,
+        tuple(found.warnings),
     )
+
+
+def told_frames(frames: Sequence[int]) -> str:
+    """``frames 2-5, 9`` of rising numbers."""
+    runs: list[list[int]] = []
+    for frame in frames:
+        if runs and frame == runs[-1][1] + 1:
+            runs[-1][1] = frame
+        else:
+            runs.append([frame, frame])
+    told = ", ".join(str(first) if first == last else f"{first}-{last}" for first, last in runs)
+    return f"frame{'s' if len(frames) > 1 else ''} {told}"
 
 
 def shot_of_cameras(path: Path, session: Session, size: tuple[int, int] | None) -> ShotFile:
@@ -69,7 +91,7 @@ def shot_of_cameras(path: Path, session: Session, size: tuple[int, int] | None) 
     views = read_camera_file(path, cameras.model_copy(update={"width": width, "height": height}))
     if size is not None:
         views = [resized(view, *size) for view in views]
-    return ShotFile([ShotFrame(number=i + 1, camera=path.stem, view=view) for i, view in enumerate(views)], FPS, {})
+    return ShotFile([ShotFrame(number=i + 1, camera=path.stem, view=view) for i, view in enumerate(views)], FPS)
 
 
 def resized(view: View, width: int, height: int) -> View:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -173,7 +174,7 @@ def between(measured: Sequence[Measured]) -> list[Measured]:
     interpolated: quality by the logarithm of the samples, seconds by the samples."""
     rungs = sorted(measured, key=lambda found: found.way.spp)
     result: list[Measured] = []
-    for low, high in zip(rungs, rungs[1:], strict=False):
+    for low, high in pairwise(rungs):
         spp = low.way.spp
         while spp < high.way.spp:
             t = math.log2(spp / low.way.spp) / math.log2(high.way.spp / low.way.spp)

@@ -16,10 +16,10 @@ from ..base_images import base_renderer, light_size, light_spp
 from ..stage import Run
 from ..worth import worth
 from .frame_tasks import Way
-from .pilot import LADDER, Measured, Pilot, between
-from .renderers import Renderer, shipped_renderer
 from .options import Option, Wanted
+from .pilot import LADDER, Measured, Pilot, between
 from .records import ShotFrame
+from .renderers import Renderer, shipped_renderer
 
 OURS = (Way(name="base"), Way(name="neural"))
 LIGHT_PATH = 8.0

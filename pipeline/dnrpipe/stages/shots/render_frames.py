@@ -134,4 +134,3 @@ def write_movie(path: Path, pictures: Sequence[Path], fps: float) -> None:
             with Image.open(picture) as image:
                 writer.send(np.ascontiguousarray(np.pad(np.asarray(image.convert("RGB")), pad, mode="edge")))
         writer.close()
-

@@ -44,6 +44,10 @@ def carry_out(session: Session, request: ShotRequest) -> dict[str, Any]:
     name = file_name(request.name or (request.camera_file.stem if request.camera_file else file.frames[0].camera))
     cameras = ", ".join(dict.fromkeys(frame.camera for frame in file.frames))
     console.say(f"shot {name}: {len(file.frames)} frames, {view.width}x{view.height}, camera {cameras}")
+    for warning in file.warnings:
+        console.warn(warning)
+    for thing, change in file.moving.items():
+        console.say(f"  {thing} {change}: path-traced there")
     folder = workspace.root / "shots" / name
     prepare_for(session, folder, file.frames, held_out(file.frames, CHECKED))
     shot = Shot(
@@ -51,7 +55,7 @@ def carry_out(session: Session, request: ShotRequest) -> dict[str, Any]:
         frames=file.frames,
         moving=file.moving,
         fps=file.fps,
-        background=not request.transparent,
+        background=not (request.transparent or file.transparent),
         wanted=request.wanted,
         at_frame=None,  # type: ignore
     )
