@@ -175,7 +175,8 @@ def between(measured: Sequence[Measured]) -> list[Measured]:
     rungs = sorted(measured, key=lambda found: found.way.spp)
     result: list[Measured] = []
     for low, high in pairwise(rungs):
-        spp = low.way.spp
+        result.append(low)
+        spp = 2 * low.way.spp
         while spp < high.way.spp:
             t = math.log2(spp / low.way.spp) / math.log2(high.way.spp / low.way.spp)
             share = (spp - low.way.spp) / (high.way.spp - low.way.spp)

@@ -22,7 +22,7 @@ from .records import ShotFrame
 from .renderers import Renderer, shipped_renderer
 
 OURS = (Way(name="base"), Way(name="neural"))
-LIGHT_PATH = 8.0
+LIGHT_PATH = 2.5
 """Seconds of a path of baked light over those of a camera path: it sets out from everywhere, in all directions."""
 
 
