@@ -67,7 +67,7 @@ def plan_shot(session: Session, shot: Shot) -> Planned:
     started = time.monotonic()
     run = session.run.for_stage("render")
     tracer = path_tracer(run, shot.background)
-    options, ours = weigh(run, shot.frames, folder_of(run, shot) / "pilot", shot.wanted, tracer, _lpips(run))
+    options, ours = weigh(run, shot.frames, folder_of(run, shot) / "pilot", shot.wanted, tracer, lpips_of(run))
     chosen, why = choose(options, shot.wanted)
     for line in lines(options, chosen, why):
         run.console.say(line)
@@ -114,7 +114,7 @@ def make_shot(session: Session, shot: Shot, planned: Planned) -> ShotRecord:
     spent = time.monotonic() - started
     places = set(held_out(shot.frames, CHECKED))
     checked = [(own.common, own.environment, sorted(places & set(of_it))) for own, of_it in tracers]
-    found = check(run, [row for row in checked if row[2]], shot.frames, folder, inputs, _lpips(run))
+    found = check(run, [row for row in checked if row[2]], shot.frames, folder, inputs, lpips_of(run))
     record = ShotRecord(
         name=shot.name,
         scene=run.workspace.manifest.source.path,
@@ -143,7 +143,7 @@ def folder_of(run: Run, shot: Shot) -> Path:
     return folder
 
 
-def _lpips(run: Run) -> Any:
+def lpips_of(run: Run) -> Any:
     """LPIPS with AlexNet, or None where its weights are missing."""
     weights = perceptual_weights(run.console)
     if weights is None:

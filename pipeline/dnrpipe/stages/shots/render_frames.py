@@ -19,11 +19,13 @@ from .frame_tasks import FrameCommon, FrameTask, Way
 from .records import ShotFrame
 
 FRAMES_VERSION = 1
+FRAMES_FOLDER = "frames"
+"""Of a shot's folder."""
 
 
 def frame_path(folder: Path, frame: ShotFrame) -> Path:
     """A frame's scene-linear layers."""
-    return folder / "frames" / f"{frame.number:05d}.exr"
+    return folder / FRAMES_FOLDER / f"{frame.number:05d}.exr"
 
 
 def picture_path(folder: Path, frame: ShotFrame) -> Path:
