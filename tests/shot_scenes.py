@@ -49,11 +49,24 @@ def cameras(folder: Path) -> Path:
 
 
 def rolling(folder: Path) -> Path:
-    """A sphere rolls from frame 2 to 4; the camera moves all the time, on an empty that nothing else hangs on."""
+    """A red sphere, rough and bumpy by noise, rolls two units to the right from frame 2 to 4.
+
+    The camera moves all the time, on an empty that nothing else hangs on.
+    """
     scene, wide = still()
     bpy.ops.mesh.primitive_uv_sphere_add(segments=16, ring_count=8, radius=1, location=(0, 0, 1))
     ball = bpy.context.object
     ball.name = "ball"
+    skin = material("skin", colour=(0.8, 0.02, 0.02))
+    principled = skin.node_tree.nodes["Principled BSDF"]
+    noise, bump = (skin.node_tree.nodes.new(f"ShaderNode{name}") for name in ("TexNoise", "Bump"))
+    for output, socket in (
+        (noise.outputs["Fac"], principled.inputs["Roughness"]),
+        (noise.outputs["Fac"], bump.inputs["Height"]),
+        (bump.outputs["Normal"], principled.inputs["Normal"]),
+    ):
+        skin.node_tree.links.new(output, socket)
+    ball.data.materials.append(skin)
     for frame, x in ((2, 0.0), (4, 2.0)):
         ball.location.x, ball.rotation_euler.y = x, x
         ball.keyframe_insert("location", frame=frame)

@@ -106,6 +106,33 @@ class ShotTask(Task):
     camera: str | None = None
 
 
+# -- scene_at_frame: a converted scene, as it is at other frames ----------------------------------------------------
+
+
+class FrameCommon(Task):
+    """A scene file and its conversion.
+
+    Args:
+        scene_dir: of the conversion, whose atlas, bakes and textures the frames take over.
+        bakes: without ``refused``.
+        lit: whether the file brings light of its own at the frame that was converted; where it does, a dark frame
+            stays dark.
+    """
+
+    source: Path
+    scene_dir: Path
+    bakes: BakeOptions
+    lit: bool
+
+
+class FrameTask(Task):
+    """Write the bundle of the scene at ``frame`` into the folder ``output``. Answers a `PrepareAnswer`."""
+
+    frame: int
+    output: Path
+    refused: tuple[str, ...] = ()
+
+
 # -- baking.bake: values of sockets over the atlas --------------------------------------------------------------
 
 

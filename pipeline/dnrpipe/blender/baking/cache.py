@@ -22,6 +22,7 @@ from ..reading.missing import is_file
 from ..shading.sockets import Source
 from ..shading.textures import Placement, Textured
 from ..tasks import MaterialTaps, Tap, ValueKind
+from .earlier import Earlier
 from .graph import AROUND, FROM_CAMERA, PER_OBJECT, VIEW_DEPENDENT, GraphHasher, labels, upstream
 from .mesh import MAX_OWN, is_object_space, object_info
 from .regions import Atlas
@@ -36,6 +37,7 @@ class BakeCache:
 
     folder: the cache. refused: keys that could not be baked; they are approximated instead. missing: (material, value)
     by key, to be baked. used: keys that were asked for. used_atlas: whether other values were resampled into the atlas.
+    materials: that asked for either. earlier: the conversion of another frame, whose bakes are taken where they hold.
     """
 
     atlas: Atlas
@@ -44,6 +46,8 @@ class BakeCache:
     missing: dict[str, tuple[str, Tap]] = field(default_factory=dict)
     used: set[str] = field(default_factory=set)
     used_atlas: bool = False
+    materials: set[str] = field(default_factory=set)
+    earlier: Earlier | None = None
     _graphs: GraphHasher = field(default_factory=GraphHasher)
     _meshes: dict[int, str] = field(default_factory=dict)
 
@@ -53,6 +57,7 @@ class BakeCache:
         Colours and normals (n * 0.5 + 0.5, world space) have three channels, scalars one. socket: the name of the
         shader input it feeds, for the finding.
         """
+        self.materials.add(material)
         region = self.atlas.region(material)
         if not len(region.texels):
             return None
@@ -142,7 +147,8 @@ class BakeCache:
         types = {entry.node.type for entry in nodes}
         parts = self.atlas.parts(material)
         for part in parts:
-            digest.update(self._mesh(part.mesh).encode())
+            mesh = part.mesh if self.earlier is None else self.earlier.stand_in(part.mesh, kind, nodes)
+            digest.update(self._mesh(mesh).encode())
             digest.update(part.triangles.tobytes())
             if types & PER_OBJECT:
                 digest.update(repr(object_info(part.mesh)).encode())

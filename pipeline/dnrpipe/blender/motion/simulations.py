@@ -35,14 +35,16 @@ def _is_played(modifier: Any) -> bool:
     return modifier.type in PLAYED
 
 
-def play(scene: Any, last: int) -> None:
+def play(scene: Any, last: int, after: int | None = None) -> None:
     """Go through the frames up to ``last`` in order, so that simulations that are not baked know them.
+
+    after: the last frame that was played to before; None begins with the simulations.
 
     Blender keeps in memory what it computed; a frame that is jumped to is computed as if it followed the last one. The
     scene is back at its frame afterwards.
     """
     now, subframe = scene.frame_current, scene.frame_subframe
-    for frame in range(_first_frame(scene), last + 1):
+    for frame in range(_first_frame(scene) if after is None else after + 1, last + 1):
         scene.frame_set(frame)
     scene.frame_set(now, subframe=subframe)
 
