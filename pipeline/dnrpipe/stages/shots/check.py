@@ -11,10 +11,11 @@ import numpy as np
 
 from ...core.images import flip_error, picture_of, write_png
 from ..stage import Run
-from .frame_tasks import FrameCommon, FrameTask, Way
+from .frame_tasks import FrameTask, Way
 from .pilot import REFERENCE_SEED, shown
 from .records import Check, ShotFrame
 from .render_frames import frame_path, render_frames
+from .renderers import Renderer
 
 SPP = 256
 
@@ -32,7 +33,7 @@ def held_out(frames: Sequence[ShotFrame], count: int) -> list[int]:
 
 def check(
     run: Run,
-    commons: Sequence[tuple[FrameCommon, dict[str, str], list[int]]],
+    tracers: Sequence[tuple[Renderer, list[int]]],
     frames: Sequence[ShotFrame],
     folder: Path,
     inputs: Any,
@@ -40,7 +41,7 @@ def check(
 ) -> Check:
     """Trace the frames and compare; pictures of both and of the error lie in ``check/``.
 
-    commons: (what renders frames, its environment, places of the frames to check).
+    tracers: (path tracer, places of the frames to check by it).
     """
     from dnrtrain.metrics import psnr, ssim
 
@@ -48,7 +49,7 @@ def check(
     way = Way(name="path", spp=SPP)
     rows: list[dict[str, float]] = []
     numbers: list[int] = []
-    for common, environment, places in commons:
+    for tracer, places in tracers:
         tasks = []
         for place in places:
             frame = frames[place]
@@ -64,7 +65,7 @@ def check(
                     fingerprint=_fingerprint(inputs, frame, way),
                 )
             )
-        render_frames(run, common, environment, tasks, label="frames to check by", purpose="evaluation")
+        render_frames(run, tracer, tasks, label="frames to check by", purpose="evaluation")
         for place, task in zip(places, tasks, strict=True):
             frame = frames[place]
             ours, truth = shown(run, frame_path(folder, frame)), shown(run, task.output)

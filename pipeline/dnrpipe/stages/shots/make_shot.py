@@ -6,30 +6,37 @@ Everything lies in ``shots/NAME`` of the workspace: ``frames/`` (EXR), ``picture
 
 from __future__ import annotations
 
+import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dnrtrain.records import write
+from dnrtrain.records import read, write
 
 from ...core.scene_files import scene_fingerprint
 from ...core.units import duration
 from ...core.workspace import digest, file_sha256
+from ...workers.view_tasks import is_made
 from ..base_images import BASE_VERSION
 from ..session import Session
+from ..shot_scene import convert_frames, scene_at
 from ..stage import Run
 from ..trainer import perceptual_weights
 from .check import check, held_out
-from .options import Option, Wanted, choose
+from .frame_tasks import Way
+from .options import Wanted, choose
 from .plan_shot import equal_rung_of, lines, weigh
-from .records import RECORD, ShotFrame, ShotRecord, facts
+from .records import PLAN, RECORD, ShotFrame, ShotPlan, ShotRecord, facts
 from .render_frames import frame_tasks, picture_path, render_frames, write_movie
 from .renderers import Renderer, path_tracer, shipped_renderer, trained_renderer
 
 CHECKED = 2
 """Frames of a shot that are traced to check it."""
+PLAN_VERSION = 1
+BATCH = 8
+"""Bundles of single frames that are on disk at once."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +46,6 @@ class Shot:
     Args:
         moving: what changes over its frames, in words, by name.
         background: the camera sees the world behind everything.
-        at_frame: converts the scene at a frame -> its bundle.
     """
 
     name: str
@@ -48,43 +54,44 @@ class Shot:
     fps: float
     background: bool
     wanted: Wanted
-    at_frame: Callable[[Run, int], Path]
 
 
-@dataclass(frozen=True)
-class Planned:
-    """options: what was weighed. chosen: of them. ours: renders with baked light, where it was weighed."""
-
-    options: list[Option]
-    chosen: Option
-    why: str
-    ours: Renderer | None
-    seconds: float
-
-
-def plan_shot(session: Session, shot: Shot) -> Planned:
-    """Measure ways to make the shot on small frames, choose, and say so."""
+def plan_shot(session: Session, shot: Shot) -> ShotPlan:
+    """Measure ways to make the shot on small frames, choose, and say so. A plan of the same shot is kept."""
     started = time.monotonic()
     run = session.run.for_stage("render")
-    tracer = path_tracer(run, shot.background)
-    options, ours = weigh(run, shot.frames, folder_of(run, shot) / "pilot", shot.wanted, tracer, lpips_of(run))
-    chosen, why = choose(options, shot.wanted)
-    for line in lines(options, chosen, why):
+    tracer, path = path_tracer(run, shot.background), folder_of(run, shot) / PLAN
+    inputs = [tracer.common.model_dump(mode="json"), run.scene_fingerprint, shot.wanted.model_dump(mode="json")]
+    frames = [frame.model_dump(mode="json") for frame in shot.frames]
+    fingerprint = digest([PLAN_VERSION, *inputs, frames, run.settings.model_dump(mode="json")])
+    plan = read(path, ShotPlan) if path.exists() and not session.options["force"] else None
+    if plan is None or plan.fingerprint != fingerprint:
+        options = weigh(run, shot.frames, folder_of(run, shot) / "pilot", shot.wanted, tracer, lpips_of(run))
+        chosen, why = choose(options, shot.wanted)
+        plan = ShotPlan(
+            fingerprint=fingerprint,
+            options=tuple(options),
+            chosen=chosen,
+            why=why,
+            seconds=time.monotonic() - started,
+        )
+        write(path, plan)
+    for line in lines(plan.options, plan.chosen, plan.why):
         run.console.say(line)
-    return Planned(options, chosen, why, ours, time.monotonic() - started)
+    return plan
 
 
-def make_shot(session: Session, shot: Shot, planned: Planned) -> ShotRecord:
+def make_shot(session: Session, shot: Shot, plan: ShotPlan) -> ShotRecord:
     """Carry the plan out: train where it says so, render all frames, make the movie, check.
 
     Raises UserError, TasksFailed: as the stages do.
     """
     started = time.monotonic()
-    run, chosen = session.run.for_stage("render"), planned.chosen
+    run, chosen = session.run.for_stage("render"), plan.chosen
     folder, tracer = folder_of(run, shot), path_tracer(run, shot.background)
     renderer = tracer
     if chosen.way.name != "path":
-        renderer = planned.ours or shipped_renderer(run, shot.background)
+        renderer = shipped_renderer(run, shot.background)
         if chosen.views:
             session.settings = session.settings.with_budget(chosen.views)
             session.stages("select", "raytrace", "finetune")
@@ -92,42 +99,32 @@ def make_shot(session: Session, shot: Shot, planned: Planned) -> ShotRecord:
             renderer = trained_renderer(run, shot.background)
     inputs = _inputs(run, renderer)
     still = [place for place, frame in enumerate(shot.frames) if not frame.moving]
-    render_frames(
-        run,
-        renderer.common,
-        renderer.environment,
-        frame_tasks(shot.frames, folder, chosen.way, inputs, still),
-        label=f"frames by {chosen.way.told}",
-    )
-    moving = [place for place, frame in enumerate(shot.frames) if frame.moving]
-    moving_way = equal_rung_of(planned.options, chosen) if moving else None
-    tracers = [(tracer, still)]
-    for place in moving:
-        assert moving_way is not None
-        own = tracer.of_bundle(shot.at_frame(run, shot.frames[place].number))
-        tracers.append((own, [place]))
-        tasks = frame_tasks(shot.frames, folder, moving_way, inputs, [place])
-        label = f"frame {shot.frames[place].number} by {moving_way.told}"
-        render_frames(run, own.common, own.environment, tasks, label=label)
+    tasks = frame_tasks(shot.frames, folder, chosen.way, inputs, still)
+    render_frames(run, renderer, tasks, label=f"frames by {chosen.way.told}")
+    places = held_out(shot.frames, CHECKED)
+    moving_way = render_moving(run, shot, plan, tracer, inputs, places)
     movie = folder / f"{shot.name}.mp4"
     write_movie(movie, [picture_path(folder, frame) for frame in shot.frames], shot.fps)
     spent = time.monotonic() - started
-    places = set(held_out(shot.frames, CHECKED))
-    checked = [(own.common, own.environment, sorted(places & set(of_it))) for own, of_it in tracers]
-    found = check(run, [row for row in checked if row[2]], shot.frames, folder, inputs, lpips_of(run))
+    tracers = [(tracer, [place for place in places if not shot.frames[place].moving])]
+    tracers += [
+        (tracer.at_frame(run, shot.frames[place].number), [place]) for place in places if shot.frames[place].moving
+    ]
+    found = check(run, tracers, shot.frames, folder, inputs, lpips_of(run))
+    shutil.rmtree(scene_at(run.workspace, 0).parent, ignore_errors=True)  # bundles of single frames
     record = ShotRecord(
         name=shot.name,
         scene=run.workspace.manifest.source.path,
         **facts(shot.frames),
         fps=shot.fps,
         moving=shot.moving,
-        options=tuple(planned.options),
+        options=plan.options,
         chosen=chosen,
-        why=planned.why,
+        why=plan.why,
         still_way=chosen.way,
         moving_way=moving_way,
         expected=chosen.seconds,
-        spent_before=planned.seconds,
+        spent_before=plan.seconds,
         spent=spent,
         check=found,
         movie=str(movie),
@@ -135,6 +132,30 @@ def make_shot(session: Session, shot: Shot, planned: Planned) -> ShotRecord:
     write(folder / RECORD, record)
     _tell(run, record)
     return record
+
+
+def render_moving(
+    run: Run, shot: Shot, plan: ShotPlan, tracer: Renderer, inputs: str, checked: Sequence[int]
+) -> Way | None:
+    """Path trace the frames in which things move, each of the scene as it is then -> how; None: there are none.
+
+    Bundles of frames that are ``checked`` stay; the others would fill the disk.
+    """
+    moving = [place for place, frame in enumerate(shot.frames) if frame.moving]
+    if not moving:
+        return None
+    folder, way = folder_of(run, shot), equal_rung_of(plan.options, plan.chosen)
+    tasks = dict(zip(moving, frame_tasks(shot.frames, folder, way, inputs, moving), strict=True))
+    due = [place for place in moving if place in checked or not is_made(tasks[place].data())]
+    for batch in (due[first : first + BATCH] for first in range(0, len(due), BATCH)):
+        convert_frames(run, [shot.frames[place].number for place in batch])
+        for place in batch:
+            number = shot.frames[place].number
+            own = tracer.at_frame(run, number)
+            render_frames(run, own, [tasks[place]], label=f"frame {number} by {way.told}")
+            if place not in checked:
+                shutil.rmtree(scene_at(run.workspace, number))
+    return way
 
 
 def folder_of(run: Run, shot: Shot) -> Path:

@@ -54,10 +54,8 @@ class Pilot:
 
     def __init__(self, run: Run, frames: Sequence[ShotFrame], folder: Path, lpips: Any) -> None:
         still = [i for i, frame in enumerate(frames) if not frame.moving]
-        if not still:
-            raise UserError("no frame of the shot stands still: there is nothing to measure on")
         self.run, self.frames, self.folder, self.lpips = run, frames, folder, lpips
-        self.chosen = spread(still, FRAMES)
+        self.chosen = spread(still or range(len(frames)), FRAMES)  # where all move: as converted
         self.seconds = 0.0
         self.references: dict[int, Any] = {}
 

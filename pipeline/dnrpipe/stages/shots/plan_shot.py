@@ -41,8 +41,8 @@ class Shape:
 
 def weigh(
     run: Run, frames: Sequence[ShotFrame], folder: Path, wanted: Wanted, tracer: Renderer, lpips: Any
-) -> tuple[list[Option], Renderer | None]:
-    """(ways to make the shot, what renders those with baked light or None where they are not weighed)."""
+) -> list[Option]:
+    """Ways to make the shot."""
     view = frames[0].view
     moving = sum(bool(frame.moving) for frame in frames)
     shape = Shape(len(frames) - moving, moving, view.width * view.height, _conversion_seconds(run))
@@ -52,7 +52,7 @@ def weigh(
     options = [path_option(found, shape) for found in ladder]
     if why := _no_baked_light(run, frames, shape, ladder, wanted):
         run.console.say(f"baked light is not weighed: {why}")
-        return options, None
+        return options
     ours = shipped_renderer(run, tracer.common.background)
     measured = pilot.measure(ours.common, ours.environment, OURS)
     options += [baked_option(found, ladder, shape) for found in measured]
@@ -72,7 +72,7 @@ def weigh(
                     }
                 )
             )
-    return options, ours
+    return options
 
 
 def path_option(found: Measured, shape: Shape) -> Option:
@@ -104,7 +104,7 @@ def lines(options: Sequence[Option], chosen: Option, why: str) -> list[str]:
     for option in sorted(options, key=lambda option: option.seconds):
         quality = "" if option.psnr is None else f"{option.psnr:6.2f} dB"
         quality += "" if option.lpips is None else f"  LPIPS {option.lpips:.4f}"
-        mark = "->" if option is chosen else "  "
+        mark = "->" if option == chosen else "  "
         rows.append(f"{mark} {duration(option.seconds):>12}  {quality:<24} {option.told}")
     return [*rows, f"{chosen.told}: {why}"]
 

@@ -1,4 +1,4 @@
-"""The frames of a shot, and what became of it: ``shots/NAME/shot.json``."""
+"""The frames of a shot, its plan, and what became of it: ``plan.json`` and ``shot.json`` of its folder."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ...core.scene_records import Lens
 from .frame_tasks import Way
 from .options import Option
 
-RECORD = "shot.json"
+PLAN, RECORD = "plan.json", "shot.json"
 
 
 class ShotFrame(BaseModel):
@@ -33,6 +33,22 @@ class ShotFrame(BaseModel):
     view: View
     lens: Lens | None = None
     moving: tuple[str, ...] = ()
+
+
+class ShotPlan(Record):
+    """How a shot is to be made.
+
+    Args:
+        fingerprint: of all that it was made from.
+        options: what was weighed. chosen: of them; why: in a sentence.
+        seconds: what it took, baked light included.
+    """
+
+    fingerprint: str
+    options: tuple[Option, ...]
+    chosen: Option
+    why: str
+    seconds: float
 
 
 class Check(Record):

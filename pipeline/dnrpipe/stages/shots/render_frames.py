@@ -15,8 +15,9 @@ from ...core.workspace import digest
 from ...workers.placement import HERE
 from ..base_images import CHUNK, WARM_UP
 from ..stage import Run
-from .frame_tasks import FrameCommon, FrameTask, Way
+from .frame_tasks import FrameTask, Way
 from .records import ShotFrame
+from .renderers import Renderer
 
 FRAMES_VERSION = 1
 FRAMES_FOLDER = "frames"
@@ -76,8 +77,7 @@ def _goes_on(before: ShotFrame, after: ShotFrame) -> bool:
 
 def render_frames(
     run: Run,
-    common: FrameCommon,
-    environment: dict[str, str],
+    renderer: Renderer,
     tasks: Sequence[FrameTask],
     *,
     label: str = "frames",
@@ -109,11 +109,11 @@ def render_frames(
     run.view_tasks(
         label,
         "dnrpipe.stages.shots.frame_worker",
-        common.data(),
+        renderer.common.data(),
         [task.data() for task in tasks],
         workers=1,  # its kernels keep all cores busy
         book=book,
-        environment=environment,
+        environment=renderer.environment,
         place=HERE,
     )
 

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ...core.scene_files import read_frame
+from ...effects.bundle import write_without
 from ...effects.store import trace_config, variant_for
 from ..base_images import bake_light, base_renderer
 from ..effect_plan import resolve_plan
+from ..shot_scene import scene_at
 from ..stage import Run
 from ..trust import measure_trust
 from .frame_tasks import FrameCommon
@@ -21,8 +23,14 @@ class Renderer:
     common: FrameCommon
     environment: dict[str, str]
 
-    def of_bundle(self, bundle: Path) -> Renderer:
-        """The same of another bundle, path-traced only."""
+    def at_frame(self, run: Run, frame: int) -> Renderer:
+        """Path traces the scene as it is at a frame, for which `convert_frames` has made a bundle."""
+        bundle = scene_at(run.workspace, frame) / "scene.xml"
+        left_out = run.effect_plan.left_out
+        if left_out:
+            edited = bundle.with_name("scene-edited.xml")
+            write_without(bundle, left_out, edited)
+            bundle = edited
         update = {"bundle": bundle, "base": None, "checkpoint": None}
         return Renderer(self.common.model_copy(update=update), self.environment)
 

@@ -57,16 +57,9 @@ def carry_out(session: Session, request: ShotRequest) -> dict[str, Any]:
         fps=file.fps,
         background=not (request.transparent or file.transparent),
         wanted=request.wanted,
-        at_frame=None,  # type: ignore
     )
-    planned = plan_shot(session, shot)
-    answer: dict[str, Any] = {
-        "workspace": str(workspace.root),
-        "shot": name,
-        "options": [option.data() for option in planned.options],
-        "chosen": planned.chosen.data(),
-        "why": planned.why,
-    }
+    plan = plan_shot(session, shot)
+    answer = {"workspace": str(workspace.root)}
     if request.only_plan:
-        return answer
-    return answer | make_shot(session, shot, planned).data()
+        return answer | plan.data()
+    return answer | make_shot(session, shot, plan).data()
