@@ -112,8 +112,21 @@ def resized(view: View, width: int, height: int) -> View:
 def prepare_for(session: Session, folder: Path, frames: Sequence[ShotFrame], held_out: Sequence[int]) -> None:
     """Prepare the session's workspace for the shot: its candidates are frames that stand still.
 
-    held_out: places of frames that are not among them. Raises UserError as `prepare` does.
+    held_out: places of frames that are not among them. Raises UserError as `prepare` does, and where a renderer was
+    trained on views of other cameras: it would be lost.
     """
+    manifest = session.workspace.manifest
+    selected = manifest.stages.get("select")
+    shots = session.workspace.root.resolve() / "shots"
+    if (
+        selected is not None
+        and selected.detail["views"]
+        and not Path(session.settings.cameras.source).is_relative_to(shots)
+    ):
+        raise UserError(
+            f"{session.workspace.root}: views of other cameras were chosen here (cameras.source ="
+            f" {session.settings.cameras.source}); a shot needs a workspace of its own: name another with -w"
+        )
     still = [place for place, frame in enumerate(frames) if not frame.moving and place not in held_out]
     chosen = [(place, "train") for place in spread(still or range(len(frames)), CANDIDATES)]
     chosen += [(place, "test") for place in held_out]
