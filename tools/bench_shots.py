@@ -35,7 +35,7 @@ from dnrpipe.stages.shot_scene import look_at_shot
 from dnrpipe.stages.shots.frame_tasks import FrameTask, Way
 from dnrpipe.stages.shots.make_shot import lpips_of
 from dnrpipe.stages.shots.open_shot import parse_size
-from dnrpipe.stages.shots.pilot import REFERENCE, REFERENCE_SEED, shown
+from dnrpipe.stages.shots.pilot import REFERENCE, REFERENCE_SEED, compared, shown
 from dnrpipe.stages.shots.render_frames import FRAMES_FOLDER
 from dnrpipe.stages.shots.renderers import path_tracer
 from dnrpipe.stages.stage import Run
@@ -200,14 +200,10 @@ def quality(
     lpips: Any,
 ) -> dict[str, float]:
     """FIGURES, means over the frames; flicker over the pairs."""
-    from dnrtrain.metrics import psnr, ssim
-
     rows = [
         {
-            "psnr": float(psnr(picture, truth[n])),
-            "ssim": float(ssim(picture, truth[n])),
+            **compared(picture, truth[n], lpips),
             "flip": flip_error(picture_of(truth[n][0]), picture_of(picture[0]))[0],
-            **({} if lpips is None else {"lpips": float(lpips(picture, truth[n]))}),
         }
         for n, picture in pictures.items()
     ]

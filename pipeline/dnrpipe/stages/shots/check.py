@@ -12,7 +12,7 @@ import numpy as np
 from ...core.images import flip_error, picture_of, write_png
 from ..stage import Run
 from .frame_tasks import FrameTask, Way
-from .pilot import REFERENCE_SEED, shown
+from .pilot import REFERENCE_SEED, compared, shown
 from .records import Check, ShotFrame
 from .render_frames import frame_path, render_frames
 from .renderers import Renderer
@@ -43,8 +43,6 @@ def check(
 
     tracers: (path tracer, places of the frames to check by it).
     """
-    from dnrtrain.metrics import psnr, ssim
-
     started = time.monotonic()
     way = Way(name="path", spp=SPP)
     rows: list[dict[str, float]] = []
@@ -72,10 +70,7 @@ def check(
             flip, heat = flip_error(picture_of(truth[0]), picture_of(ours[0]))
             write_png(task.output.with_suffix(".error.png"), heat)
             write_png(task.output.with_suffix(".ours.png"), picture_of(ours[0]))
-            row = {"psnr": float(psnr(ours, truth)), "ssim": float(ssim(ours, truth)), "flip": flip}
-            if lpips is not None:
-                row["lpips"] = float(lpips(ours, truth))
-            rows.append(row)
+            rows.append({**compared(ours, truth, lpips), "flip": flip})
             numbers.append(frame.number)
     mean = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     return Check(

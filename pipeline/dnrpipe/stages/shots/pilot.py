@@ -110,18 +110,14 @@ class Pilot:
         return [self._measured(way, rows) for way, rows in found.items()]
 
     def _measured(self, way: Way, rows: list[tuple[float, float, Any]]) -> Measured:
-        from dnrtrain.metrics import psnr
-
-        decibels = [float(psnr(picture, self.references[index])) for _, _, (index, picture) in rows]
-        distances = [
-            float(self.lpips(picture, self.references[index])) for _, _, (index, picture) in rows if self.lpips
-        ]
+        figures = [compared(picture, self.references[index], self.lpips) for _, _, (index, picture) in rows]
+        distances = [found["lpips"] for found in figures if "lpips" in found]
         pixels = self._view(self.chosen[0]).width * self._view(self.chosen[0]).height
         return Measured(
             way=way,
             pixel=float(np.mean([spent for spent, _, _ in rows])) / pixels,
             start=max(0.0, rows[0][1]),
-            psnr=float(np.mean(decibels)),
+            psnr=float(np.mean([found["psnr"] for found in figures])),
             lpips=float(np.mean(distances)) if distances else None,
         )
 
@@ -151,6 +147,18 @@ class Pilot:
     def _picture(self, path: Path) -> Any:
         """Display RGB over white, torch [1, 3, H, W]."""
         return shown(self.run, path)
+
+
+def compared(picture: Any, truth: Any, lpips: Any) -> dict[str, float]:
+    """psnr (dB), ssim and, where the pictures are large enough for it, lpips of display pictures [1, 3, H, W]."""
+    import torch
+
+    from dnrtrain.metrics import image_metrics
+
+    everywhere = torch.ones_like(truth[:, :1])
+    found = image_metrics(picture, truth, everywhere, None if lpips is None else {"alex": lpips})
+    named = {"psnr": found["psnr"], "ssim": found["ssim"], "lpips": found["lpips_alex"]}
+    return {name: value for name, value in named.items() if value is not None}
 
 
 def shown(run: Run, path: Path) -> Any:
