@@ -14,7 +14,7 @@ from dnrpipe.stages.shots.frame_tasks import Way
 from dnrpipe.stages.shots.open_shot import parse_size, resized, told_frames
 from dnrpipe.stages.shots.options import Option, Wanted, choose
 from dnrpipe.stages.shots.pilot import Measured, between
-from dnrpipe.stages.shots.plan_shot import Shape, baked_option, equal_rung_of, path_option
+from dnrpipe.stages.shots.plan_shot import Shape, baked_option, moving_way, path_option
 from dnrpipe.stages.shots.records import ShotFrame
 from dnrpipe.stages.shots.render_frames import frame_tasks
 
@@ -69,11 +69,12 @@ def test_seconds_of_a_shot_add_up() -> None:
     more = Measured(Way(name="path", spp=16), pixel=0.004, start=3.0, psnr=34.0, lpips=0.05)
     assert path_option(rung, shape).seconds == pytest.approx(3 + 10 + 2 * (1 + 3 + 5))
     ours = Measured(Way(name="neural"), pixel=0.002, start=4.0, psnr=33.0, lpips=0.06)
-    found = baked_option(ours, [rung, more], shape)
+    paths = [path_option(rung, shape), path_option(more, shape)]
+    found = baked_option(ours, paths, shape)
     assert found.seconds == pytest.approx(4 + 20 + 2 * (4 + 3 + 5))  # moving frames by the rung that is as good
-    options = [path_option(rung, shape), path_option(more, shape), found]
-    assert equal_rung_of(options, found) == more.way
-    assert equal_rung_of(options, options[0]) == rung.way
+    options = [*paths, found]
+    assert moving_way(options, found) == more.way
+    assert moving_way(options, options[0]) == rung.way
 
 
 def frames(count: int, cut: int, moving: tuple[int, ...] = ()) -> list[ShotFrame]:

@@ -11,11 +11,11 @@ from e2e_harness import image, run
 
 pytest.importorskip("bpy")
 
-from tests import shot_scenes  # noqa: E402
+from tests import shot_scenes
 
-from dnrpipe.core.scene_files import read_summary  # noqa: E402
-from dnrpipe.stages.shots.frame_worker import LAYERS  # noqa: E402
-from dnrtrain.exr import read_exr, read_metadata  # noqa: E402
+from dnrpipe.core.scene_files import read_summary
+from dnrpipe.stages.shots.frame_worker import LAYERS
+from dnrtrain.exr import read_exr, read_metadata
 
 pytestmark = [pytest.mark.slow, pytest.mark.e2e]
 

@@ -27,7 +27,7 @@ from ..trainer import perceptual_weights
 from .check import check, held_out
 from .frame_tasks import Way
 from .options import Wanted, choose
-from .plan_shot import equal_rung_of, lines, weigh
+from .plan_shot import lines, moving_way, weigh
 from .records import PLAN, RECORD, ShotFrame, ShotPlan, ShotRecord, facts
 from .render_frames import frame_tasks, picture_path, render_frames, write_movie
 from .renderers import Renderer, path_tracer, shipped_renderer, trained_renderer
@@ -102,7 +102,7 @@ def make_shot(session: Session, shot: Shot, plan: ShotPlan) -> ShotRecord:
     tasks = frame_tasks(shot.frames, folder, chosen.way, inputs, still)
     render_frames(run, renderer, tasks, label=f"frames by {chosen.way.told}")
     places = held_out(shot.frames, CHECKED)
-    moving_way = render_moving(run, shot, plan, tracer, inputs, places)
+    way_of_moving = render_moving(run, shot, plan, tracer, inputs, places)
     movie = folder / f"{shot.name}.mp4"
     write_movie(movie, [picture_path(folder, frame) for frame in shot.frames], shot.fps)
     spent = time.monotonic() - started
@@ -122,7 +122,7 @@ def make_shot(session: Session, shot: Shot, plan: ShotPlan) -> ShotRecord:
         chosen=chosen,
         why=plan.why,
         still_way=chosen.way,
-        moving_way=moving_way,
+        moving_way=way_of_moving,
         expected=chosen.seconds,
         spent_before=plan.seconds,
         spent=spent,
@@ -144,7 +144,7 @@ def render_moving(
     moving = [place for place, frame in enumerate(shot.frames) if frame.moving]
     if not moving:
         return None
-    folder, way = folder_of(run, shot), equal_rung_of(plan.options, plan.chosen)
+    folder, way = folder_of(run, shot), moving_way(plan.options, plan.chosen)
     tasks = dict(zip(moving, frame_tasks(shot.frames, folder, way, inputs, moving), strict=True))
     due = [place for place in moving if place in checked or not is_made(tasks[place].data())]
     for batch in (due[first : first + BATCH] for first in range(0, len(due), BATCH)):

@@ -55,7 +55,7 @@ def weigh(
         return options
     ours = shipped_renderer(run, tracer.common.background)
     measured = pilot.measure(ours.common, ours.environment, OURS)
-    options += [baked_option(found, ladder, shape) for found in measured]
+    options += [baked_option(found, options, shape) for found in measured]
     if _wants_more(options, wanted) and wanted.way in (None, "neural"):
         found = worth(run, shape.still)
         neural = next(option for option in options if option.way.name == "neural")
@@ -82,20 +82,26 @@ def path_option(found: Measured, shape: Shape) -> Option:
     return Option(way=found.way, before=found.start, frame=frame, seconds=total, psnr=found.psnr, lpips=found.lpips)
 
 
-def baked_option(found: Measured, ladder: Sequence[Measured], shape: Shape) -> Option:
-    """Frames that stand still by baked light, the others path-traced as well as those."""
+def baked_option(found: Measured, paths: Sequence[Option], shape: Shape) -> Option:
+    """Frames that stand still by baked light, the others path-traced as well as those. paths: `path_option` of each."""
     frame = found.pixel * shape.pixels
     total = found.start + shape.still * frame
     if shape.moving:
-        rung = equal_rung(ladder, found.psnr)
-        total += shape.moving * (rung.pixel * shape.pixels + rung.start + shape.convert)
+        rung = as_good(paths, found.psnr, found.lpips)
+        total += shape.moving * (rung.frame + rung.before + shape.convert)
     return Option(way=found.way, before=found.start, frame=frame, seconds=total, psnr=found.psnr, lpips=found.lpips)
 
 
-def equal_rung(ladder: Sequence[Measured], psnr: float | None) -> Measured:
-    """The cheapest path tracing that has the PSNR; that of the most samples where none has."""
-    enough = [found for found in ladder if psnr is None or found.psnr >= psnr]
-    return min(enough or ladder[-1:], key=lambda found: found.pixel)
+def as_good(options: Sequence[Option], psnr: float | None, lpips: float | None) -> Option:
+    """The quickest path tracing that has the quality; that of the most samples where none has."""
+    paths = [option for option in options if option.way.name == "path"]
+    enough = [option for option in paths if option.reaches(psnr, lpips)]
+    return min(enough or [max(paths, key=lambda option: option.way.spp)], key=lambda option: option.frame)
+
+
+def moving_way(options: Sequence[Option], chosen: Option) -> Way:
+    """How frames with moving things are path-traced: as the others, or as well as they are expected to be."""
+    return chosen.way if chosen.way.name == "path" else as_good(options, chosen.psnr, chosen.lpips).way
 
 
 def lines(options: Sequence[Option], chosen: Option, why: str) -> list[str]:
@@ -149,12 +155,3 @@ def _wants_more(options: Sequence[Option], wanted: Wanted) -> bool:
     neural = [option for option in options if option.way.name == "neural"]
     asked = wanted.psnr is not None or wanted.lpips is not None
     return asked and not any(option.reaches(wanted.psnr, wanted.lpips) for option in neural)
-
-
-def equal_rung_of(options: Sequence[Option], chosen: Option) -> Way:
-    """How frames with moving things are path-traced: as the others, or as well as they are expected to be."""
-    if chosen.way.name == "path":
-        return chosen.way
-    paths = [option for option in options if option.way.name == "path"]
-    enough = [option for option in paths if option.reaches(chosen.psnr, chosen.lpips)]
-    return min(enough or [max(paths, key=lambda option: option.way.spp)], key=lambda option: option.frame).way
