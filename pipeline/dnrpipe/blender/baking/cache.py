@@ -27,8 +27,9 @@ from .graph import AROUND, FROM_CAMERA, PER_OBJECT, VIEW_DEPENDENT, GraphHasher,
 from .mesh import MAX_OWN, is_object_space, object_info
 from .regions import Atlas
 
-BAKE_VERSION = 4  # raise when a bake of the same inputs would come out different
+BAKE_VERSION = 5  # raise when a bake of the same inputs would come out different
 SCALARS_PER_BAKE = 3
+ANIMATED_IMAGES = {"SEQUENCE", "MOVIE"}
 
 
 @dataclass
@@ -142,6 +143,10 @@ class BakeCache:
             findings.add("approximated", "bump on instances", note, object=copied[0], material=material)
 
     def _key(self, material: str, kind: ValueKind, source: Source, nodes: list[Source]) -> str:
+        for user in (entry.node.image_user for entry in nodes if shows_frames(entry.node)):
+            user.frame_current = frame_shown(
+                user, bpy.context.scene.frame_current
+            )  # Blender counts only while it draws
         digest = hashlib.sha256(repr((BAKE_VERSION, self.atlas.size, kind)).encode())
         digest.update(self._graphs.hash(source).encode())
         types = {entry.node.type for entry in nodes}
@@ -175,15 +180,19 @@ def _warn_of_image(node: Any, material: str, findings: Findings) -> None:
     """What Cycles bakes in magenta, and which frame of an animated image it bakes."""
     image = node.image
     name = f"image '{image.name}'"
-    if image.source in {"SEQUENCE", "MOVIE"}:
+    if image.source in ANIMATED_IMAGES:
         findings.add("approximated", f"animated {name}", "one frame is used", material=material)
-    if image.source == "SEQUENCE":  # Blender counts only while it draws
-        node.image_user.frame_current = frame_shown(node.image_user, bpy.context.scene.frame_current)
     path = Path(bpy.path.abspath(image.filepath_from_user(image_user=node.image_user), library=image.library))
     lost = image.source == "SEQUENCE" and not image.packed_files and not is_file(path)
-    if lost or (image.source != "TILED" and not _is_readable(image)):
+    # Scripts read no pixels of a sequence.
+    if lost or (image.source not in {"TILED", "SEQUENCE"} and not _is_readable(image)):
         note = f"cannot read '{path if lost else image.filepath or image.name}'; magenta stands for it"
         findings.add("missing", name, note, material=material)
+
+
+def shows_frames(node: Any) -> bool:
+    """Whether a node shows an image that changes with the frame."""
+    return getattr(getattr(node, "image", None), "source", None) in ANIMATED_IMAGES
 
 
 def frame_shown(user: Any, now: int) -> int:
