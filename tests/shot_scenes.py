@@ -53,6 +53,26 @@ def rolling(folder: Path) -> Path:
 
     The camera moves all the time, on an empty that nothing else hangs on.
     """
+    _roll()
+    return save(folder / "rolling.blend")
+
+
+def fading(folder: Path) -> Path:
+    """The rolling sphere, and a block whose roughness, noise by a keyed number, falls to a tenth at frame 5."""
+    _roll()
+    paint = material("paint")
+    tree = paint.node_tree
+    noise, factor = tree.nodes.new("ShaderNodeTexNoise"), tree.nodes.new("ShaderNodeMath")
+    factor.operation = "MULTIPLY"
+    keyed(factor.inputs[1], "default_value", {2: 1.0, 5: 0.1})
+    tree.links.new(noise.outputs["Fac"], factor.inputs[0])
+    tree.links.new(factor.outputs[0], tree.nodes["Principled BSDF"].inputs["Roughness"])
+    bpy.data.objects["block"].data.materials.append(paint)
+    bpy.context.scene.frame_set(1)
+    return save(folder / "fading.blend")
+
+
+def _roll() -> None:
     scene, wide = still()
     bpy.ops.mesh.primitive_uv_sphere_add(segments=16, ring_count=8, radius=1, location=(0, 0, 1))
     ball = bpy.context.object
@@ -72,11 +92,8 @@ def rolling(folder: Path) -> Path:
         ball.keyframe_insert("location", frame=frame)
         ball.keyframe_insert("rotation_euler", frame=frame)
     wide.parent = rig = link("rig", None)
-    for frame in (1, 5):
-        rig.location.x = frame / 10
-        rig.keyframe_insert("location", frame=frame)
+    keyed(rig, "location", {1: (0.1, 0, 0), 5: (0.5, 0, 0)})
     scene.frame_set(1)
-    return save(folder / "rolling.blend")
 
 
 def keyed(block: Any, path: str, values: dict[int, Any]) -> None:

@@ -31,9 +31,9 @@ PLACES = {2: (0.0, 0.0, 1.0), 5: (2.0, 0.0, 1.0)}
 
 @pytest.fixture(scope="module")
 def rolled(tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """A workspace of the rolling sphere with its bundles at frames 2 and 5."""
+    """A workspace of the rolling sphere and the fading block, with its bundles at frames 2 and 5."""
     folder = tmp_path_factory.mktemp("rolled")
-    source = shot_scenes.rolling(folder)
+    source = shot_scenes.fading(folder)
     workspace = Workspace.create(folder / "rolling.dnr", Source(path=str(source), sha256=file_sha256(source)))
     settings = Settings.model_validate({"passes": {"bake_size": 256, "workers": 1}})
     run = Run(workspace, settings, Console(quiet=True), "raytrace", "raytrace-0")
@@ -51,7 +51,7 @@ def _pixel(view: View, point: tuple[float, ...]) -> tuple[int, int]:
 def _traced(run: Run, bundle: Path, view: View) -> np.ndarray:
     """RGB [H, W, 3], linear."""
     choice = choose_variant()
-    task = {"view": view.model_dump(mode="json"), "output": str(bundle.parent / f"{view.name}.exr"), "spp": 16}
+    task = {"view": view.model_dump(mode="json"), "output": str(run.workspace.root / f"{view.name}.exr"), "spp": 16}
     task |= {"max_depth": 3, "seed": 1, "fingerprint": "f"}
     common = {"bundle": str(bundle), "variant": choice.variant, "threads": 1}
     module, environment = "dnrpipe.raytrace.tracer", choice.environment
@@ -70,14 +70,24 @@ def test_the_ball_is_where_it_has_rolled(rolled: Run) -> None:
             assert (red > 5 * green and red > 0.01) == (where == frame), (frame, where, red, green)
 
 
-def test_bakes_serve_again_where_they_do_not_depend_on_the_place(rolled: Run) -> None:
-    """Roughness by noise sticks to the ball, and is not baked again; its bumps turn in the world, and are."""
+def test_bakes_serve_again_where_they_hold(rolled: Run) -> None:
+    """Roughness and bumps by noise stick to the ball and are not baked again; the block's roughness has keys."""
     workspace = rolled.workspace
-    assert len(list((workspace.root / "bakes").glob("*.npy"))) == 3
+    files = sorted((workspace.root / "bakes").glob("*.npy"), key=lambda path: path.stat().st_mtime_ns)
+    values = [np.load(path).astype(np.float32) for path in files]
+    assert sorted(value.shape[1] for value in values[:3]) == [1, 1, 3]
+    (now,) = values[3:]
+    (before,) = (value for value in values[:3] if value.shape == now.shape)
+    assert now == pytest.approx(0.1 * before, abs=1e-3)
     first, second = (scene_at(workspace, frame) / "textures" for frame in PLACES)
     own = {path.name for path in (workspace.scene / "textures").iterdir()}
-    assert {path.name for path in first.iterdir()} == own
-    assert {path.name for path in second.iterdir()} & own and {path.name for path in second.iterdir()} - own
+    assert {path.name for path in first.iterdir()} == own != {path.name for path in second.iterdir()}
+
+
+def test_a_frame_like_the_converted_one_has_its_bundle(rolled: Run) -> None:
+    own, frame = rolled.workspace.scene, scene_at(rolled.workspace, 2)
+    files = [path.relative_to(frame) for path in frame.rglob("*") if path.is_file() and path.name != "prepared.json"]
+    assert len(files) == 6 and all((own / name).read_bytes() == (frame / name).read_bytes() for name in files)
 
 
 def test_frames_that_are_there_are_not_converted_again(rolled: Run) -> None:

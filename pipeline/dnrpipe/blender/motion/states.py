@@ -9,14 +9,14 @@ import numpy as np
 
 from dnrpipe.core.shot_records import ChangeKind
 
-from ..baking.cache import frame_shown
+from ..baking.cache import frame_shown, shows_frames
 from ..baking.graph import PER_OBJECT, GraphHasher
 from ..findings import Findings
 from ..geometry.freeze import surfaces
 from ..geometry.local_mesh import LocalMesh
 from ..lighting.lights import is_portal
 from ..shading.sockets import output_node, resolve, walk
-from .suspects import ANIMATED_IMAGES, Suspects
+from .suspects import Suspects
 
 TOLERANCE = 4e-6
 """Largest difference, of the largest number of an array, that counts as rounding: a few steps of float32."""
@@ -103,8 +103,8 @@ class StateReader:
         output, scope = output_node(tree)
         sources = [resolve(socket, scope) for socket in output.inputs] if output is not None else []
         values = [self._graphs.hash(source) if source.linked else None for source in sources]
-        users = [node for node in walk(tree) if getattr(getattr(node, "image", None), "source", "") in ANIMATED_IMAGES]
-        return repr([*values, *(frame_shown(node.image_user, frame) for node in users)])
+        animated = [node.image_user for node in walk(tree) if shows_frames(node)]
+        return repr([*values, *(frame_shown(user, frame) for user in animated)])
 
 
 def shows_anything(depsgraph: Any) -> bool:

@@ -8,6 +8,7 @@ from typing import Any
 
 import bpy
 
+from ..baking.cache import ANIMATED_IMAGES
 from ..geometry.render_graph import render_layer
 from ..reading.names import data_collections
 from .simulations import SIMULATING, plays
@@ -33,7 +34,6 @@ LOCAL_MODIFIERS = {
 TIMED_CONSTRAINTS = {"CAMERA_SOLVER", "FOLLOW_TRACK", "OBJECT_SOLVER", "TRANSFORM_CACHE"}
 TIMED_NODES = {"GeometryNodeInputSceneTime", "GeometryNodeBake", "GeometryNodeInputActiveCamera"}
 """The active camera moves, and markers switch it."""
-ANIMATED_IMAGES = {"SEQUENCE", "MOVIE"}
 RENDER_SETTINGS = {"view_settings", "render", "cycles", "eevee"}
 UNSEEN = {"CAMERA", "ARMATURE", "LATTICE", "SPEAKER", "LIGHT_PROBE"}
 """Types of objects that no picture shows."""
