@@ -102,7 +102,7 @@ def test_tiles_show_no_seam(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     model, views = random_model(name), view(131, 203)
     whole = rendered(model, views, 1 << 20, monkeypatch)
     assert float(whole.rgb.std()) > 0.05
-    pixels = 3000 if name == "pixels" else 12000
+    pixels = 3000 if name == "pixels" else 9000
     plan = tiles(131, 203, alignment=model.renderer.alignment, reach=model.reach, pixels=pixels)
     assert len({tile.rows.start for tile in plan}) > 1 and len({tile.columns.start for tile in plan}) > 2
     parts = rendered(model, views, pixels, monkeypatch)

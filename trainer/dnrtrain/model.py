@@ -14,7 +14,7 @@ from .renderer import SLOPE, build_renderer
 from .settings import ModelSettings
 from .tiles import tiles
 
-TILE_PIXELS = 1 << 21
+TILE_PIXELS = 1 << 20
 """Most that the network works on at once."""
 
 
