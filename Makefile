@@ -10,10 +10,10 @@ APT_DEV := chromium
 PYTEST  := $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 
 # Pages with tables made from docs/results.
-RESULTS := $(addprefix docs/,ablation.md bench-select.md cost.md frames.md noise.md scaling.md)
+RESULTS := $(addprefix docs/,ablation.md bench-select.md cost.md frames.md noise.md scaling.md shots.md)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup system browser demo test lint types imports docs docs-check audit robustness bench bench-effects bench-frames pretrain fidelity scenes clean
+.PHONY: help setup system browser demo test lint types imports docs docs-check audit robustness bench bench-shots bench-effects bench-frames pretrain fidelity scenes clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -76,6 +76,10 @@ robustness: setup  ## the slow tests, every case of docs/robustness.md, 2,000 da
 	$(BIN)/python -m tools.faults.fuzz --count 2000
 	$(BIN)/python -m tools.faults.inject --kills 50
 	$(BIN)/python -m tools.faults.memory
+
+bench-shots: setup  ## shots of the benchmark scenes beside path tracing with a denoiser; resumable
+	$(BIN)/python -m tools.bench_shots .cache/shots
+	$(BIN)/python -m tools.result_tables docs/shots.md
 
 bench-effects: setup  ## the effect plan against "everything on", on the benchmark scenes
 	$(BIN)/python tools/bench_effects.py

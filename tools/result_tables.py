@@ -21,6 +21,7 @@ from tools.bench_frames.document import markdown as frames_markdown
 from tools.bench_frames.document import overview as frames_overview
 from tools.bench_noise.document import markdown as noise_markdown
 from tools.bench_ray import markdown as scaling_markdown
+from tools.bench_shots import markdown as shots_markdown
 from tools.bench_untrained import markdown as untrained_markdown
 from tools.plan_check import markdown as check_markdown
 from tools.plan_equal import markdown as equal_markdown
@@ -33,7 +34,7 @@ from dnrpipe.studies.selectbench.bench_tables import markdown as selection_markd
 from dnrpipe.studies.selectbench.bench_tables import read_results as selection_results
 from dnrpipe.studies.selectbench.bench_tables import together as selections_markdown
 
-KINDS = "rows|results|frames(?:-overview)?|noise|frontier|plan-check|plan-equal|selections?|untrained|scaling"
+KINDS = "rows|results|frames(?:-overview)?|noise|frontier|plan-check|plan-equal|selections?|untrained|scaling|shots"
 PART = re.compile(rf"(<!-- ({KINDS})(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -58,6 +59,8 @@ def generate(text: str, folder: Path) -> str:
             body = noise_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
         elif match[2] == "frames-overview":
             body = "\n".join(frames_overview(json.loads((folder / match[3]).read_text(encoding="utf-8"))))
+        elif match[2] == "shots":
+            body = shots_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
         elif match[2] == "untrained":
             body = untrained_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
         elif match[2] == "scaling":

@@ -18,7 +18,7 @@ from dnrtrain.correction import filter_by, from_log, to_log
 from dnrtrain.dataset import DIHEDRAL_ORDER, Batch, ViewSet, load_views, view_in_memory
 from dnrtrain.display import DisplayTransform
 from dnrtrain.exr import read_exr, write_exr
-from dnrtrain.model import DNR, compose, render_radiance, render_views
+from dnrtrain.model import DNR, compose, render, render_views
 from dnrtrain.renderer import add_pointwise, planes
 from dnrtrain.settings import ModelSettings
 
@@ -184,12 +184,12 @@ def test_log_space_keeps_highlights() -> None:
 def test_radiance_of_whole_view_sets(baked: ViewSet) -> None:
     views = baked.subset([0, 1, 2])
     hdr = DNR(WHOLE.model_copy(update={"output": "log"}), seed=0)
-    radiance = render_radiance(hdr, views, batch=2)
+    radiance = render(hdr, views, batch=2).radiance
     assert radiance is not None and views.tensors.base is not None and views.tensors.display is not None
     assert torch.allclose(radiance, views.tensors.base, rtol=1e-3, atol=1e-5)
     over_white = compose(views.tensors.display(radiance), views.tensors.coverage)
     assert torch.allclose(over_white, render_views(hdr, views), atol=1e-5)
-    assert render_radiance(DNR(WHOLE, seed=0), views) is None
+    assert render(DNR(WHOLE, seed=0), views).radiance is None
 
 
 @pytest.mark.parametrize("side", [3, 5])

@@ -83,7 +83,11 @@ class Batch:
 
     def crop(self, top: int, left: int, side: int) -> Batch:
         """The window of ``side`` pixels whose first pixel is (``top``, ``left``), of all maps and the target alike."""
-        return self._map(lambda tensor: tensor[..., top : top + side, left : left + side])
+        return self.window(slice(top, top + side), slice(left, left + side))
+
+    def window(self, rows: slice, columns: slice) -> Batch:
+        """Those rows and columns of all maps and the target alike, without a copy."""
+        return self._map(lambda tensor: tensor[..., rows, columns])
 
     def augment(self, element: int) -> Batch:
         """Apply one of the eight symmetries of the square, inputs and target alike.

@@ -12,7 +12,7 @@ import hashlib
 import io
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,15 +24,19 @@ from .contract import ContractError, DamagedFile
 METADATA_KEY = "dnrpipe.json"
 CHECKSUM_KEY = "dnrpipe.sha256"
 MAX_SIDE = 65536
+LARGEST_HALF = 65504.0
 MAX_CHANNELS = 256
 MAX_RATIO = 1100
 """Decompressed over compressed size: deflate ends at 1032."""
 
 
-def write_exr(path: Path, channels: Mapping[str, np.ndarray], metadata: Mapping[str, Any]) -> None:
+def write_exr(
+    path: Path, channels: Mapping[str, np.ndarray], metadata: Mapping[str, Any], half: Collection[str] = ()
+) -> None:
     """Write channels (each float32 [H, W]) as ZIP-compressed scanline EXR.
 
-    ``metadata`` is stored as JSON in the header attribute ``dnrpipe.json``.
+    ``metadata`` is stored as JSON in the header attribute ``dnrpipe.json``. half: names of channels that are written in
+    16 bits; what is larger than they hold becomes the largest that they do.
     Raises ContractError when a channel is not finite: files never carry a hidden NaN.
     """
     import OpenEXR
@@ -43,7 +47,7 @@ def write_exr(path: Path, channels: Mapping[str, np.ndarray], metadata: Mapping[
         if not np.isfinite(array).all():
             bad = int((~np.isfinite(array)).sum())
             raise ContractError(f"{path}: channel {name} has {bad} non-finite pixels")
-        pixels[name] = array
+        pixels[name] = np.clip(array, -LARGEST_HALF, LARGEST_HALF).astype(np.float16) if name in half else array
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,

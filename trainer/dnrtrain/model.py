@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -13,6 +12,10 @@ from .correction import correct, guide_channels, guide_maps, require_base
 from .dataset import Batch, ViewSet
 from .renderer import SLOPE, build_renderer
 from .settings import ModelSettings
+from .tiles import tiles
+
+TILE_PIXELS = 1 << 20
+"""Most that the network works on at once."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,12 @@ class DNR(nn.Module):
             nn.init.zeros_(self.renderer.head.weight)
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
+    @property
+    def reach(self) -> int:
+        """How far beyond a tile of the picture (see `dnrtrain.tiles`) lies what decides it, in pixels."""
+        fused = self.settings.aggregator != "none" and self.aggregator.fusion is not None
+        return self.renderer.reach(self.settings.filter // 2) + fused
+
     def forward(self, batch: Batch) -> Output:
         settings = self.settings
         groups = [torch.cat([batch.mask, *guide_maps(batch, settings)], dim=1)]
@@ -108,22 +117,27 @@ def initialise(module: nn.Module, generator: torch.Generator) -> None:
 @torch.no_grad()
 def render_views(model: DNR, views: ViewSet, *, batch: int = 1) -> Tensor:
     """Render all views: display RGB over white in [0, 1], float32 [N, 3, H, W] on the CPU."""
-    return torch.cat([output.rgb.clamp(0.0, 1.0).cpu() for output in _outputs(model, views, batch)])
+    return render(model, views, batch=batch).rgb
 
 
 @torch.no_grad()
-def render_radiance(model: DNR, views: ViewSet, *, batch: int = 1) -> Tensor | None:
-    """Render all views: linear Rec.709 radiance, straight, highlights kept, float32 [N, 3, H, W] on the CPU.
+def render(model: DNR, views: ViewSet, *, batch: int = 1) -> Output:
+    """Render all views, large ones in tiles: rgb in [0, 1], and radiance where the model has it, on the CPU.
 
-    None when the model's output space is display: it has no radiance to give.
+    The pictures of tiles are those of the whole bit for bit where convolutions of other sizes round alike, as oneDNN's
+    do; else as close as rounding. texture is None.
     """
-    if model.settings.output == "display":
-        return None
-    frames = [output.radiance for output in _outputs(model, views, batch)]
-    return torch.cat([frame.cpu() for frame in frames if frame is not None])
-
-
-def _outputs(model: DNR, views: ViewSet, batch: int) -> Iterator[Output]:
     device = next(model.parameters()).device
+    height, width = views.size
+    rgb = torch.empty(len(views), 3, height, width)
+    radiance = torch.empty_like(rgb) if model.settings.output == "log" else None
+    plan = tiles(height, width, alignment=model.renderer.alignment, reach=model.reach, pixels=TILE_PIXELS)
     for start in range(0, len(views), batch):
-        yield model(views.batch(list(range(start, min(start + batch, len(views))))).to(device))
+        part = slice(start, min(start + batch, len(views)))
+        maps = views.batch(range(part.start, part.stop))
+        for tile in plan:
+            output = model(maps.window(tile.seen_rows, tile.seen_columns).to(device))
+            rgb[part, :, tile.rows, tile.columns] = output.rgb[(..., *tile.inner)].clamp(0.0, 1.0)
+            if radiance is not None:
+                radiance[part, :, tile.rows, tile.columns] = output.radiance[(..., *tile.inner)]
+    return Output(rgb, None, radiance)

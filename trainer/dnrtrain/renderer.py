@@ -53,12 +53,24 @@ class UNet(nn.Module):
         self.reduce = nn.ModuleList(nn.Conv2d(channels[i + 1], channels[i], 1) for i in range(depth))
         self.merge = nn.ModuleList(Block(2 * channels[i], channels[i]) for i in range(depth))
         self.head = nn.Conv2d(channels[0], outputs, 1)
+        self.alignment = 1 << depth
+
+    def reach(self, radius: int = 0) -> int:
+        """How far the inputs lie, in pixels, that decide the outputs up to ``radius`` pixels beyond a tile whose sides
+        are multiples of ``alignment``."""
+        wanted = [radius + 2]  # of each level's concatenated maps, by the two convolutions that merge them
+        for level in range(1, self.depth + 1):
+            wanted.append(-(-wanted[-1] // 2) + (2 if level < self.depth else 0))
+        far = wanted.pop()
+        for near in reversed(wanted):
+            far = max(near, 2 * (far + 1) + 1)  # one convolution within the level, one with stride 2 to it
+        return far + 2
 
     def forward(self, groups: Sequence[Tensor], *, bfloat16: bool) -> Tensor:
         """[N, inputs, H, W] per group -> [N, outputs, H, W] float32; any H and W (padded, cropped back)."""
         x = torch.cat(list(groups), dim=1)
         height, width = x.shape[-2:]
-        x = pad_to_multiple(x, 1 << self.depth).contiguous(memory_format=torch.channels_last)
+        x = pad_to_multiple(x, self.alignment).contiguous(memory_format=torch.channels_last)
         with torch.autocast(x.device.type, dtype=torch.bfloat16, enabled=bfloat16):
             x = self.features(x)
         # bfloat16 would quantise the result to 1/256: the last layer is float32.
@@ -98,6 +110,11 @@ class HalfUNet(nn.Module):
         self.unet = UNet(width, width, depth, outputs=4 * DETAIL)
         self.mix = nn.Conv2d(2 * DETAIL, DETAIL, 3, padding=1)
         self.head = nn.Conv2d(DETAIL, outputs, 1)
+        self.alignment = 2 << depth
+
+    def reach(self, radius: int = 0) -> int:
+        """As of `UNet`."""
+        return 2 * self.unet.reach(-(-(radius + 1) // 2))
 
     def forward(self, groups: Sequence[Tensor], *, bfloat16: bool) -> Tensor:
         """[N, inputs, H, W] per group -> [N, outputs, H, W] float32; any H and W (padded, cropped back)."""
@@ -108,7 +125,7 @@ class HalfUNet(nn.Module):
             for layer, maps in zip(self.point[1:], groups[1:], strict=True):
                 assert isinstance(layer, nn.Conv2d)
                 detail = add_pointwise(detail, layer, maps)
-            detail = pad_to_multiple(F.leaky_relu(detail, SLOPE), 2 << self.depth)
+            detail = pad_to_multiple(F.leaky_relu(detail, SLOPE), self.alignment)
             context = self.unet.head(self.unet.features(F.leaky_relu(self.gather(detail), SLOPE)))
             x = torch.cat([detail, F.pixel_shuffle(context, 2)], dim=1)
             x = F.leaky_relu(self.mix(x), SLOPE)
@@ -123,6 +140,11 @@ class PixelMLP(nn.Module):
         hidden = 4 * width
         self.layers = nn.ModuleList(nn.Conv2d(a, b, 1) for a, b in pairwise([inputs, hidden, hidden, hidden]))
         self.head = nn.Conv2d(hidden, outputs, 1)
+        self.alignment = 1
+
+    def reach(self, radius: int = 0) -> int:
+        """As of `UNet`."""
+        return radius
 
     def forward(self, groups: Sequence[Tensor], *, bfloat16: bool) -> Tensor:
         """[N, inputs, H, W] per group -> [N, outputs, H, W] float32."""

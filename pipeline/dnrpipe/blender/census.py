@@ -14,8 +14,8 @@ from dnrpipe.core.scene_records import Census, ImageFacts, LightFacts, MaterialF
 
 from .census_materials import describe_material
 from .findings import Findings
-from .geometry.freeze import render_layer
 from .geometry.frozen import FrozenMesh
+from .geometry.render_graph import render_layer
 from .lighting.lights import visible_lights
 from .reading.missing import SHAPELESS_IMAGES
 from .reading.names import find_material

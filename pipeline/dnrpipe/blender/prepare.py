@@ -15,7 +15,7 @@ from dnrtrain.contract import SceneFrame
 from .baking.pending import convert_materials, missing_bakes, place_atlas
 from .bundle.display import export_display
 from .bundle.export import export_bundle
-from .cameras import camera_animation, scene_cameras
+from .cameras import camera_animation, picture_size, scene_cameras
 from .census import take_census
 from .geometry.frozen import save_geometry
 from .geometry.surroundings import describe_surroundings
@@ -84,7 +84,7 @@ def prepare(
         cameras=cameras,
         animation=animation,
         surroundings=describe_surroundings(gbuffer, cameras, animation),
-        resolution=_resolution(scene),
+        resolution=picture_size(scene),
         blender_version=bpy.app.version_string,
         atlas=atlas,
         repairs=frozen.repairs,
@@ -100,8 +100,3 @@ def prepare(
     if converter.bakes is not None:
         converter.bakes.prune()
     return summary
-
-
-def _resolution(scene: bpy.types.Scene) -> tuple[int, int]:
-    scale = scene.render.resolution_percentage / 100
-    return max(1, round(scene.render.resolution_x * scale)), max(1, round(scene.render.resolution_y * scale))

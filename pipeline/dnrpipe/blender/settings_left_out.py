@@ -7,7 +7,7 @@ from typing import Any
 
 import bpy
 
-from .geometry.freeze import render_layer
+from .geometry.render_graph import render_layer
 from .lighting.lights import is_portal
 
 SIMULATED = {"CLOTH", "SOFT_BODY", "FLUID", "DYNAMIC_PAINT", "OCEAN", "PARTICLE_SYSTEM", "MESH_SEQUENCE_CACHE", "BUILD"}

@@ -90,6 +90,49 @@ class InspectAnswer(SceneRecord):
     warnings: list[str]
 
 
+# -- shot: the frames of a shot ---------------------------------------------------------------------------------
+
+
+class ShotTask(Task):
+    """Say what a shot of ``source`` sees. Answers `core.shot_records.ShotFacts`.
+
+    Args:
+        frames: rising; None for the file's own range.
+        camera: name of one; None for the one that Blender renders each frame with.
+    """
+
+    source: Path
+    frames: tuple[int, ...] | None = None
+    camera: str | None = None
+
+
+# -- scene_at_frame: a converted scene, as it is at other frames ----------------------------------------------------
+
+
+class FrameCommon(Task):
+    """A scene file and its conversion.
+
+    Args:
+        scene_dir: of the conversion, whose atlas, bakes and textures the frames take over.
+        bakes: without ``refused``.
+        lit: whether the file brings light of its own at the frame that was converted; where it does, a dark frame
+            stays dark.
+    """
+
+    source: Path
+    scene_dir: Path
+    bakes: BakeOptions
+    lit: bool
+
+
+class FrameTask(Task):
+    """Write the bundle of the scene at ``frame`` into the folder ``output``. Answers a `PrepareAnswer`."""
+
+    frame: int
+    output: Path
+    refused: tuple[str, ...] = ()
+
+
 # -- baking.bake: values of sockets over the atlas --------------------------------------------------------------
 
 

@@ -20,6 +20,7 @@ from .export import export_gltf, export_nerf, export_onnx, export_web
 from .fleet import batch
 from .plan import frontier, plan
 from .service import cancel, jobs, logs, retry, serve, submit
+from .shot import shot
 from .studies import ablate, bench_select
 from .worker import worker
 
@@ -69,6 +70,7 @@ for _command in (
     stages.evaluate,
     stages.render,
     stages.report,
+    shot,
     export_nerf,
     export_onnx,
     export_gltf,

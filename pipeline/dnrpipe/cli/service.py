@@ -33,7 +33,7 @@ SERVER = [
     click.option("--json", "as_json", is_flag=True, help="Print one JSON value; messages to stderr."),
 ]
 COMMANDS = [
-    *("run", "prepare", "select", "raytrace-selected", "finetune", "evaluate", "render", "report"),
+    *("run", "prepare", "select", "raytrace-selected", "finetune", "evaluate", "render", "report", "shot"),
     *("export-nerf", "export-onnx", "export-gltf", "export-web"),
 ]
 STATES = ["queued", "running", "done", "failed", "cancelled"]
@@ -186,6 +186,8 @@ def _is_address(url: str, *, path: bool = False) -> bool:
 @click.option("--memory-mb", type=click.IntRange(64), metavar="N", help="Stop it above this memory.")
 @click.option("--disk-mb", type=click.IntRange(1), metavar="N", help="Stop it when its workspace is larger.")
 @click.option("--orbit", type=click.IntRange(1, 10_000), metavar="N", help="Frames of `--stage render` (default 60).")
+@click.option("--frames", metavar="RANGE", help="Of `--stage shot`, such as 1-240.")
+@click.option("--size", metavar="WxH", help="Of `--stage shot`, such as 1280x720.")
 @click.option("--webhook", metavar="URL", help="Told when the job has ended; the server's operator allows which.")
 @click.option("--detach", is_flag=True, help="Do not wait for the job.")
 @with_options(SERVER)
@@ -201,6 +203,8 @@ def submit(
     memory_mb: int | None,
     disk_mb: int | None,
     orbit: int | None,
+    frames: str | None,
+    size: str | None,
     webhook: str | None,
     detach: bool,
     as_json: bool,
@@ -216,6 +220,7 @@ def submit(
       dnrpipe submit scene.blend --set select.budget=25
       dnrpipe submit scene --stage evaluate --force
       dnrpipe submit scene --stage render --orbit 120
+      dnrpipe submit scene.blend --stage shot --frames 1-48 --size 640x360
       dnrpipe submit scene.blend --server http://box:8420 --token-file token.txt --detach
     """
     import pydantic
@@ -236,7 +241,7 @@ def submit(
     name = workspace or _plain(path.stem if is_file else scene)
     upload = f"{_plain(path.stem)}{path.suffix.lower()}" if is_file else None
     fields = {"command": command, "workspace": name, "scene": upload, "preset": preset, "settings": settings}
-    fields |= {"orbit": orbit, "webhook": webhook}
+    fields |= {"orbit": orbit, "frames": frames, "size": size, "webhook": webhook}
     try:
         limits = Limits(seconds=3600 * hours if hours is not None else None, memory_mb=memory_mb, disk_mb=disk_mb)
         request = JobRequest(**fields, force=force, priority=priority, limits=limits)  # type: ignore[arg-type]

@@ -21,6 +21,7 @@ from dnrtrain.contract import SPLITS, ContractError, View, file_name, parse_tran
 from .errors import UserError
 from .scene_records import Lens, SceneCamera, SceneSummary
 from .settings import CameraSettings
+from .shot_records import ShotFacts
 
 T = TypeVar("T")
 
@@ -124,7 +125,8 @@ def _own_views(summary: SceneSummary, settings: CameraSettings) -> list[tuple[Vi
     """Views of the scene's own cameras, or of the active one's animation; [] for other sources."""
     sources = {"scene": summary.cameras, "animation": summary.animation}
     cameras = [camera for camera in sources.get(settings.source, ()) if camera.type == "PERSP"]
-    return list(zip(unique_names([_scene_view(camera, settings) for camera in cameras]), cameras, strict=True))
+    views = [_scene_view(camera, settings.width, settings.height) for camera in cameras]
+    return list(zip(unique_names(views), cameras, strict=True))
 
 
 def read_camera_file(path: Path, settings: CameraSettings) -> list[View]:
@@ -275,15 +277,40 @@ def look_at_view(name: str, position: np.ndarray, target: np.ndarray, focal: flo
     )
 
 
-def _scene_view(camera: SceneCamera, settings: CameraSettings) -> View:
-    """Blender camera -> View. Sensor fit and shift as in Blender's manual, "Camera / Lens"."""
-    width, height = settings.width, settings.height
+def shot_views(shot: ShotFacts, width: int, height: int) -> list[View]:
+    """A view of ``width`` x ``height`` pixels for each frame of a shot, in order, named ``frame00012``.
+
+    The file's pixel aspect is kept: where its pixels are not square, fl_x and fl_y differ.
+
+    Raises UserError: a camera is orthographic or panoramic.
+    """
+    require_perspective(shot.cameras)
+    return [_scene_view(camera, width, height, shot.pixel_aspect) for camera in shot.cameras]
+
+
+def require_perspective(cameras: Sequence[SceneCamera]) -> None:
+    """Raise UserError for the first camera that is orthographic or panoramic."""
+    for camera in cameras:
+        if camera.type != "PERSP":
+            kind = {"ORTHO": "orthographic", "PANO": "panoramic"}.get(camera.type, camera.type)
+            raise UserError(
+                f"camera '{camera.name}' is {kind} at frame {camera.frame}; only perspective cameras can be rendered:"
+                " change its lens type, or choose another with --camera"
+            )
+
+
+def _scene_view(camera: SceneCamera, width: int, height: int, pixel_aspect: float = 1.0) -> View:
+    """Blender camera -> View. Sensor fit and shift as in Blender's manual, "Camera / Lens".
+
+    pixel_aspect: height of a pixel by its width. Blender measures in widths of pixels: the picture is
+    ``height * pixel_aspect`` of them high (BKE_camera_params_compute_viewplane).
+    """
     if camera.sensor_fit == "AUTO":
-        side, sensor = max(width, height), camera.sensor_width
+        side, sensor = max(width, height * pixel_aspect), camera.sensor_width
     elif camera.sensor_fit == "HORIZONTAL":
         side, sensor = width, camera.sensor_width
     else:
-        side, sensor = height, camera.sensor_height
+        side, sensor = height * pixel_aspect, camera.sensor_height
     focal = camera.lens / sensor * side
     name = f"frame{camera.frame:05d}" if camera.frame is not None else camera.name
     return View(
@@ -291,8 +318,8 @@ def _scene_view(camera: SceneCamera, settings: CameraSettings) -> View:
         width=width,
         height=height,
         fl_x=focal,
-        fl_y=focal,
+        fl_y=focal / pixel_aspect,
         cx=width / 2 - camera.shift_x * side,
-        cy=height / 2 + camera.shift_y * side,
+        cy=height / 2 + camera.shift_y * side / pixel_aspect,
         c2w=camera.c2w,
     )

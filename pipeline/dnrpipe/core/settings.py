@@ -88,6 +88,9 @@ class RaytraceSettings(Strict):
     variant: Literal["auto", "cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb"] = "auto"
     denoise: bool = Field(default=False, description="denoise the views that are trained on (Open Image Denoise)")
     evaluation_denoise: bool = Field(default=False, description="denoise the held-out references")
+    evaluation_baseline: bool = Field(
+        default=True, description="time path tracing at a few samples with the denoiser on two test views, too"
+    )
     seed: int = Field(default=0, ge=0)
     workers: int = Field(default=0, ge=0, description="0 = one per core")
 
@@ -263,9 +266,10 @@ PRESETS: dict[str, dict[str, Any]] = {
         "select": {"step1": {"epochs": 12, "texture_rate_scale": 10.0}},
         "finetune": {"step2": {**DNR_STEP2, "epochs": 40, "perceptual_crop": 32}},
     },
+    # Minutes to an hour on two CPU cores, at the size of a film.
     "standard": {
-        "cameras": {"train": 100, "val": 10, "test": 50, "width": 384, "height": 384},
-        "raytrace": {"spp": 256, "evaluation_spp": 512, "denoise": True, "evaluation_denoise": True},
+        "cameras": {"train": 40, "val": 4, "test": 6, "width": 1280, "height": 720},
+        "raytrace": {"spp": 64, "evaluation_spp": 256, "denoise": True, "evaluation_denoise": True},
         "model": {**DNR, "texture_size": 256, "width": 24, "depth": 3},
         "select": {"step1": {"epochs": 30, "texture_rate_scale": 10.0}},
         "finetune": {"step2": {**DNR_STEP2, "epochs": 60, "patch": 192, "perceptual_crop": 64}},

@@ -10,7 +10,7 @@ scene.dnr/
   base/                         baked light; base images, base/<split>/<view>.exr
   checkpoints/{step1,step2}/    weights and histories
   preview/                      a held-out view as fine-tuning last rendered it
-  evaluation/  renders/  report/  logs/
+  evaluation/  renders/  shots/  report/  logs/
   costs.jsonl                   the ledger
 """
 

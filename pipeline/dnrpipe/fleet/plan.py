@@ -31,7 +31,7 @@ from dnrtrain.settings import Strict
 from ..core.errors import UserError
 from ..core.settings import merge, resolve
 
-TAKES_SCENE = ("run", "prepare")
+TAKES_SCENE = ("run", "prepare", "shot")
 TAKES_NO_FORCE = ("export-nerf", "export-onnx", "export-gltf", "export-web")
 COMMANDS = (
     *TAKES_SCENE,

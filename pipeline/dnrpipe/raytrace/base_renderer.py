@@ -39,7 +39,7 @@ CHAIN = ("chain.length", "chain.X", "chain.Y", "chain.Z")
 """How far the first ray's path goes behind the first surface by mirrors and clear glass, and where that ends."""
 CENTRES = (
     *("chain.U", "chain.V", "chain.mask", "chain.weight", *CHAIN),
-    *("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z", "mask"),
+    *("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "object.Id", "depth.Z", "mask"),
 )
 NOISE = "noise"
 FRAMES = 64
@@ -48,7 +48,7 @@ BRIGHTEST = 1e15
 """Luminance above it counts as it where squares are summed."""
 LOST = "lost"
 """Whether a part of the sample was not finite and is left out; of a pixel, the share of such samples."""
-GBUFFER = ("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "depth.Z")
+GBUFFER = ("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "object.Id", "depth.Z")
 
 
 class BaseRenderer:

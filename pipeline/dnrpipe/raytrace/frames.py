@@ -80,16 +80,19 @@ class Frames:
         return Auxiliary(image[..., :3], image[..., 3:6], image[..., 6])
 
     def gbuffer(self, view: View, rays: int = 16) -> dict[str, np.ndarray]:
-        """The view's G-buffer without the object numbers: channels of `dnrtrain.contract`, float32 [H, W].
+        """The view's G-buffer: channels of `dnrtrain.contract`, float32 [H, W].
 
         coverage: as of `coverage`. The rest is of the ray through the pixel's centre.
         """
         image = self._image(self._kernel(self._centre_kernel, view, 1)(*self._inputs(view, 0, 1)))
         axis = view.matrix[:3, 2]
-        position, mask = image[..., 5:8] / self.engine.unit_scale, image[..., 8] > 0
-        names = ("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "position.X", "position.Y", "position.Z", "mask")
+        position, mask = image[..., 6:9] / self.engine.unit_scale, image[..., 9] > 0
+        names = (
+            *("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "object.Id"),
+            *("position.X", "position.Y", "position.Z", "mask"),
+        )
         result = {name: image[..., i] for i, name in enumerate(names)}
-        for i, name in enumerate(names[5:8]):
+        for i, name in enumerate(names[6:9]):
             result[name] = np.where(mask, position[..., i], 0)
         depth = (view.position - position) @ axis
         result["depth.Z"] = np.where(mask, depth, 0).astype(np.float32)
@@ -173,7 +176,7 @@ class Frames:
             place = hit.shape.eval_attribute_3(ATTRIBUTE, hit, found & hit.shape.has_attribute(ATTRIBUTE, found))
             towards = dr.select(dr.dot(hit.sh_frame.n, ray.d) > 0, -hit.sh_frame.n, hit.sh_frame.n)
             normal = dr.select(found, towards, 0)
-            values = [*normal, place[0], place[1], *hit.p, dr.select(found, mi.Float(1), mi.Float(0))]
+            values = [*normal, *place, *hit.p, dr.select(found, mi.Float(1), mi.Float(0))]
             values = [dr.select(found, value, 0) for value in values]
             dr.eval(values)
             return values

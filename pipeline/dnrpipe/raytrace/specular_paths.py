@@ -107,7 +107,7 @@ class SpecularPaths:
         # ------------------------------ The sample ----------------------------
         radiance, diffuse, albedo = mi.Spectrum(0.0), mi.Spectrum(0.0), mi.Spectrum(0.0)
         opacity, lost = mi.Float(0.0), mi.Bool(False)
-        normal, uv, depth, covered = mi.Vector3f(0.0), mi.Point2f(0.0), mi.Float(0.0), mi.Bool(False)
+        normal, uv, depth, covered = mi.Vector3f(0.0), mi.Point3f(0.0), mi.Float(0.0), mi.Bool(False)
         chain_uv, chain_weight, chain_ended = mi.Point2f(0.0), mi.Float(0.0), mi.Bool(False)
         chain_length, chain_place = mi.Float(0.0), mi.Point3f(0.0)
         mirrored = mi.Bool(every)  # no lobe so far has blurred what is seen
@@ -146,7 +146,7 @@ class SpecularPaths:
             chain_length += dr.select(behind, dr.minimum(si.t, FAR), 0)
             chain_place = dr.select(behind, ray(dr.minimum(si.t, FAR)), chain_place)
             ends = met & ~straight & ~chain_ended & (mean_of(rho) > LEAST_RHO)
-            chain_uv = dr.select(ends, place, chain_uv)
+            chain_uv = dr.select(ends, mi.Point2f(place.x, place.y), chain_uv)
             chain_weight = dr.select(ends, mean_of(throughput), chain_weight)
             chain_ended |= ends
 
@@ -238,12 +238,12 @@ class SpecularPaths:
         return source.emitter.eval(si, active), mis
 
     def _baked(self, light: Any, si: Any, active: Any) -> tuple[Any, Any, Any]:
-        """(E, S, atlas coordinates) at the surface point, on the side that is seen."""
-        place = si.shape.eval_attribute_3(ATTRIBUTE, si, active & si.shape.has_attribute(ATTRIBUTE, active))
+        """(E, S, atlas coordinates and the object's number) at the surface point, on the side that is seen."""
+        place = mi.Point3f(si.shape.eval_attribute_3(ATTRIBUTE, si, active & si.shape.has_attribute(ATTRIBUTE, active)))
         front = dr.dot(si.n, si.to_world(si.wi)) >= 0
         uv = mi.Point2f(place.x, place.y)
         found = [dr.select(front, *pair) for pair in zip(*(texture.eval(uv, active) for texture in light), strict=True)]
-        return mi.Spectrum(*found[:3]), mi.Spectrum(*found[3:]), uv
+        return mi.Spectrum(*found[:3]), mi.Spectrum(*found[3:]), place
 
     def _opacity(self, bsdf: Any, si: Any, active: Any) -> Any:
         """Share of a surface's light that does not pass straight on; what the surface adds has the same weight."""

@@ -43,7 +43,7 @@ class AtlasSurface:
                 continue
             faces = np.array(shape.faces_buffer()).reshape(-1, 3)
             vertices = np.array(shape.vertex_positions_buffer()).reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
-            atlas = np.array(shape.attribute_buffer(ATTRIBUTE)).reshape(-1, 3)
+            atlas = np.array(shape.attribute_buffer(ATTRIBUTE)).reshape(-1, 3) * (1, 1, 0)  # without object numbers
             corners.append(vertices[faces])
             places.append(atlas[faces])
             bsdf = shape.bsdf()
@@ -56,7 +56,6 @@ class AtlasSurface:
         if not self.count:
             return
         unfolded = np.concatenate(places).reshape(-1, 3).astype(np.float32)
-        unfolded[:, 2] = 0
         mesh = mi.Mesh("atlas", len(unfolded), self.count)
         parameters = mi.traverse(mesh)
         parameters["vertex_positions"] = mi.Float(unfolded.ravel())

@@ -11,6 +11,7 @@ from dnrtrain.contract import View
 
 from ..core.ledger import CostSummary
 from ..core.units import duration, ratio, several
+from ..stages.records import equal_rung
 from .data import Missing, Quality, Selection, Training
 from .quality import perceptual_note
 
@@ -32,12 +33,24 @@ def verdict(quality: Quality | None, selection: Selection | None) -> str:
     text += f", at {duration(quality.neural_seconds)} per frame"
     if quality.gbuffer_seconds is not None:
         text += f" plus {duration(quality.gbuffer_seconds)} for its {'base image' if quality.based else 'G-buffer'}"
-    if quality.traced_seconds is None:
-        return text + "."
-    if quality.traced_seconds <= quality.frame_seconds:
-        return f"{text}; a ray-traced frame takes {duration(quality.traced_seconds)}."
-    faster = ratio(quality.traced_seconds, quality.frame_seconds)
-    return f"{text}: {faster} times faster than the {duration(quality.traced_seconds)} of a ray-traced one."
+    return f"{text}{_beside_rival(quality)}."
+
+
+def _beside_rival(quality: Quality) -> str:
+    """What path tracing with a denoiser takes for the same PSNR; "" where it was not measured."""
+    if not quality.rivals or quality.rival_psnr is None or quality.frame_seconds is None:
+        return ""
+    found, last = equal_rung(quality.rivals, quality.rival_psnr), quality.rivals[-1]
+    if found is None:
+        return (
+            f". Path tracing with a denoiser does not reach that with {last.spp} samples a pixel, at"
+            f" {duration(last.seconds)} per frame"
+        )
+    longer = f"{ratio(found.seconds, quality.frame_seconds)} times as long"
+    if found.seconds < quality.frame_seconds:
+        longer = f"quicker by {ratio(quality.frame_seconds, found.seconds)} times"
+    samples = f"{found.spp} sample{'s' if found.spp > 1 else ''} a pixel"
+    return f". Path tracing with a denoiser is as good with {samples}, at {duration(found.seconds)} per frame: {longer}"
 
 
 def missing(

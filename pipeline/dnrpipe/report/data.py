@@ -11,7 +11,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from ..core.ledger import CostSummary
-from ..stages.records import ViewMetrics
+from ..stages.records import BaselineRung, ViewMetrics
 
 
 class _Frozen(BaseModel):
@@ -68,6 +68,7 @@ class Quality(_Frozen):
     neural_seconds: the network alone; gbuffer_seconds: Blender's passes of such a view (None where the
     ledger has none), or the base image where one is rendered (``based``);
     frame_seconds: both; traced_seconds: path tracing. All per frame, on the wall clock.
+    rivals: path tracing with a denoiser on a few of the views; rival_psnr: the renderer's PSNR on those.
     perceptual: the evaluation had LPIPS weights; trained_with_perceptual: L_p was among the losses.
     """
 
@@ -82,6 +83,8 @@ class Quality(_Frozen):
     based: bool
     frame_seconds: float | None
     traced_seconds: float | None
+    rivals: list[BaselineRung]
+    rival_psnr: float | None
     spp: list[int]
     ceiling_mean: float | None
     noise_share_mean: float | None

@@ -63,6 +63,8 @@ def build_quality(root: Path, metrics: Metrics, records: Sequence[CostRecord]) -
         based=bool(bases),
         frame_seconds=None if neural is None else neural + (gbuffer or 0.0),
         traced_seconds=_mean(recorded or known("seconds_traced")),
+        rivals=metrics.baseline,
+        rival_psnr=metrics.baseline_psnr,
         spp=sorted({v.spp for v in views if v.spp is not None}),
         ceiling_mean=_mean(known("ceiling_psnr")),
         noise_share_mean=_mean(shares),

@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from PIL import Image
 
 from dnrpipe.core.errors import UserError
@@ -41,6 +40,7 @@ from dnrtrain.contract import RASTER_CHANNELS, SceneFrame, View, require_channel
 from dnrtrain.dataset import view_in_memory
 from dnrtrain.display import DisplayTransform
 from dnrtrain.exr import read_exr
+from dnrtrain.model import render_views
 
 BASE_ONLY = ("base", "albedo")
 REMEMBERED = ("neural", "base", "error")
@@ -151,8 +151,7 @@ class Worker:
     def _neural(self, view: View, channels: dict[str, np.ndarray]) -> np.ndarray:
         """Display RGB over white, float32 [H, W, 3] in [0, 1]."""
         data = view_in_memory(channels, self.frame, view, display=self.display, base=self.kind)
-        with torch.inference_mode():
-            return picture_of(self.model(data.tensors.to(self.device)).rgb[0])
+        return picture_of(render_views(self.model, data)[0])
 
     def _shown(self, mode: str, channels: dict[str, np.ndarray]) -> np.ndarray:
         """A channel as a picture over white, float32 [H, W, 3] in [0, 1]."""

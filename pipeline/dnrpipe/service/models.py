@@ -16,17 +16,21 @@ if TYPE_CHECKING:
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$"
 SCENE_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}\.(blend|obj|gltf|glb|fbx|ply|stl)$"
 WEBHOOK_PATTERN = r"^https?://[!-~]+$"
+FRAMES_PATTERN = r"^-?[0-9][0-9, /-]{0,199}$"
+SIZE_PATTERN = r"^[0-9]{2,5}x[0-9]{2,5}$"
 SETTING_PATTERN = r"^[a-z0-9_]{1,40}(\.[a-z0-9_]{1,40}){0,4}$"
 
 PLAIN = {
     NAME_PATTERN: "a name has letters, digits, - and _, begins with a letter or digit, and has 64 at most",
     SCENE_PATTERN: "a scene file's name has letters, digits, - and _, and ends as scene files do (.blend, .glb, ...)",
     SETTING_PATTERN: "no such setting",
+    FRAMES_PATTERN: "frames are such as 1-240, 1-240/2 or 7,12",
+    SIZE_PATTERN: "a size is WIDTHxHEIGHT in pixels, such as 1280x720",
     WEBHOOK_PATTERN: "an address begins with https:// or http://",
 }
 """What a value that does not match a pattern is told."""
 
-Stage = Literal["run", "prepare", "select", "raytrace-selected", "finetune", "evaluate", "render", "report"]
+Stage = Literal["run", "prepare", "select", "raytrace-selected", "finetune", "evaluate", "render", "report", "shot"]
 Export = Literal["export-nerf", "export-onnx", "export-gltf", "export-web"]
 Command = Literal[Stage, Export]
 EXPORTS: tuple[Export, ...] = get_args(Export)
@@ -57,13 +61,17 @@ class Limits(Strict):
 
 
 class JobRequest(Strict):
-    """A stage, or all of them (``run``), on a workspace of the server.
+    """A stage, all of them (``run``), or a shot on a workspace of the server.
 
-    workspace: its name; the folder is ``<root>/<name>.dnr``. scene: an uploaded scene file, for ``run`` and ``prepare``
-    of a workspace that is not there yet; scene_sha256: which file of that name, by its content (default: the one there
-    now). settings: as ``--set``, by dotted key. priority: larger goes first.
-    retries: how often the queue starts a job again whose process crashed. orbit: frames of the turntable that `render`
-    makes. webhook: address that is told when the job has ended, one of those that the operator allows.
+    Args:
+        workspace: its name; the folder is ``<root>/<name>.dnr``.
+        scene: an uploaded scene file, for ``run``, ``prepare`` and ``shot`` of a workspace that is not there yet;
+            scene_sha256: which file of that name, by its content (default: the one there now).
+        settings: as ``--set``, by dotted key.
+        priority: larger goes first.
+        retries: how often the queue starts a job again whose process crashed.
+        orbit: frames of the turntable that `render` makes. frames, size: of `shot`, as its options.
+        webhook: address that is told when the job has ended, one of those that the operator allows.
     """
 
     command: Command
@@ -78,6 +86,8 @@ class JobRequest(Strict):
     priority: int = Field(default=0, ge=-100, le=100)
     retries: int = Field(default=1, ge=0, le=10)
     orbit: int | None = Field(default=None, ge=1, le=10_000)
+    frames: Annotated[str, Field(pattern=FRAMES_PATTERN)] | None = None
+    size: Annotated[str, Field(pattern=SIZE_PATTERN)] | None = None
     webhook: Annotated[str, Field(pattern=WEBHOOK_PATTERN, max_length=2000)] | None = None
     limits: Limits = Limits()
 

@@ -1,4 +1,4 @@
-"""What a workspace has to download: movies and frames of `render`, exports, the report."""
+"""What a workspace has to download: movies and frames of `render` and `shot`, exports, the report."""
 
 from __future__ import annotations
 
@@ -25,6 +25,11 @@ def results(workspace: Path) -> list[Result]:
         found += [_result("movie", path, path.relative_to(workspace).as_posix()) for path in movies]
         if any(folder.glob("frame_*")):
             found.append(_result("frames", folder, f"renders/{folder.name}.zip"))
+    for folder in _folders(workspace / "shots"):
+        movies = [path for path in sorted(folder.iterdir()) if path.suffix in MOVIES]
+        found += [_result("movie", path, path.relative_to(workspace).as_posix()) for path in movies]
+        if any((folder / "frames").glob("*.exr")):
+            found.append(_result("frames", folder / "frames", f"shots/{folder.name}/frames.zip"))
     for place in EXPORTED.values():
         path = workspace / place
         if path.is_file() and not path.is_symlink():

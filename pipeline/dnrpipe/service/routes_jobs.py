@@ -12,6 +12,7 @@ from starlette.concurrency import run_in_threadpool
 
 from ..core.cameras import KEYWORDS
 from ..core.settings import merge, parse_assignment, resolve
+from ..core.shot_records import parse_frames
 from .models import EXPORTS, FINAL, Job, JobPage, JobRequest, LogPage, Name, Problem, State
 from .state import Shared
 from .state import State as Service
@@ -199,13 +200,17 @@ def check_request(request: JobRequest, service: Service) -> None:
     """
     if request.orbit is not None and request.command != "render":
         raise HTTPException(422, f"orbit: {request.command} makes no frames; only render does")
+    if (request.frames or request.size) and request.command != "shot":
+        raise HTTPException(422, f"frames, size: {request.command} takes none; only shot does")
+    if request.frames is not None:
+        parse_frames(request.frames)
     if request.command in EXPORTS and (request.settings or request.preset or request.force):
         raise HTTPException(422, f"settings: {request.command} takes none; it exports what is there")
     if request.webhook is not None:
         check_webhook(request.webhook, service.config.webhooks)
     if request.scene is not None:
-        if request.command not in ("run", "prepare"):
-            raise HTTPException(422, f"scene: {request.command} takes none; only run and prepare do")
+        if request.command not in ("run", "prepare", "shot"):
+            raise HTTPException(422, f"scene: {request.command} takes none; only run, prepare and shot do")
         if request.scene_sha256 is None:
             service.root.scene(request.scene)
     path = service.root.workspace(request.workspace, must_exist=request.scene is None)

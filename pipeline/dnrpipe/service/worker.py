@@ -228,6 +228,8 @@ def job_command(job: Job, root: ServiceRoot, executor: tuple[str, ...] = ()) -> 
         return [*command, "--out", str(workspace / EXPORTED[request.command])]
     if request.orbit is not None:
         command += ["--orbit", str(request.orbit)]
+    for option, value in (("--frames", request.frames), ("--size", request.size)):
+        command += [option, value] if value is not None else []
     if request.preset is not None:
         command += ["--preset", request.preset]
     for key, value in request.settings.items():

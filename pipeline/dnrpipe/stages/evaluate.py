@@ -4,22 +4,27 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dnrtrain.contract import ContractError
+from dnrtrain.contract import ContractError, View
 from dnrtrain.exr import read_metadata
 from dnrtrain.records import write
 
+from ..core.cameras import spread
 from ..core.errors import UserError
 from ..core.images import flip_error, picture_of, write_png
 from ..core.scene_files import read_selection, split_views
 from ..core.settings import Settings
+from ..core.units import duration
 from ..core.workspace import Workspace, digest
 from .base_images import RENDERED, base_path, base_views
+from .baseline import VIEWS as BASELINE_VIEWS
+from .baseline import measure_baseline
 from .raytrace import trace_views
-from .records import METRICS, Metrics, ViewMetrics
+from .records import METRICS, Metrics, ViewMetrics, equal_rung
 from .stage import Outcome, Run
 from .trainer import load, perceptual_weights, torch_device
 from .trust import VIEWS, best_share
@@ -52,6 +57,7 @@ def evaluate(run: Run) -> Outcome:
     rendered = settings.model.base in RENDERED
     shipped = _shipped(run, device)
     rows: list[ViewMetrics] = []
+    truths: dict[str, Any] = {}
     neural_seconds: list[float] = []
     with console.bar("test views", len(views)) as bar:
         for view in views:
@@ -63,7 +69,7 @@ def evaluate(run: Run) -> Outcome:
                 others["base"] = base_picture(data.batch([0])).clamp(0, 1).cpu()
             if shipped is not None:
                 others["shipped"] = render_views(shipped, data)
-            target = data.tensors.target.cpu()
+            target = truths[view.name] = data.tensors.target.cpu()
             measured = image_metrics(prediction, data.tensors.target.cpu(), data.tensors.mask.cpu(), lpips)
             truth, predicted = picture_of(data.tensors.target[0]), picture_of(prediction[0])
             flip, heat = flip_error(truth, predicted)
@@ -104,7 +110,9 @@ def evaluate(run: Run) -> Outcome:
         raster_engine=workspace.manifest.prepared.raster_engine if workspace.manifest.prepared else "",
         reference_noise_target=settings.raytrace.evaluation_noise,
         neural_ms=1000 * float(np.median(neural_seconds)),
+        **_baseline(run, views, truths, rows, lpips["alex"] if lpips else None),
     )
+    told = _tell_baseline(metrics)
     names = {view.name for view in views}
     for path in workspace.evaluation.glob("[!.]*.png"):
         if path.name.rsplit(".", 2)[0] not in names:  # of other cameras
@@ -118,8 +126,33 @@ def evaluate(run: Run) -> Outcome:
         + (f"; base image {mean['psnr_base']:.2f} dB" if mean["psnr_base"] is not None else "")
         + (f", shipped corrector {mean['psnr_shipped']:.2f} dB" if mean["psnr_shipped"] is not None else "")
     )
+    if told:
+        console.say(told)
     stable = [{k: v for k, v in row.data().items() if not k.startswith("seconds")} for row in rows]
     return Outcome(digest(stable), {"mean": mean, "views": len(rows), "perceptual": perceptual is not None})
+
+
+def _baseline(
+    run: Run, views: Sequence[View], truths: dict[str, Any], rows: list[ViewMetrics], lpips: Any
+) -> dict[str, Any]:
+    """Fields of `Metrics` on path tracing with a denoiser; none where the settings leave it out."""
+    if not run.settings.raytrace.evaluation_baseline:
+        return {}
+    rungs = measure_baseline(run, views, truths, lpips)
+    chosen = {view.name for view in spread(views, BASELINE_VIEWS)}
+    own = [row.psnr for row in rows if row.name in chosen and row.psnr is not None]
+    return {"baseline": rungs, "baseline_psnr": float(np.mean(own)) if own else None}
+
+
+def _tell_baseline(metrics: Metrics) -> str:
+    """One line on the cheapest path tracing that is as good; "" where it was not measured."""
+    if not metrics.baseline or metrics.baseline_psnr is None:
+        return ""
+    found = equal_rung(metrics.baseline, metrics.baseline_psnr)
+    last = metrics.baseline[-1]
+    if found is None:
+        return f"path tracing with a denoiser is not as good at {last.spp} samples, {duration(last.seconds)} a frame"
+    return f"path tracing with a denoiser is as good at {found.spp} samples, {duration(found.seconds)} a frame"
 
 
 def _shipped(run: Run, device: str) -> DNR | None:

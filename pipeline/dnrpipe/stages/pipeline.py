@@ -48,7 +48,7 @@ def _tracing(settings: Settings, *, test: bool) -> dict[str, Any]:
     else:
         names = ["evaluation_spp"] if test else ["spp"]
         targets = {name: getattr(raytrace, name) for name in names}
-    common = {"max_depth", "evaluation_denoise" if test else "denoise", "seed"}
+    common = {"max_depth", "seed", *(("evaluation_denoise", "evaluation_baseline") if test else ("denoise",))}
     return raytrace.model_dump(include=common) | targets
 
 

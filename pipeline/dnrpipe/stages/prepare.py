@@ -24,6 +24,7 @@ from ..blender.tasks import (
     PendingBakes,
     PrepareAnswer,
     PrepareTask,
+    ShotTask,
 )
 from ..core.cameras import automatic_source, depth_range, make_cameras
 from ..core.console import Console
@@ -39,6 +40,7 @@ from ..core.scene_files import (
 )
 from ..core.scene_records import Conversion, RasterChoice, SceneSummary
 from ..core.settings import Settings
+from ..core.shot_records import ShotFacts
 from ..core.workspace import Workspace, digest, file_sha256
 from ..effects.store import keep_plan
 from ..workers.placement import HERE, Placement
@@ -47,7 +49,7 @@ from ..workers.view_tasks import warn_of_repairs, warn_of_retries, worker_count
 from .base_images import RENDERED
 from .stage import Outcome, Run
 
-Answer = TypeVar("Answer", PrepareAnswer, InspectAnswer)
+Answer = TypeVar("Answer", PrepareAnswer, InspectAnswer, ShotFacts)
 MAX_BAKE_ROUNDS = 4
 """Values whose need shows only after others are baked take further rounds; two are the rule."""
 BAKES = "bakes"
@@ -240,7 +242,9 @@ def _run_conversion(run: Run, source: Path, folder: Path) -> None:
     raise RuntimeError(f"{source}: the same textures are to be baked again and again")
 
 
-def open_scene(module: str, task: PrepareTask | InspectTask, answer: type[Answer], log: Path) -> tuple[Answer, str]:
+def open_scene(
+    module: str, task: PrepareTask | InspectTask | ShotTask, answer: type[Answer], log: Path
+) -> tuple[Answer, str]:
     """Run the task on a worker of ``module``: (its answer, why the first try failed or "").
 
     Raises UserError: both tries failed; says whether Blender itself died of the file. Raises OSError: a full disk.

@@ -6,6 +6,7 @@ preview/preview.json      PreviewState
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 from pydantic import Field
@@ -47,6 +48,18 @@ class ViewMetrics(Record, allow_inf_nan=False):
     psnr_shipped: float | None = None
 
 
+class BaselineRung(Record, allow_inf_nan=False):
+    """Path tracing with so many samples, denoised, on a few of the test views: means.
+
+    seconds: of a frame, with the whole machine. psnr in dB; lpips with AlexNet, None where there are no weights.
+    """
+
+    spp: int
+    seconds: float
+    psnr: float
+    lpips: float | None = None
+
+
 class Metrics(Record, allow_inf_nan=False):
     """The evaluation.
 
@@ -56,6 +69,8 @@ class Metrics(Record, allow_inf_nan=False):
         trained_with_perceptual: the perceptual loss was among the losses; None: not known.
         reference_noise_target: the relative noise that references were traced to; None: a number of samples was set.
         neural_ms: median of the network's milliseconds.
+        baseline: path tracing with a denoiser, by rising samples; empty where it was not measured.
+        baseline_psnr: the renderer's mean PSNR on the views of the baseline.
     """
 
     views: list[ViewMetrics] = Field(min_length=1)
@@ -66,6 +81,13 @@ class Metrics(Record, allow_inf_nan=False):
     raster_engine: str = ""
     reference_noise_target: float | None = None
     neural_ms: float | None = None
+    baseline: list[BaselineRung] = Field(default_factory=list)
+    baseline_psnr: float | None = None
+
+
+def equal_rung(rungs: Sequence[BaselineRung], psnr: float) -> BaselineRung | None:
+    """The cheapest path tracing that has the PSNR; None: not with the most samples that were measured."""
+    return min((rung for rung in rungs if rung.psnr >= psnr), key=lambda rung: rung.seconds, default=None)
 
 
 class PreviewState(Record, allow_inf_nan=False):

@@ -56,7 +56,7 @@ def render_novel(
     Raises UserError: no fine-tuned model, or cameras that no movie can hold.
     """
     from dnrtrain.dataset import load_views
-    from dnrtrain.model import render_radiance, render_views
+    from dnrtrain.model import render
 
     workspace, settings = run.workspace, run.settings
     # What evaluate needs is what this needs; the shipped corrector needs the scene alone.
@@ -93,15 +93,15 @@ def render_novel(
                 base_files=[path] if kind in RENDERED else None,
             ).to(device)
             started = time.perf_counter()
-            picture = picture_of(render_views(model, data)[0])
+            output = render(model, data)
+            picture = picture_of(output.rgb[0])
             seconds.append(time.perf_counter() - started)
             if movie != "none":
                 pictures.append((picture * 255 + 0.5).astype(np.uint8))
             if frames in ("png", "both"):
                 write_png(folder / f"frame_{view.name}.png", picture)
             if frames in ("exr", "both"):
-                radiance = render_radiance(model, data)
-                write_frame_exr(folder / f"frame_{view.name}.exr", picture, radiance, data, view)
+                write_frame_exr(folder / f"frame_{view.name}.exr", picture, output.radiance, data, view)
             size = {"width": view.width, "height": view.height}
             run.book("inference", "view", f"neural/{view.name}", seconds[-1], device=device, **size)
             bar.advance()

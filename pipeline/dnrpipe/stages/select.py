@@ -54,7 +54,8 @@ def select_views(run: Run) -> Outcome:
     else:
         chosen = _choose(run, views)
         made = [chosen.views]
-    chosen.details.update(details)
+    # A copy: records write what they were given, and a default that was filled later is not among it.
+    chosen = chosen.model_copy(update={"details": {**chosen.details, **details}})
     write(workspace.selection, chosen)
     return Outcome(digest(made), {"policy": chosen.policy, "views": chosen.views})
 

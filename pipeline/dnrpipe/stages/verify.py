@@ -82,7 +82,7 @@ def _checks(workspace: Workspace) -> Iterator[tuple[Path, Callable[[Path], objec
     root = workspace.root
     yield from ((path, read_cameras) for path in map(workspace.cameras, SPLITS) if path.exists())
     yield from _scene(workspace)
-    for folder in ("passes", "raytraced", "base", "renders"):
+    for folder in ("passes", "raytraced", "base", "renders", "shots"):
         yield from ((path, read_exr) for path in sorted((root / folder).rglob("[!.]*.exr")))
     if workspace.selection.exists():
         yield workspace.selection, lambda _: read_selection(workspace)
@@ -90,7 +90,7 @@ def _checks(workspace: Workspace) -> Iterator[tuple[Path, Callable[[Path], objec
         folder = workspace.checkpoints(step)
         yield from ((path, _weights) for path in sorted(folder.glob("[!.]*.safetensors")))
         yield from ((path, read_json) for path in sorted(folder.glob("[!.]*.json")))
-    for folder in ("evaluation", "renders"):
+    for folder in ("evaluation", "renders", "shots"):
         yield from ((path, read_json) for path in sorted((root / folder).rglob("[!.]*.json")))
         yield from ((path, _picture) for path in sorted((root / folder).rglob("[!.]*.png")))
     light = root / "base" / "light.npz"

@@ -102,7 +102,9 @@ def bake_layer(meshes: Sequence[FrozenMesh], layer: Mapping[str, Sequence[Tap]],
 
 
 def _scene(threads: int) -> bpy.types.Scene:
+    now = bpy.context.scene
     scene = bpy.data.scenes.new("dnrpipe.bake")
+    scene.frame_set(now.frame_current, subframe=now.frame_subframe)  # copies of materials keep their keys
     scene.render.engine = "CYCLES"
     scene.render.use_simplify = False
     if threads:

@@ -78,7 +78,7 @@ class GraphHasher:
 
     def _node(self, node: Any) -> Iterator[Any]:
         yield node.bl_idname
-        yield from self._properties(node, SKIPPED)
+        yield from self.properties(node, SKIPPED)
         if node.type in {"VALUE", "RGB", "NORMAL"}:
             yield _plain(node.outputs[0].default_value)
         reference = getattr(node, "object", None)
@@ -88,7 +88,8 @@ class GraphHasher:
         if camera is not None and any(output.is_linked and output.name in FROM_CAMERA for output in node.outputs):
             yield [_plain(row) for row in camera.matrix_world]
 
-    def _properties(self, holder: Any, skipped: set[str], depth: int = 0) -> Iterator[Any]:
+    def properties(self, holder: Any, skipped: set[str], depth: int = 0) -> Iterator[Any]:
+        """(name, plain value) of each setting of a node, a lamp or whatever lies in one, but for ``skipped``."""
         for prop in holder.bl_rna.properties:
             name = prop.identifier
             if name in skipped or name == "rna_type":
@@ -98,7 +99,7 @@ class GraphHasher:
             elif prop.type == "POINTER":
                 yield name, self._pointer(getattr(holder, name), depth)
             elif prop.type == "COLLECTION" and name in {"elements", "points", "curves"}:
-                yield name, [list(self._properties(item, set(), depth + 1)) for item in getattr(holder, name)]
+                yield name, [list(self.properties(item, set(), depth + 1)) for item in getattr(holder, name)]
 
     def _pointer(self, value: Any, depth: int) -> Any:
         if value is None:
@@ -113,7 +114,7 @@ class GraphHasher:
             return value.name  # of a zone's other end; nodes point at each other
         if depth >= NESTED:
             return None
-        return list(self._properties(value, set(), depth + 1))
+        return list(self.properties(value, set(), depth + 1))
 
     def _image(self, image: Any) -> str:
         key = image.name_full

@@ -40,10 +40,17 @@ def convert_materials(
     meshes: Sequence[FrozenMesh], scene_dir: Path, findings: Findings, options: BakeOptions | None
 ) -> MaterialConverter:
     """A converter that has converted every material in use; `missing_bakes` says what it lacks."""
-    bakes = (
-        None if options is None else BakeCache(Atlas(meshes, options.size), options.folder, frozenset(options.refused))
-    )
-    converter = MaterialConverter(TextureStore(scene_dir), ImageReader(findings), findings, bakes)
+    bakes = None if options is None else bake_cache(meshes, options)
+    return converted(meshes, MaterialConverter(TextureStore(scene_dir), ImageReader(findings), findings, bakes))
+
+
+def bake_cache(meshes: Sequence[FrozenMesh], options: BakeOptions) -> BakeCache:
+    """The cache for an atlas that the meshes fill."""
+    return BakeCache(Atlas(meshes, options.size), options.folder, frozenset(options.refused))
+
+
+def converted(meshes: Sequence[FrozenMesh], converter: MaterialConverter) -> MaterialConverter:
+    """The converter, which has converted every material of the meshes."""
     for mesh in meshes:
         for slot in np.unique(mesh.material_index):
             name = mesh.materials[slot]

@@ -28,7 +28,8 @@ UNSEEN_PREFIX = "unseen-"
 UNSEEN_ATTRIBUTE = "unseen"
 """Mitsuba's loader joins plain meshes of one material and drops their ids; those with an attribute it leaves alone."""
 ATLAS_ATTRIBUTE = "atlas"
-"""Place in the scene atlas, (U, V, 0), as the vertex attribute ``vertex_atlas`` of every mesh: light is baked there."""
+"""Place in the scene atlas, where light is baked, and the object's number: (U, V, number), the vertex attribute
+``vertex_atlas`` of every mesh."""
 STRANDS_PREFIX = "hair-"
 """Shapes whose id begins so are strands of hair."""
 JOIN_ABOVE = 64  # shapes; up to here every mesh and material keeps a shape of its own
@@ -104,7 +105,8 @@ def _piece(
     attributes = [(name, values[order]) for name, values in _attributes(mesh, converted, converter.findings)]
     if not mesh.camera_visible:
         attributes.append((UNSEEN_ATTRIBUTE, np.ones((len(order), 1), np.float32)))
-    place = np.concatenate([mesh.atlas[order], np.zeros((len(order), 1), np.float32)], axis=1)
+    number = np.full((len(order), 1), mesh.object_id, np.float32)
+    place = np.concatenate([mesh.atlas[order], number], axis=1)
     attributes.append((ATLAS_ATTRIBUTE, place))
     welded = weld(positions, normals, None if uv is None else uv[order], attributes, copies)
     return Piece(mesh, converted, welded, two_sided)

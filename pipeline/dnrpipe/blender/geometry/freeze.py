@@ -16,6 +16,7 @@ from ..findings import Findings
 from .frozen import FrozenMesh
 from .instances import Placed, Shared, copy_matrices, share_instances
 from .local_mesh import LocalMesh, read_local, slot_names
+from .render_graph import render_layer, with_render_graph
 from .simplify import fit_instances
 from .strands import hair_systems, read_curves, read_points
 from .world import REPAIRS, to_world
@@ -40,69 +41,14 @@ class Frozen:
     """Full names of lamps that renders see, and of the objects that instance lamps."""
 
 
-class _FreezeEngine(bpy.types.RenderEngine):
-    """A render engine that draws nothing.
-
-    Blender hands a depsgraph in RENDER mode (hide_render, render levels of modifiers) to render engines
-    only; the one that scripts get from ``evaluated_depsgraph_get`` has viewport visibility.
-    """
-
-    bl_idname = "DNRPIPE_FREEZE"
-    bl_label = "dnrpipe freeze"
-    outcome: Frozen | Exception | None = None
-
-    def render(self, depsgraph: bpy.types.Depsgraph) -> None:
-        try:
-            type(self).outcome = freeze(depsgraph)
-        except Exception as error:  # Blender would print and swallow it; freeze_scene raises it again
-            type(self).outcome = error
-
-
-def render_layer(scene: bpy.types.Scene) -> bpy.types.ViewLayer:
-    """The view layer that pictures are made of: the first one that is used for rendering."""
-    return next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
-
-
 def freeze_scene(scene: bpy.types.Scene) -> Frozen:
     """`freeze` the scene at its current frame with render visibility; the scene stays as it was.
 
     Raises:
         UserError: nothing in the scene is visible in renders.
     """
-    render = scene.render
-    wanted = {
-        "engine": _FreezeEngine.bl_idname,
-        **dict.fromkeys(("resolution_x", "resolution_y"), 8),
-        "resolution_percentage": 100,
-        **dict.fromkeys(("use_border", "use_multiview", "use_compositing", "use_sequencer", "use_simplify"), False),
-    }
-    kept = {name: getattr(render, name) for name in wanted}
     layer = render_layer(scene)
-    used = layer.use
-    camera = None
-    if scene.camera is None:  # the render operator insists on one
-        camera = bpy.data.cameras.new("dnrpipe.freeze")
-        scene.camera = bpy.data.objects.new("dnrpipe.freeze", camera)
-    bpy.utils.register_class(_FreezeEngine)
-    _FreezeEngine.outcome = None
-    try:
-        layer.use = True
-        for name, value in wanted.items():
-            setattr(render, name, value)
-        bpy.ops.render.render(scene=scene.name, layer=layer.name)
-        outcome = _FreezeEngine.outcome
-    finally:
-        for name, value in kept.items():
-            setattr(render, name, value)
-        layer.use = used
-        if camera is not None:
-            scene.camera = None
-            bpy.data.cameras.remove(camera)  # takes its object along
-        bpy.utils.unregister_class(_FreezeEngine)
-    if isinstance(outcome, Exception):
-        raise outcome
-    if outcome is None:
-        raise RuntimeError(f"Blender did not evaluate scene '{scene.name}' for rendering")
+    outcome = with_render_graph(scene, lambda engine, depsgraph: freeze(depsgraph))
     if not outcome.meshes:
         raise UserError(
             f"scene '{scene.name}', view layer '{layer.name}': no surface is visible in renders; "
@@ -138,7 +84,7 @@ def freeze(depsgraph: bpy.types.Depsgraph) -> Frozen:
         holder = obj if instance.parent is None else instance.parent
         seen = _seen_by_camera(obj, holder, depsgraph.view_layer, findings)
         persistent = tuple(instance.persistent_id) if instance.is_instance else ()
-        for key, read in _surfaces(obj, instance.show_self, instance.show_particles, findings):
+        for key, read in surfaces(obj, instance.show_self, instance.show_particles, findings):
             if key not in cache:
                 local = read()
                 cache[key] = None
@@ -217,7 +163,7 @@ def _override_materials(frozen: Frozen, layer: bpy.types.ViewLayer) -> None:
     frozen.findings.add("exact", "material override", f"'{name}' stands for every material, as the view layer says")
 
 
-def _surfaces(
+def surfaces(
     obj: bpy.types.Object, show_self: bool, show_particles: bool, findings: Findings
 ) -> Iterator[tuple[tuple[object, ...], Callable[[], LocalMesh | None]]]:
     """(cache key, reader) of each surface that an instance shows."""

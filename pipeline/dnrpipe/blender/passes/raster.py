@@ -9,7 +9,7 @@ import bpy
 
 from dnrpipe.core.errors import UserError
 
-from ..geometry.freeze import render_layer
+from ..geometry.render_graph import render_layer
 
 WORKBENCH_AA = ((1, "OFF"), (5, "5"), (8, "8"), (11, "11"), (16, "16"), (32, "32"))
 

@@ -13,8 +13,9 @@ from dnrpipe.core.errors import UserError
 from dnrpipe.core.scene_records import Bounds
 
 from ..findings import Findings
-from ..geometry.freeze import Frozen, render_layer
+from ..geometry.freeze import Frozen
 from ..geometry.frozen import FrozenMesh
+from ..geometry.render_graph import render_layer
 from ..visible import freeze_visible
 from .framing import ensure_camera
 from .light import ensure_light, has_light

@@ -95,6 +95,7 @@ class Evaluator:
         if self.bakes is None or self.material is None:
             return value
         self.bakes.used_atlas = True
+        self.bakes.materials.add(self.material)
         return on_region(self.bakes.atlas, self.material, value)
 
     def _evaluated(self, socket: Any, scope: Scope, kind: ValueKind) -> Value:

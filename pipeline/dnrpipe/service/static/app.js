@@ -344,6 +344,7 @@
       if ($("preset").value) request.preset = $("preset").value;
       if (Number($("priority").value)) request.priority = Number($("priority").value);
       if ($("orbit").value && request.command === "render") request.orbit = Number($("orbit").value);
+      ["frames", "size"].forEach(function (name) { if ($(name).value && request.command === "shot") request[name] = $(name).value.trim(); });
       $("settings").value.split("\n").forEach(function (line) {
         const at = line.indexOf("=");
         if (at > 0) request.settings[line.slice(0, at).trim()] = line.slice(at + 1).trim();

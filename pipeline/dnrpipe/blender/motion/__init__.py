@@ -1,0 +1,1 @@
+"""What changes over the frames of a shot."""

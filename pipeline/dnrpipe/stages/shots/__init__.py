@@ -1,0 +1,1 @@
+"""`dnrpipe shot`: from an animated camera to finished frames, by the cheapest way that is good enough."""

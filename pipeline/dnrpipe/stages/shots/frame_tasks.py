@@ -1,0 +1,100 @@
+"""What the process that renders a shot's frames is asked, and what it answers.
+
+Ways of rendering a frame (`Way`):
+
+    path     path tracing and Open Image Denoise, with albedo and normals of clean primary rays
+    base     the base image alone: baked light and mirror-like paths
+    neural   the base image, corrected by the network
+
+Seconds are wall-clock, ``cpu_seconds`` of the process.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal, NotRequired
+
+from pydantic import BaseModel, ConfigDict
+
+from dnrtrain.contract import SceneFrame, View
+
+from ...core.scene_records import Lens
+from ...raytrace.tasks import Costs, Task
+
+WayName = Literal["path", "base", "neural"]
+Quality = Literal["high", "fast"]
+
+
+class Way(BaseModel):
+    """How a frame is rendered. spp, quality: samples per pixel and the denoiser's network, of ``path``."""
+
+    model_config = ConfigDict(frozen=True)
+
+    name: WayName
+    spp: int = 0
+    quality: Quality = "high"
+
+    @property
+    def told(self) -> str:
+        """In words, for tables."""
+        if self.name == "path":
+            return f"path tracing, {self.spp} samples, denoised" + (" (fast)" if self.quality == "fast" else "")
+        return "base images alone" if self.name == "base" else "neural renderer"
+
+
+class FrameCommon(Task):
+    """A scene, and what renders it.
+
+    Args:
+        bundle, variant, integrator, max_depth: of path tracing (`effects.store.trace_config`).
+        base: common of the base image worker (`raytrace.tasks.BakedCommon`), or None: frames are path-traced only.
+        checkpoint: folder of the model; None: the shipped corrector, of which ``trust`` is applied.
+        scene, frame: folder and facts of the converted scene, for the display transform.
+        device: setting of torch.
+        background: the camera sees the world behind everything.
+    """
+
+    bundle: Path
+    variant: str
+    integrator: str
+    max_depth: int
+    base: dict[str, Any] | None = None
+    checkpoint: Path | None = None
+    trust: float = 1.0
+    scene: Path
+    frame: SceneFrame
+    device: str = "auto"
+    background: bool = False
+
+
+class FrameTask(Task):
+    """Render a frame into ``output``, an EXR file, and as it is displayed into ``picture``, a PNG.
+
+    Args:
+        lens: thin lens of the camera, for ``path``; other ways have pinholes.
+        earlier: the frames of the camera's way that this one remembers (`raytrace.history`), in their order; None: it
+            stands alone. number: of the first of them in the camera's way.
+    """
+
+    view: View
+    way: Way
+    lens: Lens | None = None
+    earlier: tuple[View, ...] | None = None
+    number: int = 0
+    seed: int
+    output: Path
+    picture: Path
+    fingerprint: str
+
+
+class FrameAnswer(Costs):
+    """Also in the header of the file, but for the seconds that writing it took.
+
+    masked: pixels that were not finite and are 0. ms: milliseconds of the parts.
+    """
+
+    way: str
+    spp: int
+    masked: int
+    ms: dict[str, float]
+    write_seconds: NotRequired[float]

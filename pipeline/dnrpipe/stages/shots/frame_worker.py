@@ -1,0 +1,195 @@
+"""The process that renders a shot's frames: scene, kernels and network are kept between them.
+
+A frame's file holds scene-linear Rec.709, premultiplied (see `LAYERS`); its picture goes through the scene's view
+transform.
+"""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from dnrpipe.core.errors import UserError
+from dnrpipe.core.images import write_png
+from dnrpipe.core.settings import Settings
+from dnrpipe.raytrace.background import Background
+from dnrpipe.raytrace.base_worker import Worker as BaseWorker
+from dnrpipe.raytrace.denoise import denoise
+from dnrpipe.raytrace.engine import Engine, masked, masked_channels
+from dnrpipe.raytrace.frames import Frames
+from dnrpipe.raytrace.tasks import costs_since
+from dnrtrain.contract import View
+from dnrtrain.dataset import view_in_memory
+from dnrtrain.display import DisplayTransform
+from dnrtrain.exr import write_exr
+from dnrtrain.model import render
+
+from ..trainer import torch_device
+from .frame_tasks import FrameAnswer, FrameCommon, FrameTask, Way
+
+COLOUR = ("R", "G", "B", "A")
+LAYERS = (*COLOUR, "depth.Z", "normal.X", "normal.Y", "normal.Z", "albedo.R", "albedo.G", "albedo.B", "object.Id")
+"""Channels of a frame. Normals are of world space; all but colour and albedo are of the ray through the pixel's
+centre; albedo is the diffuse reflectance."""
+HALF = ("R", "G", "B", "A", "normal.X", "normal.Y", "normal.Z", "albedo.R", "albedo.G", "albedo.B")
+"""Of them, those that are written in 16 bits."""
+GUIDE_RAYS = 16
+"""Primary rays per pixel of the denoiser's auxiliary images: clean."""
+MAX_RAYS = 1 << 22
+"""Of a launch of the path tracer: bounds its memory."""
+
+
+class Worker:
+    """Renders frames. common: a `FrameCommon`; task: a `FrameTask`."""
+
+    def __init__(self, common: dict[str, Any]) -> None:
+        self.common = settings = FrameCommon.model_validate(common)
+        self.display = DisplayTransform(settings.frame, settings.scene)
+        self.base = None if settings.base is None else BaseWorker(settings.base)
+        if self.base is not None and self.base.bundle == settings.bundle:
+            self.engine = self.base.engine
+        else:
+            self.engine = Engine(settings.variant, 0, [settings.bundle])
+        if not self.engine.compiled:
+            raise UserError("shots need a jit variant of Mitsuba (LLVM or CUDA); see `dnrpipe doctor`")
+        self.frames = functools.cache(
+            functools.partial(Frames, self.engine, settings.bundle, settings.integrator, settings.max_depth)
+        )  # by (width, height)
+        self.background = Background(self.engine, settings.bundle) if settings.background else None
+        self.warm: set[tuple[str, int, int, int]] = set()
+
+    @functools.cached_property
+    def model(self) -> Any:
+        """The network, on its device."""
+        from dnrtrain.checkpoint import load_model
+        from dnrtrain.shipped import corrector
+
+        device = torch_device(Settings(device=self.common.device))
+        if self.common.checkpoint is not None:
+            return load_model(self.common.checkpoint, device)
+        model = corrector()
+        model.settings = model.settings.model_copy(update={"trust": self.common.trust})
+        return model.to(device)
+
+    def __call__(self, asked: dict[str, Any]) -> FrameAnswer:
+        task = FrameTask.model_validate(asked)
+        kernel = (task.way.name, _at_once(task), task.view.width, task.view.height)
+        if kernel not in self.warm:  # compiles the kernels, which is no cost of a frame
+            way = task.way.model_copy(update={"spp": _at_once(task)})
+            self.render(task.model_copy(update={"way": way, "earlier": task.earlier and task.earlier[-1:]}), {})
+            if self.base is not None:
+                self.base.seen = []
+            self.warm.add(kernel)
+        ms: dict[str, float] = {}
+        started, cpu = time.monotonic(), time.process_time()
+        layers, lost = self.render(task, ms)
+        picture = self.shown(layers)
+        costs = costs_since(started, cpu)
+        answer: FrameAnswer = {
+            **costs,
+            "way": task.way.name,
+            "spp": task.way.spp,
+            "masked": lost,
+            "ms": {name: round(value, 2) for name, value in ms.items()},
+        }
+        header = {**answer, "fingerprint": task.fingerprint, "view": task.view.model_dump(mode="json")}
+        began = time.monotonic()
+        for path in (task.output, task.picture):
+            path.parent.mkdir(parents=True, exist_ok=True)
+        write_png(task.picture, picture)
+        write_exr(task.output, layers, header, half=HALF)  # last: it says that the frame is made
+        answer["write_seconds"] = time.monotonic() - began
+        return answer
+
+    def render(self, task: FrameTask, ms: dict[str, float]) -> tuple[dict[str, np.ndarray], int]:
+        """(channels of LAYERS, float32 [H, W] each; pixels that were not finite). ms: milliseconds of the parts."""
+
+        def timed(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+            began = time.perf_counter()
+            found = function(*arguments)
+            ms[name] = 1000 * (time.perf_counter() - began)
+            return found
+
+        if task.way.name == "path":
+            layers, lost = self._path(task, timed)
+        else:
+            layers, lost = self._from_base(task, timed)
+        if self.background is not None:
+            behind = timed("background", self.background.frame, task.view)
+            clear = 1 - np.clip(layers["A"], 0, 1)
+            for i, name in enumerate("RGB"):
+                layers[name] = layers[name] + clear * behind[..., i]
+            layers["A"] = np.ones_like(layers["A"])
+        return layers, lost
+
+    def shown(self, layers: dict[str, np.ndarray]) -> np.ndarray:
+        """Display RGB over white, float32 [H, W, 3] in [0, 1]."""
+        import torch
+
+        planes = torch.from_numpy(np.stack([layers[name] for name in COLOUR]).astype(np.float32))[None]
+        return self.display.over_white(planes[:, :3], planes[:, 3:])[0].permute(1, 2, 0).numpy()
+
+    def _from_base(self, task: FrameTask, timed: Callable[..., Any]) -> tuple[dict[str, np.ndarray], int]:
+        if self.base is None:
+            raise UserError(f"frame {task.view.name}: {task.way.told} need baked light")
+        self.base.repaired = self.base.masked = 0
+        arguments = (task.view,) if task.earlier is None else (task.view, task.earlier, task.number)
+        function = self.base.channels if task.earlier is None else self.base.remembered
+        channels = timed("base image", function, *arguments)
+        lost = self.base.masked
+        alpha = channels["coverage"]
+        if task.way.name == "neural":
+            colour = timed("network", self._corrected, task.view, channels)
+        else:
+            premultiplied = np.stack([channels[f"base.{c}"] for c in "RGB"], axis=-1)
+            colour = premultiplied / np.maximum(channels["base.A"], 1e-6)[..., None]
+        layers = {name: channels[name] for name in LAYERS if name in channels}
+        layers |= {name: colour[..., i] * alpha for i, name in enumerate("RGB")}
+        return layers | {"A": alpha}, lost
+
+    def _corrected(self, view: View, channels: dict[str, np.ndarray]) -> np.ndarray:
+        """The network's radiance, linear Rec.709, straight, float32 [H, W, 3]."""
+        data = view_in_memory(channels, self.common.frame, view, display=self.display, base="baked")
+        radiance = render(self.model, data.to(next(self.model.parameters()).device)).radiance
+        if radiance is None:
+            raise UserError("shots need a model whose output is radiance: type --set model.output=log")
+        return radiance[0].permute(1, 2, 0).numpy()
+
+    def _path(self, task: FrameTask, timed: Callable[..., Any]) -> tuple[dict[str, np.ndarray], int]:
+        view, way = task.view, task.way
+        frames = self.frames((view.width, view.height))
+        image, lost = masked(timed("path tracing", self._traced, task, frames))
+        guide = timed("primary rays", frames.auxiliary, view, GUIDE_RAYS, task.seed)
+        clean = timed("denoiser", _denoised, image, guide, way)
+        gbuffer, more = masked_channels(timed("G-buffer", frames.gbuffer, view))
+        alpha = guide.coverage if task.lens is None else image[..., 3]
+        layers = {name: clean[..., i] for i, name in enumerate("RGB")} | {"A": alpha}
+        layers |= {name: gbuffer[name] for name in LAYERS if name in gbuffer}
+        return layers | {f"albedo.{c}": guide.albedo[..., i] for i, c in enumerate("RGB")}, lost + more
+
+    def _traced(self, task: FrameTask, frames: Frames) -> np.ndarray:
+        """Path-traced RGBA, premultiplied, float32 [H, W, 4], in launches that fit in memory."""
+        view, spp = task.view, task.way.spp
+        if task.lens is not None:
+            integrator, _ = self.engine.integrator(self.common.bundle, self.common.integrator, self.common.max_depth)
+            sensor = self.engine.sensor(view, task.lens)
+            image, _ = self.engine.frame(self.common.bundle, integrator, sensor, view, spp, task.seed)
+            return image.astype(np.float32)
+        each = _at_once(task)
+        launches = -(-spp // each)
+        total = sum(frames.path(view, each, task.seed * 4096 + launch) for launch in range(launches))
+        return np.asarray(total, np.float32) / launches
+
+
+def _at_once(task: FrameTask) -> int:
+    """Samples per pixel of one launch: a power of two, so that few kernels are compiled."""
+    most = min(task.way.spp, MAX_RAYS // (task.view.width * task.view.height))
+    return 1 << max(0, most.bit_length() - 1)
+
+
+def _denoised(image: np.ndarray, guide: Any, way: Way) -> np.ndarray:
+    return denoise(image, guide.albedo, guide.normal, clean=True, quality=way.quality)

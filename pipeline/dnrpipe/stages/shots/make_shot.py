@@ -1,0 +1,208 @@
+"""A shot from its cameras to the finished frames: measure, choose, render, check.
+
+Everything lies in ``shots/NAME`` of the workspace: ``frames/`` (EXR), ``pictures/`` (PNG), ``NAME.mp4``, ``check/``,
+``shot.json``. A run that was interrupted goes on with what is missing.
+"""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dnrtrain.records import read, write
+
+from ...core.scene_files import scene_fingerprint
+from ...core.units import duration
+from ...core.workspace import digest, file_sha256
+from ...workers.view_tasks import is_made
+from ..base_images import BASE_VERSION
+from ..session import Session
+from ..shot_scene import convert_frames, scene_at
+from ..stage import Run
+from ..trainer import perceptual_weights
+from .check import check, held_out
+from .frame_tasks import Way
+from .options import Wanted, choose
+from .plan_shot import lines, moving_way, weigh
+from .records import PLAN, RECORD, ShotFrame, ShotPlan, ShotRecord, facts
+from .render_frames import frame_tasks, picture_path, render_frames, write_movie
+from .renderers import Renderer, path_tracer, shipped_renderer, trained_renderer
+
+CHECKED = 2
+"""Frames of a shot that are traced to check it."""
+PLAN_VERSION = 1
+BATCH = 8
+"""Bundles of single frames that are on disk at once."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A shot to be made in a prepared workspace.
+
+    Args:
+        moving: what changes over its frames, in words, by name.
+        background: the camera sees the world behind everything.
+    """
+
+    name: str
+    frames: Sequence[ShotFrame]
+    moving: dict[str, str]
+    fps: float
+    background: bool
+    wanted: Wanted
+
+
+def plan_shot(session: Session, shot: Shot) -> ShotPlan:
+    """Measure ways to make the shot on small frames, choose, and say so. A plan of the same shot is kept."""
+    started = time.monotonic()
+    run = session.run.for_stage("render")
+    tracer, path = path_tracer(run, shot.background), folder_of(run, shot) / PLAN
+    inputs = [tracer.common.model_dump(mode="json"), run.scene_fingerprint, shot.wanted.model_dump(mode="json")]
+    frames = [frame.model_dump(mode="json") for frame in shot.frames]
+    fingerprint = digest([PLAN_VERSION, *inputs, frames, run.settings.model_dump(mode="json")])
+    plan = read(path, ShotPlan) if path.exists() and not session.options["force"] else None
+    if plan is None or plan.fingerprint != fingerprint:
+        options = weigh(run, shot.frames, folder_of(run, shot) / "pilot", shot.wanted, tracer, lpips_of(run))
+        chosen, why = choose(options, shot.wanted)
+        plan = ShotPlan(
+            fingerprint=fingerprint,
+            options=tuple(options),
+            chosen=chosen,
+            why=why,
+            seconds=time.monotonic() - started,
+        )
+        write(path, plan)
+    for line in lines(plan.options, plan.chosen, plan.why):
+        run.console.say(line)
+    return plan
+
+
+def make_shot(session: Session, shot: Shot, plan: ShotPlan) -> ShotRecord:
+    """Carry the plan out: train where it says so, render all frames, make the movie, check.
+
+    Raises UserError, TasksFailed: as the stages do.
+    """
+    started = time.monotonic()
+    run, chosen = session.run.for_stage("render"), plan.chosen
+    folder, tracer = folder_of(run, shot), path_tracer(run, shot.background)
+    renderer = tracer
+    if chosen.way.name != "path":
+        renderer = shipped_renderer(run, shot.background)
+        if chosen.views:
+            session.settings = session.settings.with_budget(chosen.views)
+            session.stages("select", "raytrace", "finetune")
+            run = session.run.for_stage("render")
+            renderer = trained_renderer(run, shot.background)
+    inputs = _inputs(run, renderer)
+    still = [place for place, frame in enumerate(shot.frames) if not frame.moving]
+    tasks = frame_tasks(shot.frames, folder, chosen.way, inputs, still)
+    render_frames(run, renderer, tasks, label=f"frames by {chosen.way.told}")
+    places = held_out(shot.frames, CHECKED)
+    way_of_moving = render_moving(run, shot, plan, tracer, inputs, places)
+    movie = folder / f"{shot.name}.mp4"
+    write_movie(movie, [picture_path(folder, frame) for frame in shot.frames], shot.fps)
+    spent = time.monotonic() - started
+    tracers = [(tracer, [place for place in places if not shot.frames[place].moving])]
+    tracers += [
+        (tracer.at_frame(run, shot.frames[place].number), [place]) for place in places if shot.frames[place].moving
+    ]
+    found = check(run, tracers, shot.frames, folder, inputs, lpips_of(run))
+    shutil.rmtree(scene_at(run.workspace, 0).parent, ignore_errors=True)  # bundles of single frames
+    record = ShotRecord(
+        name=shot.name,
+        scene=run.workspace.manifest.source.path,
+        **facts(shot.frames),
+        fps=shot.fps,
+        moving=shot.moving,
+        options=plan.options,
+        chosen=chosen,
+        why=plan.why,
+        still_way=chosen.way,
+        moving_way=way_of_moving,
+        expected=chosen.seconds,
+        spent_before=plan.seconds,
+        spent=spent,
+        check=found,
+        movie=str(movie),
+    )
+    write(folder / RECORD, record)
+    _tell(run, record)
+    return record
+
+
+def render_moving(
+    run: Run, shot: Shot, plan: ShotPlan, tracer: Renderer, inputs: str, checked: Sequence[int]
+) -> Way | None:
+    """Path trace the frames in which things move, each of the scene as it is then -> how; None: there are none.
+
+    Bundles of frames that are ``checked`` stay; the others would fill the disk.
+    """
+    moving = [place for place, frame in enumerate(shot.frames) if frame.moving]
+    if not moving:
+        return None
+    folder, way = folder_of(run, shot), moving_way(plan.options, plan.chosen)
+    tasks = dict(zip(moving, frame_tasks(shot.frames, folder, way, inputs, moving), strict=True))
+    due = [place for place in moving if place in checked or not is_made(tasks[place].data())]
+    for batch in (due[first : first + BATCH] for first in range(0, len(due), BATCH)):
+        convert_frames(run, [shot.frames[place].number for place in batch])
+        for place in batch:
+            number = shot.frames[place].number
+            own = tracer.at_frame(run, number)
+            render_frames(run, own, [tasks[place]], label=f"frame {number} by {way.told}")
+            if place not in checked:
+                shutil.rmtree(scene_at(run.workspace, number))
+    return way
+
+
+def folder_of(run: Run, shot: Shot) -> Path:
+    folder = run.workspace.root / "shots" / shot.name
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def lpips_of(run: Run) -> Any:
+    """LPIPS with AlexNet, or None where its weights are missing."""
+    weights = perceptual_weights(run.console)
+    if weights is None:
+        return None
+    from dnrtrain.perceptual import build_lpips
+
+    return build_lpips(weights)["alex"]
+
+
+def _inputs(run: Run, renderer: Renderer) -> str:
+    """Hash of all that decides a frame but its view and way."""
+    common = renderer.common.model_dump(mode="json")
+    model: list[str] = []
+    if renderer.common.checkpoint is not None:
+        model = [file_sha256(renderer.common.checkpoint / "model.safetensors")]
+    elif renderer.common.base is not None:
+        from dnrtrain.shipped import WEIGHTS
+
+        model = [file_sha256(WEIGHTS)]
+    light = base_fingerprint(run) if renderer.common.base is not None else ""
+    return digest([BASE_VERSION, scene_fingerprint(run.workspace), common, model, light])
+
+
+def base_fingerprint(run: Run) -> str:
+    from ..base_images import base_renderer
+
+    return base_renderer(run.workspace, run.settings, run.effect_plan).fingerprint
+
+
+def _tell(run: Run, record: ShotRecord) -> None:
+    spent, expected = duration(record.spent), duration(record.expected)
+    run.console.say(f"{len(record.frames)} frames in {spent} (expected {expected})")
+    if record.check is not None:
+        told = f"{record.check.psnr:.2f} dB"
+        if record.check.lpips is not None:
+            told += f", LPIPS {record.check.lpips:.4f}"
+        aim = "" if record.chosen.psnr is None else f" (expected {record.chosen.psnr:.2f} dB)"
+        frames = ", ".join(map(str, record.check.frames))
+        run.console.say(f"checked on frames {frames}, traced with {record.check.spp} samples: {told}{aim}")
+    if record.movie is not None:
+        run.console.say(record.movie)

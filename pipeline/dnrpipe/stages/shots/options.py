@@ -1,0 +1,88 @@
+"""Ways to make a shot, what they are expected to give and cost, and which is taken."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from pydantic import BaseModel, ConfigDict
+
+from dnrtrain.records import Record
+
+from .frame_tasks import Way
+
+
+class Wanted(BaseModel):
+    """What the user asked for. seconds: for all of the shot, from here on. psnr in dB, lpips (AlexNet)."""
+
+    model_config = ConfigDict(frozen=True)
+
+    seconds: float | None = None
+    psnr: float | None = None
+    lpips: float | None = None
+    way: str | None = None
+
+
+class Option(Record):
+    """A way to make the shot, and what it is expected to give.
+
+    Args:
+        views: traced to train on before.
+        before: seconds before the first frame, from here on. frame: seconds of a frame.
+        seconds: of the shot, from here on. psnr, lpips: against the pilot's references; None where not known.
+    """
+
+    way: Way
+    views: int = 0
+    before: float
+    frame: float
+    seconds: float
+    psnr: float | None
+    lpips: float | None
+
+    @property
+    def told(self) -> str:
+        return self.way.told + (f", trained on {self.views} frames" if self.views else "")
+
+    def reaches(self, psnr: float | None, lpips: float | None) -> bool:
+        """Whether the quality is expected to be at least so good. What is None does not count."""
+        enough = psnr is None or (self.psnr is not None and self.psnr >= psnr)
+        return enough and (lpips is None or self.lpips is None or self.lpips <= lpips)
+
+
+def choose(options: Sequence[Option], wanted: Wanted) -> tuple[Option, str]:
+    """The option to carry out, and why.
+
+    With a time: the best PSNR that fits in; the quickest where none does. With a quality: the cheapest that reaches it;
+    the best where none does. With neither, the wanted quality is that of the neural renderer: the cheapest option that
+    has both its PSNR and its LPIPS.
+
+    Raises ValueError: no options.
+    """
+    if not options:
+        raise ValueError("options: there are none")
+    if wanted.way is not None:
+        options = [option for option in options if option.way.name == wanted.way] or options
+
+    def quality(option: Option) -> float:
+        return -math.inf if option.psnr is None else option.psnr
+
+    if wanted.seconds is not None:
+        within = [option for option in options if option.seconds <= wanted.seconds]
+        if not within:
+            return min(options, key=lambda option: option.seconds), "the quickest; none fits in the time"
+        return max(within, key=quality), "the best that fits in the time"
+    if wanted.psnr is not None or wanted.lpips is not None:
+        enough = [option for option in options if option.reaches(wanted.psnr, wanted.lpips)]
+        if not enough:
+            return max(options, key=quality), "the best; none is expected to reach what is wanted"
+        return min(enough, key=lambda option: option.seconds), "the cheapest that is good enough"
+    neural = [option for option in options if option.way.name == "neural"]
+    if not neural:
+        return max(options, key=quality), "the best of its kind"
+    aim = max(neural, key=quality)
+    enough = [option for option in options if option.reaches(aim.psnr, aim.lpips)]
+    found = min(enough, key=lambda option: option.seconds)
+    if found is aim:
+        return aim, "nothing cheaper has its quality"
+    return found, "it has the quality of the neural renderer, and is cheaper here"

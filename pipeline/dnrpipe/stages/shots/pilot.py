@@ -1,0 +1,200 @@
+"""What ways of rendering a shot give and cost, measured on a few small frames of it.
+
+Small frames say what a pixel costs. Their quality stands for that of the whole: finer pictures are a little easier for
+all ways. The check of the finished frames (`check`) says how far off that was.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dnrtrain.contract import View
+from dnrtrain.exr import read_exr
+
+from ...core.cameras import scaled_to, spread
+from ...core.errors import UserError
+from ...workers.task_list import run_tasks
+from ...workers.view_tasks import warn_of_retries
+from ..stage import Run
+from .frame_tasks import FrameCommon, FrameTask, Way
+from .frame_worker import COLOUR
+from .records import ShotFrame
+
+FRAMES, SIDE = 2, 256
+"""Frames of the pilot, and pixels of their longer side."""
+LADDER = (1, 4, 16, 64)
+"""Samples per pixel of the path-traced pictures; those between are interpolated."""
+REFERENCE = Way(name="path", spp=256)
+REFERENCE_SEED = 7
+LEAD = 4
+"""Frames before a frame of the pilot that it remembers."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A way on the pilot's frames: means. pixel: seconds per pixel, files included. start: seconds until its process
+    renders. psnr in dB; lpips None where there are no weights."""
+
+    way: Way
+    pixel: float
+    start: float
+    psnr: float
+    lpips: float | None
+
+
+class Pilot:
+    """Renders the pilot's frames of a shot. common: of the process that renders its frames."""
+
+    def __init__(self, run: Run, frames: Sequence[ShotFrame], folder: Path, lpips: Any) -> None:
+        still = [i for i, frame in enumerate(frames) if not frame.moving]
+        self.run, self.frames, self.folder, self.lpips = run, frames, folder, lpips
+        self.chosen = spread(still or range(len(frames)), FRAMES)  # where all move: as converted
+        self.seconds = 0.0
+        self.references: dict[int, Any] = {}
+
+    def measure(self, common: FrameCommon, environment: dict[str, str], ways: Sequence[Way]) -> list[Measured]:
+        """The ways on the frames, one after the other in a process of its own.
+
+        Raises UserError: a frame failed twice.
+        """
+        tasks: list[FrameTask] = []
+        keys: list[tuple[Way, int, bool]] = []  # way, frame, whether it is measured
+        if not self.references:
+            ways = [REFERENCE, *ways]
+        for way in ways:
+            for index in self.chosen:
+                lead = [] if way.name == "path" else list(self._lead(index))
+                for number, at in enumerate([*lead, index]):
+                    earlier = None if way.name == "path" else tuple(self._view(i) for i in lead[:number])
+                    keys.append((way, index, at == index))
+                    tasks.append(self._task(way, at, earlier, len(tasks)))
+        found: dict[Way, list[tuple[float, float, Any]]] = {}
+        label = "pilot: " + ("path tracing" if ways[-1].name == "path" else "base image and network")
+        with self.run.console.bar(label, len(tasks)) as bar:
+            outcomes = run_tasks(
+                "dnrpipe.stages.shots.frame_worker",
+                common.data(),
+                [task.data() for task in tasks],
+                workers=1,
+                log=self.run.log,
+                retried=warn_of_retries("pilot", self.run.console),
+                environment=environment,
+            )
+            for (way, index, counts), task, outcome in zip(keys, tasks, outcomes, strict=True):
+                if outcome.result is None:
+                    raise UserError(f"{label} failed twice: {outcome.error}; see {self.run.log}")
+                self.seconds += outcome.seconds
+                self.run.book(
+                    "training",
+                    "view",
+                    f"pilot/{way.name} {way.spp}".rstrip(" 0") if way.name != "path" else f"pilot/path {way.spp}",
+                    outcome.result["seconds"],
+                    cpu_seconds=outcome.result["cpu_seconds"],
+                    width=task.view.width,
+                    height=task.view.height,
+                )
+                if counts:
+                    picture = self._picture(task.output)
+                    spent = outcome.result["seconds"] + outcome.result["write_seconds"]
+                    found.setdefault(way, []).append((spent, outcome.seconds - spent, (index, picture)))
+                bar.advance(note=way.told)
+        if REFERENCE in found and not self.references:
+            self.references = {index: picture for _, _, (index, picture) in found.pop(REFERENCE)}
+        return [self._measured(way, rows) for way, rows in found.items()]
+
+    def _measured(self, way: Way, rows: list[tuple[float, float, Any]]) -> Measured:
+        figures = [compared(picture, self.references[index], self.lpips) for _, _, (index, picture) in rows]
+        distances = [found["lpips"] for found in figures if "lpips" in found]
+        pixels = self._view(self.chosen[0]).width * self._view(self.chosen[0]).height
+        return Measured(
+            way=way,
+            pixel=float(np.mean([spent for spent, _, _ in rows])) / pixels,
+            start=max(0.0, rows[0][1]),
+            psnr=float(np.mean([found["psnr"] for found in figures])),
+            lpips=float(np.mean(distances)) if distances else None,
+        )
+
+    def _lead(self, index: int) -> range:
+        """Frames before one that stand still like it, at most LEAD."""
+        first = index
+        while first > 0 and index - first < LEAD and not self.frames[first - 1].moving:
+            first -= 1
+        return range(first, index)
+
+    def _view(self, index: int) -> View:
+        return scaled_to(self.frames[index].view, SIDE)
+
+    def _task(self, way: Way, index: int, earlier: tuple[View, ...] | None, number: int) -> FrameTask:
+        stem = f"{number:03d}-{way.name}"
+        return FrameTask(
+            view=self._view(index),
+            way=way,
+            lens=self.frames[index].lens,
+            earlier=earlier,
+            seed=REFERENCE_SEED if way == REFERENCE else 0,
+            output=self.folder / f"{stem}.exr",
+            picture=self.folder / f"{stem}.png",
+            fingerprint="",
+        )
+
+    def _picture(self, path: Path) -> Any:
+        """Display RGB over white, torch [1, 3, H, W]."""
+        return shown(self.run, path)
+
+
+def compared(picture: Any, truth: Any, lpips: Any) -> dict[str, float]:
+    """psnr (dB), ssim and, where the pictures are large enough for it, lpips of display pictures [1, 3, H, W]."""
+    import torch
+
+    from dnrtrain.metrics import image_metrics
+
+    everywhere = torch.ones_like(truth[:, :1])
+    found = image_metrics(picture, truth, everywhere, None if lpips is None else {"alex": lpips})
+    named = {"psnr": found["psnr"], "ssim": found["ssim"], "lpips": found["lpips_alex"]}
+    return {name: value for name, value in named.items() if value is not None}
+
+
+def shown(run: Run, path: Path) -> Any:
+    """A frame's file as display RGB over white, torch [1, 3, H, W]. Raises DamagedFile."""
+    import torch
+
+    from dnrtrain.display import DisplayTransform
+
+    from ...core.scene_files import read_frame
+
+    channels, _ = read_exr(path)
+    display = DisplayTransform(read_frame(run.workspace), run.workspace.scene)
+    planes = torch.from_numpy(np.stack([channels[name] for name in COLOUR]))[None]
+    return display.over_white(planes[:, :3], planes[:, 3:]).clamp(0, 1)
+
+
+def between(measured: Sequence[Measured]) -> list[Measured]:
+    """Path tracing at all powers of two from the least to the most samples measured; those that were not are
+    interpolated: quality by the logarithm of the samples, seconds by the samples."""
+    rungs = sorted(measured, key=lambda found: found.way.spp)
+    result: list[Measured] = []
+    for low, high in pairwise(rungs):
+        result.append(low)
+        spp = 2 * low.way.spp
+        while spp < high.way.spp:
+            t = math.log2(spp / low.way.spp) / math.log2(high.way.spp / low.way.spp)
+            share = (spp - low.way.spp) / (high.way.spp - low.way.spp)
+            lpips = None if low.lpips is None or high.lpips is None else low.lpips + t * (high.lpips - low.lpips)
+            result.append(
+                Measured(
+                    way=low.way.model_copy(update={"spp": spp}),
+                    pixel=low.pixel + share * (high.pixel - low.pixel),
+                    start=low.start,
+                    psnr=low.psnr + t * (high.psnr - low.psnr),
+                    lpips=lpips,
+                )
+            )
+            spp *= 2
+    return [*result, *rungs[-1:]]

@@ -1,0 +1,157 @@
+"""Which way to make a shot: what the pilot measured, reckoned to all of its frames.
+
+Light is baked only where baked light can be worth it: where path tracing all frames at the most samples takes longer
+than baking is expected to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ...core.units import duration
+from ..base_images import base_renderer, light_size, light_spp
+from ..stage import Run
+from ..worth import worth
+from .frame_tasks import Way
+from .options import Option, Wanted
+from .pilot import LADDER, Measured, Pilot, between
+from .records import ShotFrame
+from .renderers import Renderer, shipped_renderer
+
+OURS = (Way(name="base"), Way(name="neural"))
+LIGHT_PATH = 2.5
+"""Seconds of a path of baked light over those of a camera path: it sets out from everywhere, in all directions."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A shot as its seconds depend on it.
+
+    still, moving: numbers of frames. pixels: of a frame. convert: seconds of converting the scene at another frame.
+    """
+
+    still: int
+    moving: int
+    pixels: int
+    convert: float
+
+
+def weigh(
+    run: Run, frames: Sequence[ShotFrame], folder: Path, wanted: Wanted, tracer: Renderer, lpips: Any
+) -> list[Option]:
+    """Ways to make the shot."""
+    view = frames[0].view
+    moving = sum(bool(frame.moving) for frame in frames)
+    shape = Shape(len(frames) - moving, moving, view.width * view.height, _conversion_seconds(run))
+    pilot = Pilot(run, frames, folder, lpips)
+    rungs = [Way(name="path", spp=spp) for spp in LADDER]
+    ladder = between(pilot.measure(tracer.common, tracer.environment, rungs))
+    options = [path_option(found, shape) for found in ladder]
+    if why := _no_baked_light(run, frames, shape, ladder, wanted):
+        run.console.say(f"baked light is not weighed: {why}")
+        return options
+    ours = shipped_renderer(run, tracer.common.background)
+    measured = pilot.measure(ours.common, ours.environment, OURS)
+    options += [baked_option(found, options, shape) for found in measured]
+    if _wants_more(options, wanted) and wanted.way in (None, "neural"):
+        found = worth(run, shape.still)
+        neural = next(option for option in options if option.way.name == "neural")
+        if found.views and neural.psnr is not None:
+            before = neural.before + found.views * found.seconds
+            options.append(
+                neural.model_copy(
+                    update={
+                        "views": found.views,
+                        "before": before,
+                        "seconds": neural.seconds + found.views * found.seconds,
+                        "psnr": neural.psnr + found.expected,
+                        "lpips": None,
+                    }
+                )
+            )
+    return options
+
+
+def path_option(found: Measured, shape: Shape) -> Option:
+    """All frames path-traced."""
+    frame = found.pixel * shape.pixels
+    total = found.start + shape.still * frame + shape.moving * (frame + found.start + shape.convert)
+    return Option(way=found.way, before=found.start, frame=frame, seconds=total, psnr=found.psnr, lpips=found.lpips)
+
+
+def baked_option(found: Measured, paths: Sequence[Option], shape: Shape) -> Option:
+    """Frames that stand still by baked light, the others path-traced as well as those. paths: `path_option` of each."""
+    frame = found.pixel * shape.pixels
+    total = found.start + shape.still * frame
+    if shape.moving:
+        rung = as_good(paths, found.psnr, found.lpips)
+        total += shape.moving * (rung.frame + rung.before + shape.convert)
+    return Option(way=found.way, before=found.start, frame=frame, seconds=total, psnr=found.psnr, lpips=found.lpips)
+
+
+def as_good(options: Sequence[Option], psnr: float | None, lpips: float | None) -> Option:
+    """The quickest path tracing that has the quality; that of the most samples where none has."""
+    paths = [option for option in options if option.way.name == "path"]
+    enough = [option for option in paths if option.reaches(psnr, lpips)]
+    return min(enough or [max(paths, key=lambda option: option.way.spp)], key=lambda option: option.frame)
+
+
+def moving_way(options: Sequence[Option], chosen: Option) -> Way:
+    """How frames with moving things are path-traced: as the others, or as well as they are expected to be."""
+    return chosen.way if chosen.way.name == "path" else as_good(options, chosen.psnr, chosen.lpips).way
+
+
+def lines(options: Sequence[Option], chosen: Option, why: str) -> list[str]:
+    """The options as a table for the terminal, the chosen one marked, and why it was."""
+    rows = []
+    for option in sorted(options, key=lambda option: option.seconds):
+        quality = "" if option.psnr is None else f"{option.psnr:6.2f} dB"
+        quality += "" if option.lpips is None else f"  LPIPS {option.lpips:.4f}"
+        mark = "->" if option == chosen else "  "
+        rows.append(f"{mark} {duration(option.seconds):>12}  {quality:<24} {option.told}")
+    return [*rows, f"{chosen.told}: {why}"]
+
+
+def _conversion_seconds(run: Run) -> float:
+    """Of the workspace's scene, by the ledger; a few where it does not say."""
+    found = [record.seconds for record in run.workspace.ledger.read() if record.name == "convert"]
+    return found[-1] if found else 5.0
+
+
+def _no_baked_light(
+    run: Run, frames: Sequence[ShotFrame], shape: Shape, ladder: Sequence[Measured], wanted: Wanted
+) -> str:
+    """Why baked light is out of the question, or ""."""
+    if wanted.way in ("base", "neural"):
+        return ""
+    if wanted.way == "path":
+        return "path tracing is wanted"
+    if any(frame.lens is not None for frame in frames):
+        return "the camera has depth of field, which only path tracing has"
+    if not shape.still:
+        return "no frame stands still"
+    if run.settings.model.base != "baked":
+        return f"model.base = {run.settings.model.base}"
+    base = base_renderer(run.workspace, run.settings, run.effect_plan)
+    if base.light_is_baked:
+        return ""
+    most = ladder[-1]
+    tracing = path_option(most, shape).seconds
+    texels = light_size(run.settings) ** 2
+    light = texels * light_spp(run.settings) * LIGHT_PATH * most.pixel / most.way.spp
+    if tracing < light:
+        return (
+            f"path tracing all frames at {most.way.spp} samples takes {duration(tracing)}, baking the light about"
+            f" {duration(light)}"
+        )
+    return ""
+
+
+def _wants_more(options: Sequence[Option], wanted: Wanted) -> bool:
+    """Whether a quality is wanted that the shipped renderer is not expected to reach."""
+    neural = [option for option in options if option.way.name == "neural"]
+    asked = wanted.psnr is not None or wanted.lpips is not None
+    return asked and not any(option.reaches(wanted.psnr, wanted.lpips) for option in neural)

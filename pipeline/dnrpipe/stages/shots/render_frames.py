@@ -1,0 +1,138 @@
+"""All frames of a shot, those that are missing or out of date, and the movie of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dnrtrain.atomic import atomic_path
+
+from ...core.ledger import Purpose
+from ...core.workspace import digest
+from ...workers.placement import HERE
+from ..base_images import CHUNK, WARM_UP
+from ..stage import Run
+from .frame_tasks import FrameTask, Way
+from .records import ShotFrame
+from .renderers import Renderer
+
+FRAMES_VERSION = 1
+FRAMES_FOLDER = "frames"
+"""Of a shot's folder."""
+
+
+def frame_path(folder: Path, frame: ShotFrame) -> Path:
+    """A frame's scene-linear layers."""
+    return folder / FRAMES_FOLDER / f"{frame.number:05d}.exr"
+
+
+def picture_path(folder: Path, frame: ShotFrame) -> Path:
+    """A frame as it is displayed."""
+    return folder / "pictures" / f"{frame.number:05d}.png"
+
+
+def frame_tasks(
+    frames: Sequence[ShotFrame], folder: Path, way: Way, inputs: Any, numbers: Sequence[int] | None = None
+) -> list[FrameTask]:
+    """The tasks that render the frames by ``way``. A frame of baked light remembers those before it, back to the last
+    cut and to the begin of its chunk (`base_images.CHUNK`).
+
+    inputs: of all that decides a frame but its view and way. numbers: places in ``frames`` to render; None: all.
+    """
+    tasks: list[FrameTask] = []
+    for place in range(len(frames)) if numbers is None else numbers:
+        frame = frames[place]
+        first = place
+        if way.name != "path":
+            begin = max(0, place - place % CHUNK - WARM_UP)
+            while first > begin and _goes_on(frames[first - 1], frame):
+                first -= 1
+        earlier = None if way.name == "path" else tuple(other.view for other in frames[first:place])
+        decided = [FRAMES_VERSION, inputs, frame.view.model_dump(mode="json"), way.model_dump(mode="json"), frame.lens]
+        known = None if earlier is None else [other.model_dump(mode="json") for other in earlier]
+        tasks.append(
+            FrameTask(
+                view=frame.view,
+                way=way,
+                lens=frame.lens,
+                earlier=earlier,
+                number=first,
+                seed=frame.number % (1 << 16),
+                output=frame_path(folder, frame),
+                picture=picture_path(folder, frame),
+                fingerprint=digest([*decided, known]),
+            )
+        )
+    return tasks
+
+
+def _goes_on(before: ShotFrame, after: ShotFrame) -> bool:
+    """Whether two frames belong together: of one camera and one size, and nothing has moved."""
+    same = (before.view.width, before.view.height) == (after.view.width, after.view.height)
+    return same and before.camera == after.camera and before.moving == after.moving
+
+
+def render_frames(
+    run: Run,
+    renderer: Renderer,
+    tasks: Sequence[FrameTask],
+    *,
+    label: str = "frames",
+    purpose: Purpose = "inference",
+) -> None:
+    """Render what is missing. Raises TasksFailed, after all others are done. Raises OSError: the disk is full.
+
+    label: of the bar. purpose: what it is booked as.
+    """
+
+    def book(task: dict[str, Any], result: dict[str, Any], _workers: int) -> None:
+        view = task["view"]
+        run.book(
+            purpose,
+            "view",
+            f"{Path(task['output']).parent.name}/{view['name']}",
+            result["seconds"] + result["write_seconds"],
+            cpu_seconds=result["cpu_seconds"],
+            peak_mb=result["peak_mb"],
+            width=view["width"],
+            height=view["height"],
+            spp=result["spp"] or None,
+            detail={"way": result["way"], "ms": result["ms"]},
+        )
+
+    for task in tasks:
+        if not task.picture.exists():  # a frame is both of its files
+            task.output.unlink(missing_ok=True)
+    run.view_tasks(
+        label,
+        "dnrpipe.stages.shots.frame_worker",
+        renderer.common.data(),
+        [task.data() for task in tasks],
+        workers=1,  # its kernels keep all cores busy
+        book=book,
+        environment=renderer.environment,
+        place=HERE,
+    )
+
+
+def write_movie(path: Path, pictures: Sequence[Path], fps: float) -> None:
+    """H.264 in MP4 of PNG files of one size, one after the other: memory does not grow with the shot."""
+    import imageio_ffmpeg
+    from PIL import Image
+
+    with Image.open(pictures[0]) as first:
+        width, height = first.size
+    even = (width + width % 2, height + height % 2)
+    pad = ((0, height % 2), (0, width % 2), (0, 0))
+    with atomic_path(path) as temporary:
+        writer = imageio_ffmpeg.write_frames(
+            str(temporary), even, fps=fps, quality=8, macro_block_size=2, ffmpeg_log_level="error"
+        )
+        writer.send(None)
+        for picture in pictures:
+            with Image.open(picture) as image:
+                writer.send(np.ascontiguousarray(np.pad(np.asarray(image.convert("RGB")), pad, mode="edge")))
+        writer.close()

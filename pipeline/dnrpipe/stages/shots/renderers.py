@@ -1,0 +1,76 @@
+"""What renders the frames of a shot: the path tracer, and the neural renderer on baked light."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from ...core.scene_files import read_frame
+from ...effects.bundle import write_without
+from ...effects.store import trace_config, variant_for
+from ..base_images import bake_light, base_renderer
+from ..effect_plan import resolve_plan
+from ..shot_scene import scene_at
+from ..stage import Run
+from ..trust import measure_trust
+from .frame_tasks import FrameCommon
+
+
+@dataclass(frozen=True)
+class Renderer:
+    """A process that renders frames: what it is told when it starts, and its environment."""
+
+    common: FrameCommon
+    environment: dict[str, str]
+
+    def at_frame(self, run: Run, frame: int) -> Renderer:
+        """Path traces the scene as it is at a frame, for which `convert_frames` has made a bundle."""
+        bundle = scene_at(run.workspace, frame) / "scene.xml"
+        left_out = run.effect_plan.left_out
+        if left_out:
+            edited = bundle.with_name("scene-edited.xml")
+            write_without(bundle, left_out, edited)
+            bundle = edited
+        update = {"bundle": bundle, "base": None, "checkpoint": None}
+        return Renderer(self.common.model_copy(update=update), self.environment)
+
+
+def path_tracer(run: Run, background: bool) -> Renderer:
+    """Path traces frames of the workspace's scene. background: the camera sees the world behind everything."""
+    plan = resolve_plan(run)
+    choice = variant_for(plan, run.settings)
+    config = trace_config(run.workspace, plan, choice.variant)
+    common = FrameCommon(
+        bundle=Path(config["bundle"]),
+        variant=config["variant"],
+        integrator=config["integrator"],
+        max_depth=int(config["max_depth"]),
+        scene=run.workspace.scene,
+        frame=read_frame(run.workspace),
+        device=run.settings.device,
+        background=background,
+    )
+    return Renderer(common, choice.environment)
+
+
+def shipped_renderer(run: Run, background: bool) -> Renderer:
+    """The shipped corrector, as far as it is trusted on the scene, on baked light: bakes that where it is missing."""
+    from dnrtrain.shipped import corrector
+
+    trust = measure_trust(run, corrector())
+    run.console.say(trust.told)
+    return _neural(run, background, trust=trust.share, checkpoint=None)
+
+
+def trained_renderer(run: Run, background: bool) -> Renderer:
+    """The renderer that stage `finetune` trained on frames of the shot."""
+    return _neural(run, background, trust=1.0, checkpoint=run.workspace.checkpoints("step2"))
+
+
+def _neural(run: Run, background: bool, *, trust: float, checkpoint: Path | None) -> Renderer:
+    tracer = path_tracer(run, background)
+    base = base_renderer(run.workspace, run.settings, run.effect_plan)
+    with run.timed("baking light: process"):
+        bake_light(run, base)
+    update = {"base": base.common, "checkpoint": checkpoint, "trust": trust}
+    return Renderer(tracer.common.model_copy(update=update), tracer.environment | base.environment)

@@ -1,0 +1,136 @@
+"""Which way a shot is made, and what its frames remember: rules without a renderer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dnrpipe.core.cameras import look_at_view
+from dnrpipe.core.errors import UserError
+from dnrpipe.core.settings import CameraSettings
+from dnrpipe.stages.base_images import CHUNK, WARM_UP
+from dnrpipe.stages.shots.check import held_out
+from dnrpipe.stages.shots.frame_tasks import Way
+from dnrpipe.stages.shots.open_shot import parse_size, resized, told_frames
+from dnrpipe.stages.shots.options import Option, Wanted, choose
+from dnrpipe.stages.shots.pilot import Measured, between
+from dnrpipe.stages.shots.plan_shot import Shape, baked_option, moving_way, path_option
+from dnrpipe.stages.shots.records import ShotFrame
+from dnrpipe.stages.shots.render_frames import frame_tasks
+
+
+def option(name: str, seconds: float, psnr: float | None, lpips: float | None = None, spp: int = 0) -> Option:
+    way = Way.model_validate({"name": name, "spp": spp})
+    return Option(way=way, before=0, frame=1, seconds=seconds, psnr=psnr, lpips=lpips)
+
+
+CHEAP, BASE = option("path", 50, 26.0, 0.15, spp=1), option("base", 80, 29.0, 0.10)
+OURS, FINE = option("neural", 100, 31.0, 0.05), option("path", 300, 34.0, 0.02, spp=64)
+ALL = [CHEAP, BASE, OURS, FINE]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "chosen"),
+    [
+        (Wanted(), OURS),
+        (Wanted(seconds=90), BASE),
+        (Wanted(seconds=1000), FINE),
+        (Wanted(seconds=10), CHEAP),
+        (Wanted(psnr=28.5), BASE),
+        (Wanted(psnr=30, lpips=0.04), FINE),
+        (Wanted(psnr=50), FINE),
+        (Wanted(way="base"), BASE),
+    ],
+)
+def test_the_cheapest_that_is_good_enough(wanted: Wanted, chosen: Option) -> None:
+    assert choose(ALL, wanted)[0] is chosen
+
+
+def test_path_tracing_that_is_as_good_and_cheaper_wins() -> None:
+    quick = option("path", 60, 31.5, 0.04, spp=16)
+    assert choose([*ALL, quick], Wanted())[0] is quick
+    blurred = option("path", 60, 31.5, 0.20, spp=16)  # PSNR alone is not enough
+    assert choose([*ALL, blurred], Wanted())[0] is OURS
+
+
+def test_rungs_between_those_measured() -> None:
+    low = Measured(Way(name="path", spp=4), pixel=1.0, start=2.0, psnr=30.0, lpips=0.1)
+    high = Measured(Way(name="path", spp=16), pixel=4.0, start=1.0, psnr=34.0, lpips=None)
+    rungs = between([high, low])
+    assert [rung.way.spp for rung in rungs] == [4, 8, 16]
+    assert rungs[1].psnr == pytest.approx(32.0) and rungs[1].pixel == pytest.approx(2.0)
+    assert rungs[0] is low and rungs[2] is high
+    assert rungs[1].lpips is None
+
+
+def test_seconds_of_a_shot_add_up() -> None:
+    shape = Shape(still=10, moving=2, pixels=1000, convert=5.0)
+    rung = Measured(Way(name="path", spp=4), pixel=0.001, start=3.0, psnr=30.0, lpips=0.1)
+    more = Measured(Way(name="path", spp=16), pixel=0.004, start=3.0, psnr=34.0, lpips=0.05)
+    assert path_option(rung, shape).seconds == pytest.approx(3 + 10 + 2 * (1 + 3 + 5))
+    ours = Measured(Way(name="neural"), pixel=0.002, start=4.0, psnr=33.0, lpips=0.06)
+    paths = [path_option(rung, shape), path_option(more, shape)]
+    found = baked_option(ours, paths, shape)
+    assert found.seconds == pytest.approx(4 + 20 + 2 * (4 + 3 + 5))  # moving frames by the rung that is as good
+    options = [*paths, found]
+    assert moving_way(options, found) == more.way
+    assert moving_way(options, options[0]) == rung.way
+
+
+def frames(count: int, cut: int, moving: tuple[int, ...] = ()) -> list[ShotFrame]:
+    """A camera's way with a cut to another camera."""
+    settings = CameraSettings(width=32, height=18)
+    return [
+        ShotFrame(
+            number=place + 1,
+            camera="near" if place < cut else "far",
+            view=look_at_view(f"frame{place + 1:05d}", np.array([5.0, place / 10, 2]), np.zeros(3), 40.0, settings),
+            moving=("ball",) if place in moving else (),
+        )
+        for place in range(count)
+    ]
+
+
+def test_frames_remember_back_to_the_cut_and_no_further_than_a_chunk(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    shot = frames(CHUNK + 20, cut=10)
+    tasks = frame_tasks(shot, tmp_path, Way(name="neural"), "inputs")
+    remembered = [len(task.earlier or ()) for task in tasks]
+    assert remembered[:12] == [*range(10), 0, 1]
+    assert remembered[CHUNK - 1] == CHUNK - 11
+    assert remembered[CHUNK] == WARM_UP and remembered[CHUNK + 5] == WARM_UP + 5
+    assert tasks[CHUNK].earlier == tuple(frame.view for frame in shot[CHUNK - WARM_UP : CHUNK])
+    assert tasks[CHUNK].number == CHUNK - WARM_UP
+    assert all(task.earlier is None for task in frame_tasks(shot, tmp_path, Way(name="path", spp=4), "inputs"))
+    again = frame_tasks(shot, tmp_path, Way(name="neural"), "other inputs")
+    assert {task.fingerprint for task in tasks}.isdisjoint(task.fingerprint for task in again)
+
+
+def test_what_is_rendered_does_not_depend_on_where_a_run_begins(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    shot = frames(30, cut=30)
+    whole = frame_tasks(shot, tmp_path, Way(name="neural"), "inputs")
+    assert frame_tasks(shot, tmp_path, Way(name="neural"), "inputs", [17]) == [whole[17]]
+
+
+def test_a_frame_in_which_things_move_is_not_remembered(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    shot = frames(8, cut=8, moving=(3,))
+    tasks = frame_tasks(shot, tmp_path, Way(name="neural"), "inputs", [2, 4, 5])
+    assert [len(task.earlier or ()) for task in tasks] == [2, 0, 1]
+
+
+def test_frames_that_are_checked() -> None:
+    assert held_out(frames(10, 10), 2) == [2, 7]
+    chosen = held_out(frames(10, 10, moving=(4, 5)), 2)
+    assert len(chosen) == 2 and len(set(chosen) & {4, 5}) == 1
+
+
+def test_sizes_and_frames_as_written() -> None:
+    assert parse_size("1280x720") == (1280, 720) == parse_size(" 1280 × 720 ")
+    for text in ("1280", "1280x", "0x720", "1280x99999", "axb"):
+        with pytest.raises(UserError, match="--size"):
+            parse_size(text)
+    assert told_frames([3]) == "frame 3"
+    assert told_frames([1, 2, 3, 7, 9, 10]) == "frames 1-3, 7, 9-10"
+    view = frames(1, 1)[0].view
+    half = resized(view, 16, 9)
+    assert (half.fl_x, half.cx, half.cy) == (view.fl_x / 2, view.cx / 2, view.cy / 2)
+    assert resized(view, 32, 32).cy == 16 and resized(view, 32, 32).fl_y == view.fl_y

@@ -1,0 +1,271 @@
+"""Shots: what `dnrpipe shot` takes and gives, beside path tracing with a denoiser at equal quality.
+
+python -m tools.bench_shots FOLDER [SCENE.blend ...] [--size 640x360] [--frames 48] [--cycles] [--out RESULTS.json]
+
+The file's own camera moves on an arc about what it looks at, half a degree a frame. Seconds are wall-clock of a machine
+that does nothing else; those of REEL frames are reckoned from the parts that were measured. FOLDER keeps workspaces and
+references; a scene that is in the results is not measured again. Quality is over white, against references traced with
+256 samples and denoised, on pairs of frames one after the other; flicker is what changes between the two of a pair
+beyond what the references change by (`tools.bench_frames.motion`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dnrpipe.core.cameras import look_at_view, shot_views
+from dnrpipe.core.console import Console
+from dnrpipe.core.images import flip_error, picture_of
+from dnrpipe.core.machine import processor
+from dnrpipe.core.scene_files import read_summary
+from dnrpipe.core.settings import CameraSettings
+from dnrpipe.core.workspace import Workspace
+from dnrpipe.stages.session import resolve_settings
+from dnrpipe.stages.shot_scene import look_at_shot
+from dnrpipe.stages.shots.frame_tasks import FrameTask, Way
+from dnrpipe.stages.shots.make_shot import lpips_of
+from dnrpipe.stages.shots.open_shot import parse_size
+from dnrpipe.stages.shots.pilot import REFERENCE, REFERENCE_SEED, compared, shown
+from dnrpipe.stages.shots.render_frames import FRAMES_FOLDER
+from dnrpipe.stages.shots.renderers import path_tracer
+from dnrpipe.stages.stage import Run
+from dnrpipe.workers.task_list import run_tasks
+from dnrtrain.atomic import write_json
+from dnrtrain.contract import View, write_cameras
+from dnrtrain.exr import read_exr
+
+from .bench_frames.motion import Surface, flicker
+
+ROOT = Path(__file__).resolve().parents[1]
+OUT = ROOT / "docs" / "results" / "shots.json"
+REEL = 240
+DEGREES = 0.5
+"""That the camera moves on its arc from frame to frame."""
+LADDER = (1, 2, 4, 8, 16, 32, 64)
+FIGURES = ("psnr", "ssim", "lpips", "flip", "flicker")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("scenes", type=Path, nargs="*")
+    parser.add_argument("--size", default="640x360")
+    parser.add_argument("--frames", type=int, default=48)
+    parser.add_argument("--out", type=Path, default=OUT)
+    options = parser.parse_args()
+    size = parse_size(options.size)
+    rows: list[dict[str, Any]] = json.loads(options.out.read_text())["rows"] if options.out.exists() else []
+    for scene in options.scenes or sorted((ROOT / "blender_scenes").glob("*.blend")):
+        if any(
+            (row["scene"], row["size"], row["frames"]) == (scene.stem, options.size, options.frames) for row in rows
+        ):
+            continue
+        root = (options.folder / f"{scene.stem}-{options.size}.dnr").resolve()
+        rows.append({"size": options.size, **measured(scene.resolve(), root, size, options.frames)})
+        write_json(options.out, {"machine": processor(), "rows": sorted(rows, key=lambda row: row["scene"])})
+    print(markdown({"machine": processor(), "rows": rows}))
+
+
+def measured(scene: Path, root: Path, size: tuple[int, int], frames: int) -> dict[str, Any]:
+    """A row of the results."""
+    root.mkdir(parents=True, exist_ok=True)
+    views = arc(scene, root, size, frames)
+    cameras = root / "arc.json"
+    write_cameras(cameras, views, "arc")
+    words = (
+        "shot",
+        str(scene),
+        "--cameras",
+        str(cameras),
+        "-w",
+        str(root),
+        "--name",
+        "arc",
+        "--preset",
+        "standard",
+        "--json",
+    )
+    started = time.monotonic()
+    answer = subprocess.run([sys.executable, "-m", "dnrpipe.cli", *words], check=True, stdout=subprocess.PIPE)
+    seconds = time.monotonic() - started
+    shot = json.loads(answer.stdout)
+    print(f"{scene.stem}: {frames} frames in {seconds:.0f} s by {shot['chosen']['way']['name']}", flush=True)
+    pairs = [(i - 1, i) for i in (frames // 3, 2 * frames // 3, frames - 1)]
+    found = beside(root, views, pairs, shot["chosen"]["way"])
+    after = seconds - shot["check"]["seconds"]
+    frame = float(np.median(frame_seconds(root)))
+    return {
+        "scene": scene.stem,
+        "frames": frames,
+        "seconds": seconds,
+        "before": max(0.0, after - frames * frame),
+        "frame": frame,
+        "chosen": shot["chosen"],
+        "why": shot["why"],
+        "expected": shot["expected"],
+        "spent": shot["spent"],
+        "check": shot["check"],
+        **found,
+    }
+
+
+def arc(scene: Path, root: Path, size: tuple[int, int], frames: int) -> list[View]:
+    """The scene's own camera, moved about the point that it looks at as far away as the middle of the scene."""
+    subprocess.run(
+        [sys.executable, "-m", "dnrpipe.cli", "prepare", str(scene), "-w", str(root), "-q", "--set", "select.budget=0"],
+        check=True,
+    )
+    log = root / "logs" / "arc.log"
+    own = shot_views(look_at_shot(scene, (1,), None, log), *size)[0]
+    summary = read_summary(root / "scene")
+    matrix = own.matrix
+    forward = -matrix[:3, 2]
+    away = max(float((np.asarray(summary.bounds.center) - own.position) @ forward), 0.2 * summary.bounds.radius)
+    target = own.position + away * forward
+    settings = CameraSettings(width=size[0], height=size[1])
+    views = []
+    for number in range(frames):
+        turn = math.radians(DEGREES * (number - frames / 2))
+        rotation = np.array([[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0], [0, 0, 1]])
+        eye = target + rotation @ (own.position - target)
+        views.append(look_at_view(f"{number + 1:05d}", eye, target, own.fl_x, settings))
+    return views
+
+
+def beside(root: Path, views: Sequence[View], pairs: Sequence[tuple[int, int]], way: dict[str, Any]) -> dict[str, Any]:
+    """Quality of the shot's frames, and of path tracing with seconds per frame, on pairs of frames."""
+    workspace = Workspace.open(root)
+    run = Run(workspace, resolve_settings(workspace, {}, None), Console(quiet=True), "render", "bench")
+    lpips, tracer, folder = lpips_of(run), path_tracer(run, background=True), root / "beside"
+    numbers = sorted({number for pair in pairs for number in pair})
+    ways = [REFERENCE, *(Way(name="path", spp=spp) for spp in LADDER)]
+    tasks = [
+        FrameTask(
+            view=views[number],
+            way=one,
+            seed=REFERENCE_SEED if one == REFERENCE else number,
+            output=folder / f"{one.spp}" / f"{number:05d}.exr",
+            picture=folder / f"{one.spp}" / f"{number:05d}.png",
+            fingerprint="",
+        )
+        for one in ways
+        for number in numbers
+    ]
+    spent: dict[int, list[float]] = {}
+    outcomes = run_tasks(
+        "dnrpipe.stages.shots.frame_worker",
+        tracer.common.data(),
+        [task.data() for task in tasks],
+        workers=1,
+        log=root / "logs" / "beside.log",
+        environment=tracer.environment,
+    )
+    for task, outcome in zip(tasks, outcomes, strict=True):
+        if outcome.result is None:
+            raise SystemExit(f"{task.output}: {outcome.error}")
+        spent.setdefault(task.way.spp, []).append(outcome.result["seconds"] + outcome.result["write_seconds"])
+    truth = {n: shown(run, folder / f"{REFERENCE.spp}" / f"{n:05d}.exr") for n in numbers}
+    surfaces = {n: surface_of(views[n], folder / f"{REFERENCE.spp}" / f"{n:05d}.exr") for n in numbers}
+
+    def figures(path_of: Any) -> dict[str, float]:
+        return quality({n: shown(run, path_of(n)) for n in numbers}, truth, surfaces, pairs, lpips)
+
+    ours = figures(lambda n: root / "shots" / "arc" / FRAMES_FOLDER / f"{n + 1:05d}.exr")
+    rungs = [
+        {
+            "spp": spp,
+            "frame": float(np.median(spent[spp])),
+            **figures(lambda n, spp=spp: folder / f"{spp}" / f"{n:05d}.exr"),
+        }
+        for spp in LADDER
+    ]
+    return {"ours": ours, "rungs": rungs, "pairs": len(pairs)}
+
+
+def quality(
+    pictures: dict[int, Any],
+    truth: dict[int, Any],
+    surfaces: dict[int, Surface],
+    pairs: Sequence[tuple[int, int]],
+    lpips: Any,
+) -> dict[str, float]:
+    """FIGURES, means over the frames; flicker over the pairs."""
+    rows = [
+        {
+            **compared(picture, truth[n], lpips),
+            "flip": flip_error(picture_of(truth[n][0]), picture_of(picture[0]))[0],
+        }
+        for n, picture in pictures.items()
+    ]
+    found = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
+    planes = {n: picture_of(picture[0]).astype(np.float64) for n, picture in pictures.items()}
+    true = {n: picture_of(picture[0]).astype(np.float64) for n, picture in truth.items()}
+    changes = [
+        flicker([planes[a], planes[b]], [true[a], true[b]], [surfaces[a], surfaces[b]])["flicker"] for a, b in pairs
+    ]
+    return {**found, "flicker": float(np.mean(changes))}
+
+
+def surface_of(view: View, path: Path) -> Surface:
+    """What a frame's file says of what its camera sees."""
+    channels, _ = read_exr(path)
+    depth = channels["depth.Z"].astype(np.float64)
+    directions = view.ray_directions().astype(np.float64)
+    along = directions @ -view.matrix[:3, 2]
+    position = view.position + directions * (depth / along)[..., None]
+    return Surface(view, position, depth, channels["object.Id"] > 0.5)
+
+
+def frame_seconds(root: Path) -> list[float]:
+    """Of the shot's frames, files included, by the ledger."""
+    rows = [json.loads(line) for line in (root / "costs.jsonl").read_text().splitlines()]
+    return [row["seconds"] for row in rows if row["name"].startswith(f"{FRAMES_FOLDER}/")]
+
+
+def equal_rung(row: dict[str, Any], names: Sequence[str]) -> dict[str, Any] | None:
+    """The cheapest path tracing that is as good as ours by each of the figures; None: not by its last rung."""
+
+    def enough(rung: dict[str, Any]) -> bool:
+        own = row["ours"]
+        return all(rung[name] >= own[name] if name in ("psnr", "ssim") else rung[name] <= own[name] for name in names)
+
+    return next((rung for rung in row["rungs"] if enough(rung)), None)
+
+
+def markdown(results: dict[str, Any]) -> str:
+    """Seconds and quality of every shot, and path tracing at equal quality."""
+    lines = [
+        f"Measured on {results['machine']}.",
+        "",
+        "| scene | size | way | before the first frame, s | a frame, s | dB | LPIPS | FLIP | flicker | path tracing as"
+        " good (dB and LPIPS) | its frame, s | its flicker | 240 frames, s | path tracing, s | ratio |",
+        "|---" * 15 + "|",
+    ]
+    for row in results["rows"]:
+        own, rung = row["ours"], equal_rung(row, ("psnr", "lpips"))
+        ours = row["before"] + REEL * row["frame"]
+        cells = [row["scene"], row["size"], row["chosen"]["way"]["name"], f"{row['before']:.0f}", f"{row['frame']:.2f}"]
+        cells += [f"{own['psnr']:.2f}", f"{own['lpips']:.4f}", f"{own['flip']:.4f}", f"{own['flicker']:.4f}"]
+        if rung is None:
+            last = row["rungs"][-1]
+            cells += [f"not by {last['spp']} spp", f"> {last['frame']:.2f}", f"{last['flicker']:.4f}"]
+            cells += [f"{ours:.0f}", f"> {REEL * last['frame']:.0f}", f"< {ours / (REEL * last['frame']):.2f}"]
+        else:
+            cells += [f"{rung['spp']} spp", f"{rung['frame']:.2f}", f"{rung['flicker']:.4f}"]
+            cells += [f"{ours:.0f}", f"{REEL * rung['frame']:.0f}", f"{ours / (REEL * rung['frame']):.2f}"]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
