@@ -21,10 +21,11 @@ from dnrpipe.blender.geometry.frozen import FrozenMesh
 from dnrpipe.core.cameras import make_cameras
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import CameraSettings, resolve
+from dnrpipe.studies.cells.intervals import half_width, summarise, t_distribution, t_quantile
 from dnrpipe.studies.selectbench.active.batches import KINDS
 from dnrpipe.studies.selectbench.bench_select import choose_budgets
 from dnrpipe.studies.selectbench.bench_tables import difference, markdown, together
-from dnrpipe.studies.selectbench.figures import Figures, half_width, summarise, t_distribution, t_quantile
+from dnrpipe.studies.selectbench.figures import Figures
 from dnrpipe.studies.selectbench.policies import CONTENDERS, GROUPS, SIMPLE, choose_policies, settings_of
 from dnrpipe.studies.selectbench.pools import POOLS, choose_pools, write_rig
 from dnrpipe.studies.selectbench.rigs import inside, surface_points, walk, winding

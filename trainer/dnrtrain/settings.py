@@ -193,7 +193,7 @@ class Step2Settings(Strict):
         default=0, ge=0, description="side of the random square that L_p looks at in each step; 0 = whole image"
     )
     perceptual_weights: Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=1, max_length=5)] = Field(
-        default=(1 / 32, 1 / 16, 1 / 8, 1 / 4, 1.0),
+        default=(1 / 32, 1 / 16, 1 / 8, 1 / 4),
         description="w_j of L_p, from VGG16's relu1_2 on: as many as are named of relu2_2, relu3_3, relu4_3, relu5_3",
     )
     frequency_norm: Literal["backward", "ortho"] = Field(

@@ -1,7 +1,7 @@
 """Named sets of settings. `PAPER` and `VANILLA` are the one place that says what the paper's method and DNR are.
 
-`SIZES` says how large and how long, for each preset: the two sets leave that out. The presets of the same names, the rows
-of `dnrpipe ablate` and the agent of `dnrpipe bench-select` are made of them.
+`SIZES` says how large and how long, for each preset: the two sets leave that out. The presets of the same names, the
+rows of `dnrpipe ablate` and the agent of `dnrpipe bench-select` are made of them.
 """
 
 from __future__ import annotations
@@ -24,8 +24,17 @@ def merge(base: Mapping[str, Any], extra: Mapping[str, Any]) -> dict[str, Any]:
 # -- what ----------------------------------------------------------------------------------------------------
 
 _PAINTED: dict[str, Any] = {
-    "base": "none", "guides": False, "chain": False, "filter": 0, "output": "display", "network": "unet",
-    "stride": 1, "aggregator": "concat", "spherical_harmonics": True, "texture_levels": 4, "texture_channels": 16,
+    "base": "none",
+    "guides": False,
+    "chain": False,
+    "filter": 0,
+    "output": "display",
+    "network": "unet",
+    "stride": 1,
+    "aggregator": "concat",
+    "spherical_harmonics": True,
+    "texture_levels": 4,
+    "texture_channels": 16,
 }
 _RATES = {"learning_rate": 1e-3, "learning_rate_end": 1e-4}
 # What the paper leaves open, and why it is as it is here: docs/method.md.
@@ -37,19 +46,33 @@ PAPER: dict[str, Any] = {
         "policy": "rl-paper",
         "step1": {
             **_RATES,
-            "weight_rl": 0.1, "weight_dnr": 1.0, "texture_rate_scale": 10.0,
-            "reward": "neg-loss", "reward_scale": "raw", "q_target": "plain", "gamma": 0.5,
+            "weight_rl": 0.1,
+            "weight_dnr": 1.0,
+            "texture_rate_scale": 10.0,
+            "reward": "neg-loss",
+            "reward_scale": "raw",
+            "q_target": "plain",
+            "gamma": 0.5,
         },
     },
     "finetune": {
         "step2": {
             **_RATES,
-            "start": "coarse", "ema": 0.0, "patch": 0, "augment": True, "texture_rate_scale": 10.0,
-            "photometric": "l1", "frequency_norm": "backward",
-            "perceptual_weights": [1 / 32, 1 / 16, 1 / 8, 1 / 4, 1.0],
+            "start": "coarse",
+            "ema": 0.0,
+            "patch": 0,
+            "augment": True,
+            "texture_rate_scale": 10.0,
+            "photometric": "l1",
+            "frequency_norm": "backward",
+            "perceptual_weights": [1 / 32, 1 / 16, 1 / 8, 1 / 4],
             "loss": {
-                "photometric": 1.0, "ssim": 0.1, "perceptual": 0.1,
-                "frequency": 0.01, "total_variation": 0.001, "regularisation": 0.1,
+                "photometric": 1.0,
+                "ssim": 0.1,
+                "perceptual": 0.1,
+                "frequency": 0.01,
+                "total_variation": 0.001,
+                "regularisation": 0.1,
             },
         }
     },
@@ -64,8 +87,13 @@ VANILLA: dict[str, Any] = {
     "finetune": {
         "step2": {
             **_RATES,
-            "start": "fresh", "ema": 0.0, "patch": 0, "augment": False, "texture_rate_scale": 10.0,
-            "photometric": "l1", "loss": {"photometric": 1.0, **PHOTOMETRIC_ONLY},
+            "start": "fresh",
+            "ema": 0.0,
+            "patch": 0,
+            "augment": False,
+            "texture_rate_scale": 10.0,
+            "photometric": "l1",
+            "loss": {"photometric": 1.0, **PHOTOMETRIC_ONLY},
         }
     },
 }

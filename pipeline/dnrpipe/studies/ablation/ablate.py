@@ -29,6 +29,7 @@ from ..cells.scenes import (
     find_scenes,
     make_bases,
     prepared,
+    raster_engine,
     scene_workspace,
     trace_references,
     trace_train,
@@ -102,7 +103,7 @@ class Ablation(Study[tuple[str, str, int]]):
             for row in self.rows:
                 settings = self.settings_of(row, scene)
                 if needs_coarse(row, settings):
-                    seconds = None if row.full_step1 or not self.seconds else STEP1_SHARE * self.seconds
+                    seconds = STEP1_SHARE * self.seconds if self.seconds else None
                     step1[scene.name, row.name] = self.step1_task(
                         scene, settings, step1_policy(settings), seed, seconds
                     )
@@ -133,7 +134,6 @@ class Ablation(Study[tuple[str, str, int]]):
                 bases[kind] if based else {},
                 label=row.name,
                 network=row.network,
-                full_step1=row.full_step1,
                 spp=row.spp,
                 picture=seed == 0,
             )
@@ -176,9 +176,12 @@ class Ablation(Study[tuple[str, str, int]]):
             **dict(zip(("scene", "row", "seed"), place, strict=True)),
             "key": cell.key,
             **{name: mean_of(cell.tests, name) for name in METRICS},
+            "train_psnr": cell.train_psnr and round(cell.train_psnr, 5),
             "views": len(cell.views),
             "epochs": training and training.epochs,
             "steps": training and training.step2.steps,
+            "step1_steps": step1 and step1.steps,
+            "raster_engine": raster_engine(task.workspace) if step1 else None,
             "train_seconds": training and round(training.seconds, 2),
             "train_cpu_seconds": training and round(training.cpu_seconds, 2),
             "step1_cpu_seconds": step1 and round(step1.cpu_seconds, 2),

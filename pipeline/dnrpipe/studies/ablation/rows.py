@@ -1,7 +1,7 @@
 """The rows of the ablation, as data: each is a set of changes to named settings.
 
-Rows of the family ``vanilla`` or ``paper`` start from that set of `core.presets`, at the sizes of the preset; rows of the
-family ``dnr`` start from the preset itself.
+Rows of the family ``vanilla`` or ``paper`` start from that set of `core.presets`, at the sizes of the preset; rows of
+the family ``dnr`` start from the preset itself.
 """
 
 from __future__ import annotations
@@ -28,9 +28,8 @@ class Row:
 
     name: as on the command line and in tables. what: for people. changes: nested settings. everything: train on all
     candidates, whatever the policy. network: False measures the base image alone. against: the row that differs in this
-    one thing. full_step1: step 1 runs the preset's epochs even where all rows train equally long, because it is what the
-    row is about. as_long: step 2 has the steps that row `paper` makes in both. budget, spp: views and samples of their
-    ray tracing, None = the run's.
+    one thing. as_long: step 2 has the steps that row `paper` makes in both. budget, spp: views and samples of their ray
+    tracing, None = the run's.
     """
 
     name: str
@@ -40,7 +39,6 @@ class Row:
     everything: bool = False
     network: bool = True
     against: str | None = None
-    full_step1: bool = False
     as_long: bool = False
     budget: int | None = None
     spp: int | None = None
@@ -63,7 +61,7 @@ def _reward(name: str) -> dict[str, Any]:
 
 
 def _paper(name: str, what: str, changes: Mapping[str, Any]) -> Row:
-    return Row(f"paper-{name}", what, "paper", changes, against="paper", full_step1="select" in changes)
+    return Row(f"paper-{name}", what, "paper", changes, against="paper")
 
 
 _NO_BASE: dict[str, Any] = {"base": "none", "guides": True, "chain": False, "filter": 0, "output": "display"}
@@ -78,8 +76,7 @@ def _other_network(name: str, what: str, **changes: Any) -> Row:
 _ROWS = (
     Row("vanilla", "DNR (Thies et al. 2019): UV texture, harmonics, U-Net, L1, from scratch", "vanilla"),
     Row("vanilla-long", "DNR with the steps that DNRSelect makes in both of its own", "vanilla", as_long=True),
-    Row("paper", "DNRSelect: RL-driven step 1, six losses, augmentation, D + N + U textures fused by a CNN", "paper",
-        full_step1=True),
+    Row("paper", "DNRSelect: RL-driven step 1, six losses, augmentation, D + N + U textures fused by a CNN", "paper"),
     _paper("no-augmentation", "without flips and rotations", _step2(augment=False)),
     _paper("one-loss", "photometric loss only", _step2(loss=PHOTOMETRIC_ONLY)),
     _paper("no-frequency", "without L_FR", _step2(loss={"frequency": 0.0})),

@@ -153,11 +153,14 @@ class Bench(Study[Place]):
         chosen: dict[Place, ChoiceTask] = {}
         for pool, budget, contender in itertools.product(self.pools.values(), self.budgets, self.policies):
             place = Place(pool.scene, pool.name, budget, contender.name, seed)
-            settings = settings_of(contender, self._settings(pool), budget)
+            own = self._settings(pool)
+            settings = settings_of(contender, own, budget)
             chosen[place] = task = self._choice_task(pool, contender, settings, seed)
-            if settings.starts_coarse:
-                coarse = isinstance(task, Step1Task)
-                starts[place] = task if coarse else self.step1_task(pool.data, settings, SHARED_COARSE, seed)
+            if own.starts_coarse:
+                if isinstance(task, Step1Task) and settings.model.coarse() == own.model.coarse():
+                    starts[place] = task
+                else:
+                    starts[place] = self.step1_task(pool.data, own.with_budget(budget), SHARED_COARSE, seed)
         for label, worker, kind in (
             ("selections", "dnrpipe.studies.selectbench.rule_worker", RuleTask),
             ("active selections", "dnrpipe.studies.selectbench.active.active_worker", ActiveTask),
@@ -261,6 +264,7 @@ class Bench(Study[Place]):
             **asdict(place),
             "key": cell.key,
             **{name: mean_of(cell.tests, name) for name in METRICS},
+            "train_psnr": cell.train_psnr and round(cell.train_psnr, 5),
             "views": choice.views,
             **{name: round(value, 3) for name, value in seconds.items()},
             "total_seconds": round(sum(seconds.values()), 3),

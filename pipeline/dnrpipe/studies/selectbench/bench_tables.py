@@ -12,8 +12,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..cells.intervals import LEVEL, Difference, difference
 from ..cells.results import NONE, made_line, read_made, spread, table
-from .figures import LEVEL, SPHERICAL, Difference, Figures
+from .figures import SPHERICAL, Figures
 from .pools import POOLS
 
 SCHEMA = 1
@@ -75,16 +76,6 @@ def _how(figures: Figures) -> str:
         " is selection, ray tracing of the chosen views with their base images, and training: processor seconds of one"
         " core where the model trains on a CPU."
     )
-
-
-def difference(found: Difference | None) -> str:
-    """``+0.42 [+0.10, +0.74]``, bold where the interval leaves out 0."""
-    if found is None:
-        return NONE
-    if found.half is None:
-        return f"{found.mean:+.2f}"
-    text = f"{found.mean:+.2f} [{found.mean - found.half:+.2f}, {found.mean + found.half:+.2f}]"
-    return f"**{text}**" if found.clear else text
 
 
 def _worst(found: Difference | None) -> str:
