@@ -89,8 +89,9 @@ def test_an_agent_that_diverges_is_said_and_taken_back(
         return 1e4 if calls <= 60 else td_target(*given)
 
     monkeypatch.setattr(walker, "td_target", wild)
-    rate = {"learning_rate": 0.01, "learning_rate_end": 0.01}
-    settings = Step1Settings(epochs=8, precision="float32", reward_scale="raw", q_target="plain", **rate)
+    settings = Step1Settings(
+        epochs=8, precision="float32", reward_scale="raw", q_target="plain", learning_rate=0.01, learning_rate_end=0.01
+    )
     events = list(
         run_step1(
             scene.raster, None, MODEL, settings, policy="rl-paper", budget=10, seed=0,

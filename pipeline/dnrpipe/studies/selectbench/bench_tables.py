@@ -58,7 +58,11 @@ def together(runs: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _provenance(results: Mapping[str, Any], figures: Figures) -> str:
-    time = f"about {results['seconds']:g} s of training for every cell" if results["seconds"] else "the preset's epochs"
+    time = "the preset's epochs"
+    if results["seconds"]:
+        time = f"about {results['seconds']:g} s of training for every cell"
+    elif results.get("step2_steps"):
+        time = f"{results['step2_steps']} steps of step 2 for every cell"
     return (
         f"{made_line(results)}, {results['candidates']}"
         f" candidates a pool, {len(figures.scenes)} scene(s) ({', '.join(figures.scenes)}), {len(figures.seeds)}"
