@@ -42,15 +42,16 @@ def td_target(
     """q_t of equation 3: r_{t+1} + γ max_a Q(s_{t+1}, a), or the reward alone at the episode's end.
 
     The maximum runs over views that are not selected in s_{t+1}: the others are no actions. With ``slow``
-    the same as ``network`` this is the equation, literally. So taken it diverges here (values of +8 for
-    rewards of −0.001: the maximum feeds on its own errors), so by default the maximising action comes from
+    the same as ``network`` this is the equation, literally. With γ near 1 it then diverges (values of +8 for
+    rewards of −0.001: the maximum feeds on its own errors). Else the maximising action comes from
     ``network`` and its value from ``slow``, an exponential average of it (double Q-learning, van Hasselt et
     al. 2016; the average is MVSelect's).
     """
     if terminal:
         return reward
-    action = best_action(network(selected, observation), selected)
-    return reward + gamma * float(slow(selected, observation)[action])
+    values = network(selected, observation)
+    worth = values if slow is network else slow(selected, observation)
+    return reward + gamma * float(worth[best_action(values, selected)])
 
 
 @torch.no_grad()

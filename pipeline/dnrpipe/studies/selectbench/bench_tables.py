@@ -16,6 +16,7 @@ from ..cells.intervals import LEVEL, Difference, difference
 from ..cells.results import NONE, made_line, read_made, spread, table
 from .figures import SPHERICAL, Figures
 from .pools import POOLS
+from .views_table import by_views
 
 SCHEMA = 1
 read_results = functools.partial(read_made, command="bench-select", schema=SCHEMA, part="pools")
@@ -32,7 +33,7 @@ def markdown(results: Mapping[str, Any], *, pictures: bool = True) -> str:
     parts.append(_how(figures))
     parts += [_overall(figures, budget) for budget in figures.budgets]
     for pool in figures.pools:
-        parts.append(f"## Pool `{pool}`: {POOLS[pool]}")
+        parts += [f"## Pool `{pool}`: {POOLS[pool]}", by_views(figures, pool)]
         for budget in figures.budgets:
             parts += [_pool(figures, pool, budget), _per_scene(figures, pool, budget)]
     return "\n\n".join(part for part in parts if part) + "\n"

@@ -37,7 +37,7 @@ class Figures:
     def values(self, pool: str, budget: int, policy: str, metric: str) -> dict[tuple[str, int], float]:
         """A metric by (scene, seed), where it was measured."""
         found = self.cells.get((pool, budget, policy), {})
-        return {place: cell[metric] for place, cell in found.items() if cell[metric] is not None}
+        return {place: cell[metric] for place, cell in found.items() if cell.get(metric) is not None}
 
     def means(self, pool: str, budget: int, policy: str, metric: str) -> list[float]:
         """Means over all scenes, one per seed; seeds that lack a scene are left out."""
@@ -71,3 +71,8 @@ class Figures:
                 found.setdefault(place, []).append(ours[place] - theirs[place])
         whole = {place: statistics.fmean(pairs) for place, pairs in found.items() if len(pairs) == len(baselines)}
         return summarise({place: whole[place] for place in sorted(whole)})
+
+    def paired(self, policy: str, other: str, pool: str, budget: int, metric: str) -> Difference | None:
+        """policy - other over all (scene, seed) that both have; its interval speaks of these scenes."""
+        ours, theirs = (self.values(pool, budget, name, metric) for name in (policy, other))
+        return summarise({place: ours[place] - theirs[place] for place in sorted(ours.keys() & theirs)}, pairs=True)
