@@ -21,10 +21,11 @@ from dnrpipe.blender.geometry.frozen import FrozenMesh
 from dnrpipe.core.cameras import make_cameras
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import CameraSettings, resolve
+from dnrpipe.studies.cells.intervals import difference, half_width, summarise, t_distribution, t_quantile
 from dnrpipe.studies.selectbench.active.batches import KINDS
 from dnrpipe.studies.selectbench.bench_select import choose_budgets
-from dnrpipe.studies.selectbench.bench_tables import difference, markdown, together
-from dnrpipe.studies.selectbench.figures import Figures, half_width, summarise, t_distribution, t_quantile
+from dnrpipe.studies.selectbench.bench_tables import markdown, together
+from dnrpipe.studies.selectbench.figures import Figures
 from dnrpipe.studies.selectbench.policies import CONTENDERS, GROUPS, SIMPLE, choose_policies, settings_of
 from dnrpipe.studies.selectbench.pools import POOLS, choose_pools, write_rig
 from dnrpipe.studies.selectbench.rigs import inside, surface_points, walk, winding
@@ -238,6 +239,23 @@ def test_every_pool_has_its_own_rival_and_differences_are_paired() -> None:
     assert "| 29.12 ± 0.18 |" in line and "| **+4.12 [+2.54, +5.71]** |" in line and "| +1.00 (a) |" in line
     assert "| 1.50 | 32 |" in line  # selection and total seconds
     assert "bench-select" in text and "commit abc" in text and "Student's t over scenes" in text
+
+
+def test_quality_against_the_number_of_views_has_pairs_and_the_price_of_choosing() -> None:
+    gains = {"random": 0.0, "rl-paper": 1.0}
+    values = {
+        (scene, "dome", budget, policy, seed): 20.0 + budget / 10 + gain * (1 + 0.1 * seed)
+        for scene in ("a", "b")
+        for budget in (5, 10, 25)
+        for policy, gain in gains.items()
+        for seed in range(2)
+    }
+    text = markdown(results(values))
+    assert "| 10 | 21.00 ± 0.00 | 22.05 ± 0.07 |" in text
+    # Four pairs of 1.0 and 1.1, 3.182 · 0.0577 / 2; 1.5 s of choosing where ten views take 20 s.
+    assert "| 10 | **+1.05 [+0.96, +1.14]** | – | 0.8 |" in text
+    two = {place: value for place, value in values.items() if place[2] != 5}
+    assert "against the number of traced views" not in markdown(results(two))
 
 
 def test_runs_on_several_scenes_make_one_table() -> None:

@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from dnrpipe.studies.selectbench.figures import Difference, summarise
+from dnrpipe.studies.cells.intervals import Difference, summarise
 from dnrtrain.atomic import write_json
 
 ROOT = Path(__file__).resolve().parents[1]

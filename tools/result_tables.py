@@ -26,8 +26,9 @@ from tools.bench_untrained import markdown as untrained_markdown
 from tools.plan_check import markdown as check_markdown
 from tools.plan_equal import markdown as equal_markdown
 
+from dnrpipe.core.settings import resolve
 from dnrpipe.studies.ablation.ablation_tables import markdown, read_results
-from dnrpipe.studies.ablation.rows import GROUPS, ROWS
+from dnrpipe.studies.ablation.rows import GROUPS, ROWS, settings_of
 from dnrpipe.studies.frontier.frontier_report import markdown as frontier_markdown
 from dnrpipe.studies.frontier.records import read_frontier
 from dnrpipe.studies.selectbench.bench_tables import markdown as selection_markdown
@@ -41,9 +42,11 @@ PART = re.compile(rf"(<!-- ({KINDS})(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOT
 def rows_table() -> str:
     """All rows: name, what they are, how their views are chosen, groups they belong to."""
     lines = ["| row | what | views | groups |", "| --- | --- | --- | --- |"]
+    base = resolve("draft", {}, environment={})
     for name, row in ROWS.items():
         groups = ", ".join(group for group, names in GROUPS.items() if name in names and group != "all")
-        lines.append(f"| `{name}` | {row.what} | {row.views} | {groups} |")
+        views = "all" if row.everything else settings_of(row, base, {}).select.policy
+        lines.append(f"| `{name}` | {row.what} | {views} | {groups} |")
     return "\n".join(lines)
 
 

@@ -131,7 +131,9 @@ def test_harmonics_are_orthonormal_by_quadrature() -> None:
 
 @pytest.mark.parametrize("size", [(8, 8), (7, 5), (1, 4)])
 def test_frequency_loss(size: tuple[int, int]) -> None:
-    assert gradcheck(losses.frequency, (uniform(1, 3, *size), uniform(1, 3, *size, seed=1)))
+    pair = (uniform(1, 3, *size), uniform(1, 3, *size, seed=1))
+    for norm in ("backward", "ortho"):
+        assert gradcheck(lambda a, b, norm=norm: losses.frequency(a, b, norm), pair)
 
 
 @pytest.mark.parametrize("size", [(12, 11), (6, 9), (1, 1)])
@@ -155,7 +157,7 @@ def test_other_losses() -> None:
 
 def test_perceptual_loss_and_lpips() -> None:
     prediction, target = uniform(1, 3, 16, 16), uniform(1, 3, 16, 16, seed=1, grad=False)
-    loss = PerceptualLoss(random_weights("vgg")).double()
+    loss = PerceptualLoss(random_weights("vgg"), Step2Settings().perceptual_weights).double()
     check_entries(lambda: loss(prediction, target), [prediction])
     small = uniform(1, 3, 5, 6)
     check_entries(lambda: loss(small, target[..., :5, :6]), [small])

@@ -10,7 +10,7 @@ import torch
 
 from dnrtrain import losses
 from dnrtrain.model import Output
-from dnrtrain.perceptual import LOSS_WEIGHTS, Features, PerceptualLoss, weight_shapes
+from dnrtrain.perceptual import Features, PerceptualLoss, weight_shapes
 from dnrtrain.settings import LossWeights, Step2Settings
 
 TERMS = {"photometric", "ssim", "perceptual", "frequency", "total_variation", "regularisation"}
@@ -30,7 +30,7 @@ def random_weights(network: str) -> dict[str, torch.Tensor]:
 
 @pytest.fixture(scope="module")
 def perceptual() -> PerceptualLoss:
-    return PerceptualLoss(random_weights("vgg"))
+    return PerceptualLoss(random_weights("vgg"), Step2Settings().perceptual_weights)
 
 
 def images(side: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -80,10 +80,11 @@ def test_zero_weights_and_missing_network_drop_terms() -> None:
 
 def test_frequency_against_numpy() -> None:
     prediction, target = images(8)
-    spectrum = np.fft.rfft2((prediction - target).numpy().astype(np.float64), norm="ortho")
-    expected = (np.abs(spectrum.real) + np.abs(spectrum.imag)).mean()
-    assert float(losses.frequency(prediction, target)) == pytest.approx(expected, rel=1e-5)
-    assert losses.frequency(prediction.bfloat16(), target.bfloat16()).dtype == torch.float32
+    for norm in ("backward", "ortho"):
+        spectrum = np.fft.rfft2((prediction - target).numpy().astype(np.float64), norm=norm)
+        expected = (np.abs(spectrum.real) + np.abs(spectrum.imag)).mean()
+        assert float(losses.frequency(prediction, target, norm)) == pytest.approx(expected, rel=1e-5)
+    assert losses.frequency(prediction.bfloat16(), target.bfloat16(), "ortho").dtype == torch.float32
 
 
 def test_total_variation_by_hand() -> None:
@@ -101,7 +102,7 @@ def test_perceptual_is_the_weighted_feature_distance(perceptual: PerceptualLoss)
     network = Features("vgg", random_weights("vgg"), taps=4)
     expected = sum(
         w * float((a - b).abs().mean())
-        for w, a, b in zip(LOSS_WEIGHTS, network(prediction), network(target), strict=True)
+        for w, a, b in zip((1 / 32, 1 / 16, 1 / 8, 1 / 4), network(prediction), network(target), strict=True)
     )
     assert float(perceptual(prediction, target)) == pytest.approx(expected, rel=1e-5)
 
@@ -109,10 +110,24 @@ def test_perceptual_is_the_weighted_feature_distance(perceptual: PerceptualLoss)
 def test_crop_is_the_same_window_of_both() -> None:
     prediction, target = images(32)
     random = np.random.default_rng(1)
-    a, b = losses.random_crop(prediction, target, 8, random)
+    a, b = losses.random_crop(prediction, prediction + target, 8, random)
     assert a.shape == (1, 3, 8, 8)
-    found = (prediction[0, 0].unfold(0, 8, 1).unfold(1, 8, 1) == a[0, 0]).all(-1).all(-1).nonzero()[0]
+    mirrored = [
+        torch.from_numpy(np.pad(image[0].numpy(), ((0, 0), (4, 4), (4, 4)), "symmetric"))
+        for image in (prediction, target)
+    ]
+    found = (mirrored[0][0].unfold(0, 8, 1).unfold(1, 8, 1) == a[0, 0]).all(-1).all(-1).nonzero()[0]
     top, left = int(found[0]), int(found[1])
-    assert torch.equal(b, target[..., top : top + 8, left : left + 8])
+    assert torch.equal(b[0], a[0] + mirrored[1][:, top : top + 8, left : left + 8])
     assert losses.random_crop(prediction, target, 0, random)[0] is prediction
     assert losses.random_crop(prediction, target, 99, random)[0].shape == prediction.shape
+
+
+@pytest.mark.parametrize("side", [7, 8, 20])
+def test_crop_shows_every_pixel_equally_often(side: int) -> None:
+    """From border to border. Windows that stay inside would show the middle up to 20 times as often as row one."""
+    places = torch.arange(24.0).expand(1, 1, 24, 24)
+    random = np.random.default_rng(0)
+    rows = torch.cat([losses.random_crop(places, places, side, random)[0][0, 0, 0] for _ in range(4000)])
+    share = torch.bincount(rows.long(), minlength=24) / len(rows)
+    assert share.min() > 0.9 / 24 and share.max() < 1.1 / 24

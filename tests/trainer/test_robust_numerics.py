@@ -61,7 +61,7 @@ quick = settings(deadline=None, max_examples=60, derandomize=True)
 
 @pytest.fixture(scope="module")
 def perceptual() -> PerceptualLoss:
-    return PerceptualLoss(random_weights("vgg"))
+    return PerceptualLoss(random_weights("vgg"), Step2Settings().perceptual_weights)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ SIMPLE = {
     "l1": lambda a, b: losses.photometric(a, b, "l1"),
     "mse": lambda a, b: losses.photometric(a, b, "mse"),
     "ssim": losses.structural,
-    "frequency": losses.frequency,
+    "frequency": lambda a, b: losses.frequency(a, b, "backward"),
     "total variation": lambda a, b: losses.total_variation(a) + losses.total_variation(b),
     "regularisation": lambda a, b: losses.texture_regularisation(a - b),
 }
@@ -122,7 +122,7 @@ def test_large_and_prime_sizes(side: int) -> None:
     """The paper's 800², and a prime beside it, through all six losses (the perceptual one by its crop)."""
     x, y = picture("hdr pixel", side, side).clamp(0, 1).requires_grad_(), picture("random", side, side)
     settings = Step2Settings(perceptual_crop=16)
-    loss = losses.Step2Loss(settings, PerceptualLoss(random_weights("vgg")))
+    loss = losses.Step2Loss(settings, PerceptualLoss(random_weights("vgg"), Step2Settings().perceptual_weights))
     texture = torch.zeros(1, 12, 4, 4, requires_grad=True)
     total, terms = loss(Output(x, texture), y, np.random.default_rng(0), bfloat16=False)
     assert len(terms) == 6

@@ -7,12 +7,13 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 from statistics import mean
+from typing import Any
 
 import pytest
 import torch
 
 from conftest import Scene
-from dnrtrain import checkpoint, step2
+from dnrtrain import checkpoint, step2, walker
 from dnrtrain.checkpoint import load_model, read_record
 from dnrtrain.contract import ContractError, DamagedFile
 from dnrtrain.dataset import ViewSet
@@ -21,6 +22,7 @@ from dnrtrain.metrics import psnr
 from dnrtrain.model import render_views
 from dnrtrain.records import Epoch
 from dnrtrain.schedule import MAX_RESTARTS, SLOWER, EpochBook, Watch
+from dnrtrain.selector.agent import td_target
 from dnrtrain.settings import LossWeights, ModelSettings, Step1Settings, Step2Settings
 from dnrtrain.step1 import run_step1
 from dnrtrain.step2 import run_step2
@@ -73,6 +75,34 @@ def test_step1_takes_a_spike_back_too(scene: Scene, tmp_path: Path) -> None:
     assert any(isinstance(event, Diverged) for event in events)
     assert isinstance(events[-1], Selected) and len(set(events[-1].selection.views)) == 4
     assert finite(tmp_path / "step1")
+
+
+def test_an_agent_that_diverges_is_said_and_taken_back(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its values leave the range of its rewards while weights and pictures stay as they should."""
+    calls = 0
+
+    def wild(*given: Any) -> float:
+        nonlocal calls
+        calls += 1
+        return 1e4 if calls <= 60 else td_target(*given)
+
+    monkeypatch.setattr(walker, "td_target", wild)
+    settings = Step1Settings(
+        epochs=8, precision="float32", reward_scale="raw", q_target="plain", learning_rate=0.01, learning_rate_end=0.01
+    )
+    events = list(
+        run_step1(
+            scene.raster, None, MODEL, settings, policy="rl-paper", budget=10, seed=0,
+            device="cpu", checkpoints=tmp_path / "step1", fingerprint="f",
+        )
+    )  # fmt: skip
+    restart = next(event for event in events if isinstance(event, Diverged))
+    assert "values reach" in restart.text and "learning rate times 0.1" in restart.text
+    assert [event.epoch for event in events if isinstance(event, EpochEnd)] == list(range(1, 9))
+    record = read_record(tmp_path / "step1")
+    assert record is not None and "rewards" in record.restarts[0].reason
 
 
 def test_a_restart_survives_a_kill(scene: Scene, tmp_path: Path) -> None:

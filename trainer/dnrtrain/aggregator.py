@@ -90,6 +90,10 @@ class Aggregator(nn.Module):
         fused = len(self.modalities) > 1
         self.fusion = FusionCNN(len(self.modalities) * channels, channels) if fused else None
 
+    def surface_texels(self) -> list[nn.Parameter]:
+        """Of the UV texture, finest level first; none where there is no texture."""
+        return [] if self.strategy == "early" else list(self.texture_uv.levels)
+
     def zero_residual(self) -> None:
         """Start the residual strategy at T = Tex_U (called after the weights are initialised)."""
         if self.strategy == "residual" and self.fusion is not None:

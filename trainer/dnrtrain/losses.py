@@ -29,14 +29,16 @@ def structural(prediction: Tensor, target: Tensor) -> Tensor:
     return 1.0 - ssim(prediction, target).mean()
 
 
-def frequency(prediction: Tensor, target: Tensor) -> Tensor:
-    """L_FR: mean |Re ΔF| + |Im ΔF| over the half spectrum of the orthonormal real FFT.
+def frequency(prediction: Tensor, target: Tensor, norm: str) -> Tensor:
+    """L_FR: mean |Re ΔF| + |Im ΔF| over the half spectrum of the real FFT.
 
     The FFT is linear, so F(Î) − F(I) = F(Î − I). The L1 norm is taken of real and imaginary parts, not of
     the complex modulus: the modulus has no gradient at 0, where a good prediction lives. Always float32:
     half-precision transforms give NaN and want powers of two.
+
+    norm: of the transform: "backward", plain sums over the H·W pixels, or "ortho", those over √(H·W).
     """
-    spectrum = torch.fft.rfft2(at_least_float32(prediction - target), norm="ortho")
+    spectrum = torch.fft.rfft2(at_least_float32(prediction - target), norm=norm)
     return torch.view_as_real(spectrum).abs().sum(dim=-1).mean()
 
 
@@ -59,15 +61,21 @@ def random_crop(prediction: Tensor, target: Tensor, side: int, random: np.random
     """The same random ``side``×``side`` window of both images; 0, or larger than the image: all of it.
 
     VGG is the dearest part of a step and its features are local: a window per step is an estimate of L_p
-    at a fraction of the cost.
+    at a fraction of the cost. Its centre lies anywhere in the image with equal chance, and beyond the border the
+    images go on mirrored: so every pixel is as often in it as any other. Windows that stay inside would show the
+    middle of the image more often than its border.
     """
-    height, width = prediction.shape[-2:]
     if side == 0:
         return prediction, target
-    top = int(random.integers(max(1, height - side + 1)))
-    left = int(random.integers(max(1, width - side + 1)))
-    window = (..., slice(top, top + side), slice(left, left + side))
-    return prediction[window], target[window]
+    for axis in (-2, -1):
+        length = prediction.shape[axis]
+        if side < length:
+            start = int(np.floor(random.uniform(0.0, length) - 0.5 * side + 0.5))
+            places = np.arange(start, start + side)
+            places = np.where(places < 0, -1 - places, np.where(places >= length, 2 * length - 1 - places, places))
+            index = torch.from_numpy(places).to(prediction.device)
+            prediction, target = prediction.index_select(axis, index), target.index_select(axis, index)
+    return prediction, target
 
 
 class Step2Loss:
@@ -99,7 +107,7 @@ class Step2Loss:
                 *random_crop(rgb, target, self.settings.perceptual_crop, random), bfloat16=bfloat16
             )
         if weights.frequency:
-            terms["frequency"] = frequency(rgb, target)
+            terms["frequency"] = frequency(rgb, target, self.settings.frequency_norm)
         if weights.total_variation:
             terms["total_variation"] = total_variation(rgb)
         if weights.regularisation and output.texture is not None:

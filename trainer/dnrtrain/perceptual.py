@@ -6,7 +6,7 @@ Krizhevsky 2014), defined here: torchvision is no dependency. Weights come from 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Literal
 
 import torch
@@ -39,11 +39,6 @@ MINIMUM_SIDE = {"vgg": 16, "alex": 31}
 # LPIPS' scaling layer for inputs in [-1, 1]: ImageNet's mean and deviation, rounded as published.
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
-
-LOSS_TAPS = 4
-"""L_p uses relu1_2 to relu4_3."""
-LOSS_WEIGHTS = (1 / 16, 1 / 8, 1 / 4, 1.0)
-"""w_j: deeper features, which are smaller and more semantic, count more (as in Wang et al. 2018, pix2pixHD)."""
 
 
 class Features(nn.Module):
@@ -147,18 +142,23 @@ class Lpips(nn.Module):
 class PerceptualLoss(nn.Module):
     """L_p(Î, I) = Σ_j w_j · mean |φ_j(Î) − φ_j(I)| with VGG16 features (paper, training section).
 
-    The norm is the mean absolute difference. Images smaller than 16 pixels a side use the taps that fit.
+    The norm is the mean absolute difference.
+
+    Args:
+        weights: of VGG16.
+        taps: w_j, from relu1_2 on.
     """
 
-    def __init__(self, weights: Mapping[str, Tensor]) -> None:
+    def __init__(self, weights: Mapping[str, Tensor], taps: Sequence[float]) -> None:
         super().__init__()
-        self.features = Features("vgg", weights, taps=LOSS_TAPS)
+        self.features = Features("vgg", weights, taps=len(taps))
+        self.taps = tuple(taps)
 
     def forward(self, prediction: Tensor, target: Tensor, *, bfloat16: bool = False) -> Tensor:
         """[N, 3, H, W] twice -> scalar. Gradients flow to ``prediction`` only."""
-        side = min(prediction.shape[-2:])
-        if side < 8:  # relu4_3 lies behind three poolings
-            factor = -(-8 // side)
+        least, side = 1 << (len(self.taps) - 1), min(prediction.shape[-2:])
+        if side < least:  # a pooling lies between two taps
+            factor = -(-least // side)
             prediction = F.interpolate(prediction, scale_factor=factor, mode="nearest")
             target = F.interpolate(target, scale_factor=factor, mode="nearest")
         with torch.no_grad():
@@ -168,7 +168,7 @@ class PerceptualLoss(nn.Module):
         # memory, the whole backward pass stays in one layout.
         parts = [
             weight * at_least_float32((a - b).abs()).permute(0, 2, 3, 1).mean()
-            for weight, a, b in zip(LOSS_WEIGHTS, found, wanted, strict=True)
+            for weight, a, b in zip(self.taps, found, wanted, strict=True)
         ]
         return torch.stack(parts).sum()
 

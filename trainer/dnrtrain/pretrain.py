@@ -34,7 +34,8 @@ from .schedule import Averaged, adam, averaged_weights, guarded_step
 from .settings import CORRECTOR, LossWeights, ModelSettings, Step2Settings
 
 LOSS = Step2Settings(
-    loss=LossWeights(photometric=0.0, ssim=0.02, perceptual=0.0, total_variation=0.0, regularisation=0.0)
+    loss=LossWeights(photometric=0.0, ssim=0.02, perceptual=0.0, total_variation=0.0, regularisation=0.0),
+    frequency_norm="ortho",
 )
 TYPICAL, LEAST = 0.02, 0.005
 """Mean absolute error of a base image: where its picture counts as much as in L1, and what is added to it."""

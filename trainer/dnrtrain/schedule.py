@@ -18,12 +18,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from .aggregator import Aggregator
 from .contract import ContractError
 from .dataset import ViewSet
 from .metrics import psnr, ssim
 from .model import DNR, render_views
 from .records import Epoch, Restart
-from .textures import TexturePyramid
 
 STEP1, STEP2 = 1, 2
 GRADIENT_NORM = 10.0
@@ -52,11 +52,12 @@ def learning_rate(step: int, steps: int, start: float, end: float) -> float:
 def adam(modules: list[nn.Module], rate: float, device: str, texture_rate_scale: float = 1.0) -> torch.optim.Adam:
     """Adam (0.9, 0.999). Fused: on dense textures it is an order of magnitude faster than the loop.
 
-    Each parameter group carries ``scale``: what `guarded_step` multiplies its rate by. Texels are seen
-    by few pixels of few views, so they may want a larger rate than the networks (DNR uses ten times it).
+    Each parameter group carries ``scale``: what `guarded_step` multiplies its rate by. Texels of the surface are seen
+    by few pixels of few views, so they may want a larger rate than the networks (DNR uses ten times it). Those of the
+    depth and normal textures are met by every view; they learn at the networks' rate.
     """
-    textures = [t for module in modules for t in module.modules() if isinstance(t, TexturePyramid)]
-    texels = {id(p) for pyramid in textures for p in pyramid.parameters()}
+    parts = [part for module in modules for part in module.modules()]
+    texels = {id(p) for part in parts if isinstance(part, Aggregator) for p in part.surface_texels()}
     parameters = [p for module in modules for p in module.parameters()]
     groups = [
         {"params": [p for p in parameters if id(p) not in texels], "scale": 1.0},

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field, model_validator
 
@@ -128,10 +128,12 @@ class Step1Settings(Strict):
     epochs: int = Field(default=50, ge=1, description="one epoch is as many steps as there are candidate views")
     learning_rate: float = Field(default=1e-3, gt=0)
     learning_rate_end: float = Field(default=1e-4, gt=0)
-    texture_rate_scale: float = Field(default=1.0, gt=0, description="learning rate of texels over the networks'")
+    texture_rate_scale: float = Field(
+        default=1.0, gt=0, description="learning rate of the UV texture's texels over the networks'"
+    )
     weight_rl: float = Field(default=0.1, ge=0, description="lambda_RL")
     weight_dnr: float = Field(default=1.0, ge=0, description="lambda_DNRc")
-    gamma: float = Field(default=0.99, ge=0, le=1, description="discount factor")
+    gamma: float = Field(default=0.5, ge=0, le=1, description="discount factor")
     epsilon_start: float = Field(default=0.9, ge=0, le=1)
     epsilon_end: float = Field(default=0.05, ge=0, le=1)
     reward: Literal["neg-loss", "pos-loss", "improvement", "improvement-own", "improvement-all"] = Field(
@@ -169,8 +171,10 @@ class Step2Settings(Strict):
     batch: int = Field(default=1, ge=1, description="views per optimiser step")
     learning_rate: float = Field(default=1e-3, gt=0)
     learning_rate_end: float = Field(default=1e-4, gt=0)
-    texture_rate_scale: float = Field(default=1.0, gt=0, description="learning rate of texels over the networks'")
-    photometric: Literal["l1", "mse"] = "mse"
+    texture_rate_scale: float = Field(
+        default=1.0, gt=0, description="learning rate of the UV texture's texels over the networks'"
+    )
+    photometric: Literal["l1", "mse"] = "l1"
     start: Literal["coarse", "fresh", "pretrained"] = Field(
         default="coarse",
         description="coarse: the weights of step 1, as far as they fit; fresh: new ones; pretrained: the shipped"
@@ -187,5 +191,13 @@ class Step2Settings(Strict):
     validation_views: int = Field(default=8, ge=0, description="validation views rendered after each epoch")
     perceptual_crop: int = Field(
         default=0, ge=0, description="side of the random square that L_p looks at in each step; 0 = whole image"
+    )
+    perceptual_weights: Annotated[tuple[Annotated[float, Field(ge=0)], ...], Field(min_length=1, max_length=5)] = Field(
+        default=(1 / 32, 1 / 16, 1 / 8, 1 / 4),
+        description="w_j of L_p, from VGG16's relu1_2 on: as many as are named of relu2_2, relu3_3, relu4_3, relu5_3",
+    )
+    frequency_norm: Literal["backward", "ortho"] = Field(
+        default="backward",
+        description="of the FFT in L_FR; backward: none, so that L_FR counts the more the larger the picture",
     )
     loss: LossWeights = LossWeights()

@@ -4,9 +4,8 @@ With ``rl-paper`` an episode walks ``budget`` candidate views; every view taken 
 and gives the agent its reward. With any other policy the DNR trains on all candidates in random order for the same
 number of steps, without an agent: step 2 may start from its weights.
 
-The joint loss 0.1·L_RL + 1.0·L_DNRc (equation 5) is stepped by two Adam optimisers: the observation is
-detached, so the two gradients touch disjoint parameters and the sum splits exactly. L_RL = Σ_t (equation
-4) is stepped term by term as the episode goes: one temporal-difference update per view taken.
+The joint loss 0.1·L_RL + 1.0·L_DNRc (equation 5) is one loss with one Adam optimiser. L_RL = Σ_t (equation 4) is
+stepped term by term as the episode goes: one temporal-difference update per view taken.
 """
 
 from __future__ import annotations
@@ -72,9 +71,12 @@ def run_step1(
     candidates = Candidates(views.camera_positions, views.camera_directions)
     if rule is not None and choice is None:
         choice = rule.choose(candidates, budget, seed)
-    parts = [model.coarse().model_dump(), settings.model_dump(), policy, budget, seed, device]
+    parts = [model.coarse().model_dump(), settings.model_dump(), policy, budget, seed, device, "one optimiser"]
     dnr = DNR(model.coarse(), seed).to(device)
     dnr.use_bfloat16 = decide_bfloat16(settings.precision, device)
+    walker = None
+    if choice is None:
+        walker = Walker(candidates, dnr.settings.texture_channels, settings, budget=budget, seed=seed, device=device)
     step = _Step1(
         dnr=dnr,
         views=views,
@@ -85,9 +87,8 @@ def run_step1(
         run=run_fingerprint(fingerprint, views, parts),
         folder=Path(checkpoints),
         device=device,
+        walker=walker,
     )
-    if choice is None:
-        step.walker = Walker(step, candidates, budget)
     done = step.finished()
     if done is not None:
         known = {"policy": policy, "budget": budget, "seed": seed, "views": done.selected}
@@ -96,7 +97,7 @@ def run_step1(
     yield from step.train()
     book = EpochBook()
     if step.walker is not None:
-        choice = step.walker.roll_out()
+        choice = step.walker.roll_out(step.look)
     assert choice is not None  # given, the rule's, or the agent's
     spent = book.entry(0, 0.0, {})
     selection = choice.selection(views.names, policy, seed)
@@ -114,7 +115,6 @@ class _Step1(TrainingRun[Step1Settings]):
 
     budget: int
     walker: Walker | None = None
-    step: int = 0
 
     @property
     def episodes(self) -> int:
@@ -124,24 +124,23 @@ class _Step1(TrainingRun[Step1Settings]):
     def steps_per_epoch(self) -> int:
         return self.episodes * self.budget
 
-    def train_epoch(self, epoch: int, book: EpochBook) -> None:
-        self.step = epoch * self.steps_per_epoch
+    def look(self, view: int) -> tuple[Tensor, Tensor]:
+        """A candidate -> (L_DNRc on it, with its graph; T of the view, detached)."""
+        batch = self.views.batch([view])
+        assert batch.target is not None
+        output = self.dnr(batch)
+        assert output.texture is not None  # the coarse model has a neural texture
+        return F.mse_loss(output.rgb, batch.target), output.texture.detach()
 
-        def train_view(view: int) -> tuple[float, Tensor]:
-            """One DNR step on one view -> (L_DNRc before the step, T of the view)."""
-            batch = self.views.batch([view])
-            assert batch.target is not None
-            output = self.dnr(batch)
-            loss = F.mse_loss(output.rgb, batch.target)
-            book.count(guarded_step(self.optimiser, self.settings.weight_dnr * loss, self.rate(self.step)))
-            value = float(loss.detach())
-            book.add(dnr=value)
-            self.step += 1
-            return value, output.texture.detach()
+    def train_epoch(self, epoch: int, book: EpochBook) -> None:
+        first = epoch * self.steps_per_epoch
+
+        def step(loss: Tensor) -> bool:
+            return guarded_step(self.optimiser, loss, self.rate(first + book.steps))
 
         if self.walker is not None:
             for episode in range(self.episodes):
-                self.walker.episode(epoch, episode, train_view, lambda: self.rate(self.step - 1), book)
+                self.walker.episode(epoch, episode, self.look, step, book)
             return
         # All candidates in random order, cycled to as many steps as an RL epoch has.
         random = step_random(self.seed, STEP1, epoch, -1)
@@ -149,15 +148,21 @@ class _Step1(TrainingRun[Step1Settings]):
         while len(order) < self.steps_per_epoch:
             order += [int(i) for i in random.permutation(len(self.views))]
         for view in order[: self.steps_per_epoch]:
-            train_view(view)
+            loss, _ = self.look(view)
+            book.count(step(self.settings.weight_dnr * loss))
+            book.add(dnr=float(loss.detach()))
 
     def trained(self) -> list[nn.Module]:
         return [self.dnr] if self.walker is None else [self.dnr, self.walker.agent]
 
+    def more_trouble(self) -> str | None:
+        return None if self.walker is None else self.walker.trouble()
+
     def more_state(self) -> tuple[checkpoint.Parts, dict[str, Any]]:
         if self.walker is None:
-            return {}, {"reward_mean": None}
-        return self.walker.parts(), {"reward_mean": self.walker.scale.mean}
+            return {}, {}
+        known = {"reward_mean": self.walker.scale.mean, "largest_reward": self.walker.largest_reward}
+        return self.walker.parts(), known
 
     def load_more(self, saved: checkpoint.State) -> None:
         if self.walker is not None:

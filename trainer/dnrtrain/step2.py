@@ -66,7 +66,7 @@ def run_step2(
     wants_perceptual = settings.loss.perceptual > 0
     perceptual = None
     if weights is not None and wants_perceptual:
-        perceptual = PerceptualLoss(weights["vgg"]).to(device)
+        perceptual = PerceptualLoss(weights["vgg"], settings.perceptual_weights).to(device)
     record = checkpoint.read_record(coarse) if from_coarse else None
     parts = [
         model.model_dump(), settings.model_dump(), seed, device, perceptual is not None,

@@ -60,7 +60,7 @@ class TrainingRun(ABC, Generic[Settings]):
         self.val = None if self.val is None else self.val.to(self.device)
         self.dnr.train()
         rate, scale = self.settings.learning_rate, self.settings.texture_rate_scale
-        self.optimiser = adam([self.dnr], rate, self.device, scale)
+        self.optimiser = adam(self.trained(), rate, self.device, scale)
         self.watch = Watch()
         self.history: list[Epoch] = []
 
@@ -79,8 +79,12 @@ class TrainingRun(ABC, Generic[Settings]):
         return self.views.batch([0])
 
     def trained(self) -> list[nn.Module]:
-        """Modules whose weights must stay finite."""
+        """Modules that the optimiser steps, and whose weights must stay finite."""
         return [self.dnr]
+
+    def more_trouble(self) -> str | None:
+        """What else shows that the epoch diverged, in words."""
+        return None
 
     def more_state(self) -> tuple[checkpoint.Parts, dict[str, Any]]:
         """Further parts, and further fields of `Progress`, for a checkpoint."""
@@ -123,7 +127,7 @@ class TrainingRun(ABC, Generic[Settings]):
         self.train_epoch(epoch, book)
         with torch.no_grad():
             picture = self.dnr(self.first_views()).rgb
-        reason = self.watch.trouble(book, self.term, self.history, picture, *self.trained())
+        reason = self.watch.trouble(book, self.term, self.history, picture, *self.trained()) or self.more_trouble()
         if reason is not None:
             text = f"step {self.number}: {self.watch.restart(epoch + 1, reason)}"
             saved = checkpoint.load_state(self.folder, self.run)

@@ -7,116 +7,144 @@ from typing import Any
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from . import checkpoint
-from .schedule import STEP1, EpochBook, adam, guarded_step, step_random
+from .schedule import STEP1, EpochBook, step_random
 from .selector.agent import RewardScale, best_action, epsilon_at, epsilon_greedy, follow, reward_of, td_target
 from .selector.policies import FarthestPolicy
 from .selector.protocol import Candidates, Choice
 from .selector.qnetwork import QNetwork
 from .settings import Step1Settings
-from .training_run import TrainingRun
 
 PROBES = 4
 """Views whose loss the ``improvement`` reward watches."""
+MARGIN = 2.0
+"""An agent has diverged when its values leave the range that its rewards allow by more than this factor."""
+
+Look = Callable[[int], tuple[Tensor, Tensor]]
+"""A candidate -> (L_DNRc of the renderer on it, with its graph; T of the view, detached)."""
+Step = Callable[[Tensor], bool]
+"""One optimiser step on a loss -> whether it was taken."""
 
 
 class Walker:
-    """The agent: Q-network, its slow copy, their optimiser, the scale of rewards.
+    """The agent: Q-network, its slow copy, the scale of rewards, and how large rewards and values have been.
+
+    Its weights are trained by the caller, in one loss with the renderer's.
 
     Args:
-        run: the training of the renderer on all candidates, which it is part of.
+        candidates: all N views.
+        channels: of T.
         budget: views of an episode.
     """
 
-    def __init__(self, run: TrainingRun[Step1Settings], candidates: Candidates, budget: int) -> None:
-        self.dnr, self.views, self.settings, self.budget = run.dnr, run.views, run.settings, budget
-        self.seed, self.device, settings = run.seed, run.device, run.settings
-        shape = (len(self.views), self.dnr.settings.texture_channels, settings.embedding, self.seed + 1)
-        self.agent, self.slow = QNetwork(*shape).to(self.device), QNetwork(*shape).to(self.device)
-        self.adam = adam([self.agent], settings.learning_rate, self.device)
+    def __init__(
+        self, candidates: Candidates, channels: int, settings: Step1Settings, *, budget: int, seed: int, device: str
+    ) -> None:
+        self.count, self.settings, self.budget, self.seed, self.device = len(candidates), settings, budget, seed, device
+        shape = (self.count, channels, settings.embedding, seed + 1)
+        self.agent, self.slow = QNetwork(*shape).to(device), QNetwork(*shape).to(device)
         self.probes: list[int] = []
         if settings.reward == "improvement":
-            self.probes = FarthestPolicy().choose(candidates, min(PROBES, len(self.views)), self.seed).views
+            self.probes = FarthestPolicy().choose(candidates, min(PROBES, self.count), seed).views
         elif settings.reward == "improvement-all":
-            self.probes = list(range(len(self.views)))
+            self.probes = list(range(self.count))
         self.scale = RewardScale(raw=settings.reward_scale == "raw")
+        self.largest_reward = 0.0
+        self.largest_value = 0.0
 
-    def episode(
-        self,
-        epoch: int,
-        episode: int,
-        train_view: Callable[[int], tuple[float, Tensor]],
-        rate: Callable[[], float],
-        book: EpochBook,
-    ) -> None:
-        """Select ``budget`` views one after the other; each trains the DNR and the agent.
+    def episode(self, epoch: int, episode: int, look: Look, step: Step, book: EpochBook) -> None:
+        """Select ``budget`` views one after the other; each trains the renderer and the agent.
+
+        L_step1 = λ_RL L_RL + λ_DNRc L_DNRc is stepped as one loss, a view at a time, L_RL in squares of the unit of Q.
+        Rewards that watch what a step changes are known only after it: their L_RL is stepped by itself, by the same
+        optimiser.
 
         Args:
             epoch: zero-based.
             episode: zero-based, of the epoch.
-            train_view: one DNR step on a view -> (its loss before the step, T of the view).
-            rate: learning rate of the last step.
         """
         s, agent = self.settings, self.agent
+        if episode == 0:
+            self.largest_value = 0.0
         random = step_random(self.seed, STEP1, epoch, episode)
         epsilon = epsilon_at(epoch, s.epochs, s.epsilon_start, s.epsilon_end)
-        selected = torch.zeros(len(self.views), dtype=torch.bool, device=self.device)
-        view = int(random.integers(len(self.views)))
-        loss, texture = train_view(view)
-        self.scale.reward(loss)
+        selected = torch.zeros(self.count, dtype=torch.bool, device=self.device)
+        view = int(random.integers(self.count))
+        loss, texture = look(view)
+        book.count(step(s.weight_dnr * loss))
+        book.add(dnr=float(loss.detach()))
+        self.scale.reward(float(loss.detach()))
         selected[view] = True
-        probe = self._probe_loss()
+        probe = self._loss_on(self.probes, look)
+        after_the_step = s.reward.startswith("improvement")
         for taken in range(1, self.budget):
             values = agent(selected, agent.encode(texture))
             view = epsilon_greedy(values.detach(), selected, epsilon, random)
-            loss, texture = train_view(view)
-            if s.reward == "improvement-own":
-                probe, after = loss, self._loss_on([view])
+            loss, texture = look(view)
+            paid = float(loss.detach())
+            own = self.scale.reward(paid)
+            if after_the_step:
+                book.count(step(s.weight_dnr * loss))
+                before = paid if s.reward == "improvement-own" else probe
+                probe = self._loss_on([view] if s.reward == "improvement-own" else self.probes, look)
+                reward = reward_of(s.reward, own, before, probe)
             else:
-                after = self._probe_loss()
-            reward = reward_of(s.reward, self.scale.reward(loss), probe, after)
-            probe = after
+                reward = reward_of(s.reward, own, None, None)
             selected = selected.clone()
             selected[view] = True
-            terminal = taken == self.budget - 1
             slow = self.slow if s.q_target == "double" else agent
-            target = td_target(agent, slow, reward, s.gamma, selected, agent.encode(texture), terminal)
+            last = taken == self.budget - 1
+            unit = self._unit()
+            target = td_target(agent, slow, reward / unit, s.gamma, selected, agent.encode(texture), last)
             loss_rl = (values[view] - target).square()
-            if not guarded_step(self.adam, s.weight_rl * loss_rl, rate()):
-                book.skipped += 1
+            if after_the_step:
+                book.skipped += not step(s.weight_rl * loss_rl)
+            else:
+                book.count(step(s.weight_dnr * loss + s.weight_rl * loss_rl))
             follow(self.slow, agent)
-            book.add(rl=float(loss_rl.detach()), reward=reward, q=float(values[view].detach()))
+            value = unit * float(values[view].detach())
+            self.largest_reward = max(self.largest_reward, abs(reward))
+            self.largest_value = max(self.largest_value, abs(value))
+            book.add(dnr=paid, rl=float(loss_rl.detach()), reward=reward, q=value)
 
-    def _probe_loss(self) -> float | None:
-        return self._loss_on(self.probes) if self.probes else None
+    def trouble(self) -> str | None:
+        """What shows that the agent diverged in the last epoch, in words; None when it did not.
+
+        The value of M − 1 further views is Σ γ^k r: no policy makes it larger than max |r| times Σ γ^k.
+        """
+        horizon = sum(self.settings.gamma**k for k in range(self.budget - 1))
+        allowed = MARGIN * self.largest_reward * horizon
+        if self.largest_value <= allowed:
+            return None
+        return (
+            f"the agent's values reach {self.largest_value:.3g}, where rewards of at most {self.largest_reward:.3g}"
+            f" allow {allowed / MARGIN:.3g}"
+        )
+
+    def _unit(self) -> float:
+        """What the network's output is multiplied by to give Q."""
+        return 1.0 if self.settings.reward.startswith("improvement") else self.scale.unit
 
     @torch.no_grad()
-    def _loss_on(self, views: list[int]) -> float:
-        """Mean L_DNRc of some candidates."""
-        losses = []
-        for view in views:
-            batch = self.views.batch([view])
-            assert batch.target is not None
-            losses.append(F.mse_loss(self.dnr(batch).rgb, batch.target))
-        return float(torch.stack(losses).mean())
+    def _loss_on(self, views: list[int], look: Look) -> float | None:
+        """Mean L_DNRc of some candidates; None of none."""
+        return float(torch.stack([look(view)[0] for view in views]).mean()) if views else None
 
     @torch.no_grad()
-    def roll_out(self) -> Choice:
+    def roll_out(self, look: Look) -> Choice:
         """The trained agent's greedy choice."""
         random = step_random(self.seed, STEP1, -1, -1)
-        order = [int(random.integers(len(self.views)))]
-        selected = torch.zeros(len(self.views), dtype=torch.bool, device=self.device)
+        order = [int(random.integers(self.count))]
+        selected = torch.zeros(self.count, dtype=torch.bool, device=self.device)
         selected[order[0]] = True
         values: list[float] = []
         while len(order) < self.budget:
-            texture = self.dnr(self.views.batch([order[-1]])).texture
-            q = self.agent(selected, self.agent.encode(texture))
+            q = self.agent(selected, self.agent.encode(look(order[-1])[1]))
             order.append(best_action(q, selected))
             selected[order[-1]] = True
-            values.append(float(q[order[-1]]))
+            values.append(self._unit() * float(q[order[-1]]))
         details: dict[str, Any] = {"reward": self.settings.reward, "measure": "action value when it was taken"}
         if values and np.isfinite(values).all():
             details["action_values"] = values
@@ -127,12 +155,11 @@ class Walker:
 
     def parts(self) -> checkpoint.Parts:
         """Its parts of step 1's checkpoint."""
-        adam = checkpoint.optimiser_tensors(self.adam)
-        return {"agent": self.agent.state_dict(), "slow": self.slow.state_dict(), "adam_agent": adam}
+        return {"agent": self.agent.state_dict(), "slow": self.slow.state_dict()}
 
     def load(self, saved: checkpoint.State) -> None:
         """Go on from step 1's checkpoint."""
         self.scale = RewardScale(saved.progress.reward_mean, raw=self.settings.reward_scale == "raw")
+        self.largest_reward = saved.progress.largest_reward
         self.agent.load_state_dict(saved.parts["agent"])
         self.slow.load_state_dict(saved.parts["slow"])
-        checkpoint.restore_optimiser(self.adam, saved.parts["adam_agent"])

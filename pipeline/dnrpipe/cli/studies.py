@@ -12,7 +12,10 @@ from .options import EXECUTOR_OPTIONS, executor_assignments, options
 SCENES = click.option(
     "--scenes", metavar="A,B", help="Scene files, or names of blender_scenes/ (default: its ten scenes)."
 )
-PRESET = click.option("--preset", default="draft", show_default=True, metavar="NAME", help="draft, standard or paper.")
+PRESET = click.option(
+    "--preset", default="draft", show_default=True, metavar="NAME",
+    help="draft, standard, paper, or paper-128: its schedule on pictures of 128x128.",
+)  # fmt: skip
 JOBS = click.option(
     "--jobs", type=int, default=0, metavar="N", help="Cells side by side (default: one per core; 1 on a GPU)."
 )
@@ -26,7 +29,7 @@ QUIET = click.option("-q", "--quiet", is_flag=True, help="Warnings and errors on
 @click.option(
     "--rows",
     metavar="A,B",
-    help="Rows or groups: core (default), paper-table, fig7a, fig7b, ingredients, all, vanilla, paper, dnr, ...",
+    help="Rows or groups: core (default), paper-table, paper-more, fig7a, fig7b, fig7c, ingredients, all, vanilla, ...",
 )
 @click.option("--seeds", type=int, default=3, show_default=True, metavar="N", help="Every row is trained N times.")
 @PRESET
@@ -80,6 +83,7 @@ def ablate(as_json: bool, quiet: bool, out: Path, **given: Any) -> None:
 @click.option(
     "--seconds", type=float, metavar="S", help="Train every cell for about S seconds, not the preset's epochs."
 )
+@click.option("--steps", type=int, metavar="N", help="N steps of step 2, whatever the budget, not the preset's epochs.")
 @JOBS
 @click.option("--set", "assignments", multiple=True, metavar="KEY=VALUE", help="A setting of all cells. Repeatable.")
 @click.option(

@@ -17,10 +17,11 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from dnrtrain.selector.names import TRAINED_NAMES, PolicyName
-from dnrtrain.settings import LossWeights, ModelSettings, Step1Settings, Step2Settings, Strict
+from dnrtrain.settings import ModelSettings, Step1Settings, Step2Settings, Strict
 
 from .effect_names import EffectName
 from .errors import UserError
+from .presets import PRESETS, merge
 from .units import parse_seconds, parse_share
 
 ENVIRONMENT_PREFIX = "DNRPIPE_"
@@ -239,64 +240,6 @@ class Settings(Strict):
         return self.finetune.step2.start == "coarse"
 
 
-# The default model, "dnr": it corrects an image of baked light (docs/method.md; figures in docs/experiments.md).
-DNR: dict[str, Any] = {
-    "base": "baked",
-    "guides": "camera",
-    "filter": 3,
-    "stride": 2,
-    "output": "log",
-    "aggregator": "residual",
-    "modalities": "uv",
-}
-DNR_STEP2: dict[str, Any] = {
-    "start": "pretrained",
-    "ema": 0.99,
-    "photometric": "l1",
-    "texture_rate_scale": 3.0,
-    "loss": {"perceptual": 0.03},
-}
-PRESETS: dict[str, dict[str, Any]] = {
-    # Minutes on two CPU cores.
-    "draft": {
-        "cameras": {"train": 40, "val": 4, "test": 12, "width": 128, "height": 128},
-        "passes": {"bake_size": 1024},
-        "raytrace": {"spp": 128, "evaluation_spp": 512, "denoise": True, "evaluation_denoise": True},
-        "model": {**DNR, "texture_size": 128, "width": 24, "depth": 3},
-        "select": {"step1": {"epochs": 12, "texture_rate_scale": 10.0}},
-        "finetune": {"step2": {**DNR_STEP2, "epochs": 40, "perceptual_crop": 32}},
-    },
-    # Minutes to an hour on two CPU cores, at the size of a film.
-    "standard": {
-        "cameras": {"train": 40, "val": 4, "test": 6, "width": 1280, "height": 720},
-        "raytrace": {"spp": 64, "evaluation_spp": 256, "denoise": True, "evaluation_denoise": True},
-        "model": {**DNR, "texture_size": 256, "width": 24, "depth": 3},
-        "select": {"step1": {"epochs": 30, "texture_rate_scale": 10.0}},
-        "finetune": {"step2": {**DNR_STEP2, "epochs": 60, "patch": 192, "perceptual_crop": 64}},
-    },
-    # DNR (Thies et al. 2019) at the paper's sizes: what DNRSelect is compared with.
-    "vanilla": {
-        "model": {"modalities": "uv"},
-        "select": {"policy": "rl-paper", "step1": {"reward_scale": "raw", "q_target": "plain"}},
-        "effects": {"enable": ["view-dependence"]},
-        "finetune": {
-            "step2": {
-                "start": "fresh",
-                "augment": False,
-                "photometric": "l1",
-                "texture_rate_scale": 10.0,
-                "loss": {name: 0.0 for name in LossWeights.model_fields if name != "photometric"},
-            }
-        },
-    },
-    # The paper's numbers: every other default of the models above is the paper's.
-    "paper": {
-        "select": {"policy": "rl-paper", "step1": {"reward_scale": "raw", "q_target": "plain"}},
-        "effects": {"enable": ["view-dependence", "depth", "normal"]},
-    },
-}
-
-
 def resolve(
     preset: str | None,
     overrides: Mapping[str, Any],
@@ -332,17 +275,6 @@ def resolve(
         if first["type"] == "value_error" and isinstance(first["input"], Mapping):  # settings that exclude each other
             raise UserError(f"setting {where or 'values'}: {first.get('ctx', {}).get('error')}") from None
         raise UserError(f"setting {where}: {first['msg'].lower()}, got {first['input']!r}") from None
-
-
-def merge(base: Mapping[str, Any], extra: Mapping[str, Any]) -> dict[str, Any]:
-    """``base`` with ``extra`` merged into a copy, recursively."""
-    result = dict(base)
-    for key, value in extra.items():
-        if isinstance(value, Mapping):
-            below = result.get(key)
-            value = merge(below if isinstance(below, Mapping) else {}, value)
-        result[key] = value
-    return result
 
 
 def parse_assignment(text: str) -> dict[str, Any]:

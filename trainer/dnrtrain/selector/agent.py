@@ -42,15 +42,16 @@ def td_target(
     """q_t of equation 3: r_{t+1} + γ max_a Q(s_{t+1}, a), or the reward alone at the episode's end.
 
     The maximum runs over views that are not selected in s_{t+1}: the others are no actions. With ``slow``
-    the same as ``network`` this is the equation, literally. So taken it diverges here (values of +8 for
-    rewards of −0.001: the maximum feeds on its own errors), so by default the maximising action comes from
+    the same as ``network`` this is the equation, literally. With γ near 1 it then diverges (values of +8 for
+    rewards of −0.001: the maximum feeds on its own errors). Else the maximising action comes from
     ``network`` and its value from ``slow``, an exponential average of it (double Q-learning, van Hasselt et
     al. 2016; the average is MVSelect's).
     """
     if terminal:
         return reward
-    action = best_action(network(selected, observation), selected)
-    return reward + gamma * float(slow(selected, observation)[action])
+    values = network(selected, observation)
+    worth = values if slow is network else slow(selected, observation)
+    return reward + gamma * float(worth[best_action(values, selected)])
 
 
 @torch.no_grad()
@@ -67,11 +68,12 @@ def epsilon_at(epoch: int, epochs: int, start: float, end: float) -> float:
 
 
 class RewardScale:
-    """Running mean of the coarse loss: the yardstick of loss rewards.
+    """Running mean of the coarse loss: the yardstick of loss rewards, and of the values that the network gives.
 
-    −L shrinks fifty-fold while the DNR converges; raw, it vanishes below the network's own noise. So
-    neg-loss is (mean − L) / mean: the same ranking of episodes (all have equal length, and the mean is
-    common to all views), but of order one throughout training. ``raw`` keeps −L, the paper's.
+    −L shrinks fifty-fold while the DNR converges. ``relative`` rewards are (mean − L) / mean: the same ranking of
+    episodes (all have equal length, and the mean is common to all views), but of order one throughout training.
+    ``raw`` keeps −L, the paper's. Its values are the network's output times ``unit``, the mean: a step of Adam moves
+    the output by some tenths, whatever the rewards are, which would be ten times all of −L.
     """
 
     KEEP = 0.95
@@ -79,29 +81,32 @@ class RewardScale:
     def __init__(self, mean: float | None = None, *, raw: bool = False) -> None:
         self.mean, self.raw = mean, raw
 
+    @property
+    def unit(self) -> float:
+        """What an output of 1 is worth."""
+        return max(self.mean, 1e-8) if self.raw and self.mean is not None else 1.0
+
     def reward(self, loss: float) -> float:
-        """(mean − loss) / mean with the mean before this loss; then takes it in. Non-finite losses are 0."""
+        """−loss, or (mean − loss) / mean with the mean before this loss; then takes it in. Non-finite losses are 0."""
         if not np.isfinite(loss):  # its step is skipped, counted and said by the epoch
             return 0.0
-        if self.raw:
-            return -loss
         mean = loss if self.mean is None else self.mean
         self.mean = self.KEEP * mean + (1.0 - self.KEEP) * loss
-        return (mean - loss) / max(mean, 1e-8)
+        return -loss if self.raw else (mean - loss) / max(mean, 1e-8)
 
 
-def reward_of(kind: Reward, relative: float, probe_before: float | None, probe_after: float | None) -> float:
+def reward_of(kind: Reward, loss: float, probe_before: float | None, probe_after: float | None) -> float:
     """Reward of taking a view into training.
 
-    neg-loss     −L_DNRc on that view (the paper's choice), as `RewardScale` measures it
+    neg-loss     −L_DNRc on that view (the paper's choice), as `RewardScale` measures it: ``loss``
     pos-loss     the negative of that (the paper's comparison: hard views first)
     improvement, improvement-own, improvement-all
                  relative decrease by this step of the raster loss on a fixed set of probe views, on the view itself,
                  or on all candidates: the objective itself, at the price of rendering them after every step
     """
     if kind == "neg-loss":
-        return relative
+        return loss
     if kind == "pos-loss":
-        return -relative
+        return -loss
     assert probe_before is not None and probe_after is not None
     return (probe_before - probe_after) / max(probe_before, 1e-8)

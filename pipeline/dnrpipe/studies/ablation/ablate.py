@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from dnrtrain.atomic import write_text
+from dnrtrain.selector.names import TRAINED_NAMES
 
 from ...core.console import Console
 from ...core.errors import UserError
@@ -28,6 +29,7 @@ from ..cells.scenes import (
     find_scenes,
     make_bases,
     prepared,
+    raster_engine,
     scene_workspace,
     trace_references,
     trace_train,
@@ -101,14 +103,17 @@ class Ablation(Study[tuple[str, str, int]]):
             for row in self.rows:
                 settings = self.settings_of(row, scene)
                 if needs_coarse(row, settings):
-                    seconds = None if row.full_step1 or not self.seconds else STEP1_SHARE * self.seconds
-                    step1[scene.name, row.name] = self.step1_task(scene, settings, step1_policy(row), seed, seconds)
+                    seconds = STEP1_SHARE * self.seconds if self.seconds else None
+                    step1[scene.name, row.name] = self.step1_task(
+                        scene, settings, step1_policy(settings), seed, seconds
+                    )
         self.worker_pool.work(f"step 1, seed {seed}", CELL_WORKER, step1.values())
         for scene in self.scenes:
             self._plan_scene(scene, seed, step1)
 
     def _plan_scene(self, scene: Scene, seed: int, step1: dict[tuple[str, str], Step1Task]) -> None:
-        chosen = {row.name: self._views(scene, row, seed, step1) for row in self.rows}
+        own = {row.name: self.settings_of(row, scene) for row in self.rows}
+        chosen = {row.name: self._views(scene, row, own[row.name], seed, step1) for row in self.rows}
         everything = sorted({name for names in chosen.values() for name in names})
         by_spp: dict[int | None, set[str]] = {}
         for row in self.rows:
@@ -116,7 +121,7 @@ class Ablation(Study[tuple[str, str, int]]):
         traced = {spp: trace_train(scene, self.base, names, spp) for spp, names in by_spp.items()}
         bases: dict[str, dict[str, str]] = {}
         for row in self.rows:
-            settings = self.settings_of(row, scene)
+            settings = own[row.name]
             kind, based = settings.model.base, needs_base(row, settings)
             if based and kind not in bases:
                 bases[kind] = make_bases(scene, settings, everything)
@@ -129,19 +134,21 @@ class Ablation(Study[tuple[str, str, int]]):
                 bases[kind] if based else {},
                 label=row.name,
                 network=row.network,
-                full_step1=row.full_step1,
                 spp=row.spp,
                 picture=seed == 0,
             )
 
-    def _views(self, scene: Scene, row: Row, seed: int, step1: dict[tuple[str, str], Step1Task]) -> list[str]:
-        if row.views == "rl":
-            return step1[scene.name, row.name].result().selected
-        if row.views == "all":
+    def _views(
+        self, scene: Scene, row: Row, settings: Settings, seed: int, step1: dict[tuple[str, str], Step1Task]
+    ) -> list[str]:
+        if row.everything:
             return list(scene.train)
+        policy = settings.select.policy
+        if policy in TRAINED_NAMES:
+            return step1[scene.name, row.name].result().selected
         budget = row.budget or self.base.select.most
         # Farthest points are the same views for every seed.
-        chosen = choose_by_pose(list(scene.train.values()), row.views, budget, seed if row.views == "random" else 0)
+        chosen = choose_by_pose(list(scene.train.values()), policy, budget, seed if policy == "random" else 0)
         return [view.name for view in chosen]
 
     def settings_of(self, row: Row, scene: Scene | None = None) -> Settings:
@@ -169,9 +176,12 @@ class Ablation(Study[tuple[str, str, int]]):
             **dict(zip(("scene", "row", "seed"), place, strict=True)),
             "key": cell.key,
             **{name: mean_of(cell.tests, name) for name in METRICS},
+            "train_psnr": cell.train_psnr and round(cell.train_psnr, 5),
             "views": len(cell.views),
             "epochs": training and training.epochs,
             "steps": training and training.step2.steps,
+            "step1_steps": step1 and step1.steps,
+            "raster_engine": raster_engine(task.workspace) if step1 else None,
             "train_seconds": training and round(training.seconds, 2),
             "train_cpu_seconds": training and round(training.cpu_seconds, 2),
             "step1_cpu_seconds": step1 and round(step1.cpu_seconds, 2),

@@ -11,12 +11,14 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..cells.intervals import LEVEL, Difference, difference, summarise
 from ..cells.results import NONE, made_line, read_made, spread, table
 from ..cells.scenes import HARD_LIGHT
-from .rows import ROWS
+from .rows import GROUPS, ROWS
 
 SCHEMA = 1
 read_results = functools.partial(read_made, command="ablate", schema=SCHEMA, part="cells")
+DIFFERENCES = (("psnr", 2), ("ssim", 4), ("lpips_vgg", 4))
 # Wu, Li, Wei: DNRSelect, table I (25 views, NeRF-Synthetic, 800²): PSNR, SSIM, LPIPS.
 PUBLISHED = {
     "full": (28.12, 0.8506, 0.0479),
@@ -27,11 +29,13 @@ PUBLISHED = {
 }
 COLUMNS: tuple[tuple[str, str, int], ...] = (
     ("psnr", "PSNR", 2),
-    ("psnr_mask", "PSNR in mask", 2),
-    ("ssim", "SSIM", 4),
     ("lpips_vgg", "LPIPS VGG", 4),
+    ("ssim", "SSIM", 4),
+    ("train_psnr", "PSNR of training views", 2),
+    ("psnr_mask", "PSNR in mask", 2),
     ("lpips_alex", "LPIPS Alex", 4),
     ("flip", "FLIP", 4),
+    ("steps", "steps of step 2", 0),
     ("train_seconds", "training, s wall", 0),
     ("train_cpu_seconds", "s CPU", 0),
     ("frame_ms", "network, ms/frame", 1),
@@ -46,8 +50,10 @@ class Figures:
     """Cells by (scene, row, seed), and their means."""
 
     def __init__(self, results: Mapping[str, Any]) -> None:
-        present = {cell["row"] for cell in results["cells"]}
-        self.rows = [name for name in ROWS if name in present]
+        # Published results may name rows that are no longer offered, and say of others what they were then.
+        self.what: dict[str, str] = results.get("rows") or {name: row.what for name, row in ROWS.items()}
+        present = dict.fromkeys(cell["row"] for cell in results["cells"])
+        self.rows = [name for name in ROWS if name in present] + [name for name in present if name not in ROWS]
         self.cells = {(cell["scene"], cell["row"], cell["seed"]): cell for cell in results["cells"]}
         self.scenes = [name for name in results["scenes"] if any(key[0] == name for key in self.cells)]
         self.seeds = sorted({key[2] for key in self.cells})
@@ -87,6 +93,12 @@ class Figures:
                 found.append(statistics.fmean(compare(*pair) for pair in pairs))
         return found
 
+    def difference(self, row: str, other: str, metric: str) -> Difference | None:
+        """row - other over all (scene, seed) that both have; its interval speaks of these scenes."""
+        both = {(scene, seed) for scene, name, seed in self.cells if name == row}
+        pairs = {pair: [self._value(pair[0], name, pair[1], metric) for name in (row, other)] for pair in sorted(both)}
+        return summarise({pair: a - b for pair, (a, b) in pairs.items() if None not in (a, b)}, pairs=True)
+
     def _value(self, scene: str, row: str, seed: int, metric: str) -> Any:
         """None where there is no such cell, or it was not measured."""
         return self.cells.get((scene, row, seed), {}).get(metric)
@@ -115,16 +127,19 @@ def _provenance(results: Mapping[str, Any], figures: Figures) -> str:
     return (
         f"{made_line(results)}, {results['budget']}"
         f" training views, {len(figures.seeds)} seed(s), {time}. PSNR and SSIM over white; ± is the standard deviation"
-        " over seeds; training time includes step 1 where a row has it."
+        " over seeds; training time includes step 1 where a row has it. Δ with brackets: the mean of differences paired"
+        f" by scene and seed, and the {LEVEL:.0%} interval of Student's t over the pairs, bold where it leaves out 0."
+        " It speaks of these scenes."
     )
 
 
 def _means(figures: Figures, scenes: Sequence[str], title: str) -> str:
+    columns = [column for column in COLUMNS if any(figures.mean(row, column[0], scenes) for row in figures.rows)]
     rows = []
     for row in figures.rows:
-        cells = [spread(figures.mean(row, metric, scenes), digits) for metric, _, digits in COLUMNS]
-        rows.append([f"`{row}`", ROWS[row].what, *cells])
-    body = table(["row", "what", *[title for _, title, _ in COLUMNS]], rows)
+        cells = [spread(figures.mean(row, metric, scenes), digits) for metric, _, digits in columns]
+        rows.append([f"`{row}`", figures.what[row], *cells])
+    body = table(["row", "what", *[title for _, title, _ in columns]], rows)
     ceiling = [
         max(found)
         for scene in scenes
@@ -160,59 +175,70 @@ def _gains(figures: Figures) -> str:
 
 
 def _paper(figures: Figures) -> str:
-    """The paper's table: each mechanism taken away, against the row that has it."""
-    rows = []
-    for row, published in PUBLISHED.items():
-        if row not in figures.rows or (other := ROWS[row].against) not in figures.rows:
+    """The paper's table: each mechanism taken away, against row `paper`; and DNR, which has none of them."""
+    other, rows = "paper", []
+    for row in figures.rows:
+        if other not in figures.rows or row == other or row not in ROWS or ROWS[row].family == "dnr":
             continue
-        theirs = published[0] - PUBLISHED["full"][0]
-        ours = figures.paired(row, other, "psnr", figures.scenes)
-        rows.append([ROWS[row].what, f"{theirs:+.2f}", *_differences(figures, row, other), _verdict(theirs, ours)])
+        published = PUBLISHED.get(row)
+        theirs = [a - b for a, b in zip(published, PUBLISHED["full"], strict=True)] if published else []
+        found = [figures.difference(row, other, metric) for metric, _ in DIFFERENCES]
+        line = [figures.what[row], str(found[0].pairs if found[0] else 0)]
+        for index, (metric, digits) in enumerate(DIFFERENCES):
+            line.append(difference(found[index], digits))
+            if metric != "ssim":
+                line.append(f"{theirs[index]:+.{digits}f}" if theirs else NONE)
+                line.append(_verdict(theirs[index], found[index]) if theirs else NONE)
+        rows.append(line)
     if not rows:
         return ""
-    head = ["taken away", "ΔPSNR, paper", "ΔPSNR, ours", "ΔSSIM, ours", "ΔLPIPS VGG, ours", "paper's order"]
+    head = ["instead of row `paper`", "pairs", "ΔPSNR", "the paper's", "the paper's order", "ΔSSIM"]
+    head += ["ΔLPIPS VGG", "the paper's", "the paper's order"]
     return f"### The paper's table: what each mechanism is worth\n\n{table(head, rows)}"
 
 
 def _differences(figures: Figures, row: str, other: str) -> list[str]:
-    return [
-        spread(figures.paired(row, other, metric, figures.scenes), digits, signed=True)
-        for metric, digits in (("psnr", 2), ("ssim", 4), ("lpips_vgg", 4))
-    ]
+    return [spread(figures.paired(row, other, metric, figures.scenes), digits, signed=True)
+            for metric, digits in DIFFERENCES]  # fmt: skip
 
 
-def _verdict(theirs: float, ours: Sequence[float]) -> str:
-    if not ours:
+def _verdict(theirs: float, ours: Difference | None) -> str:
+    """Whether the sign of the paper's difference is ours, as far as the interval carries it."""
+    if ours is None or ours.half is None:
         return NONE
-    if len(ours) > 1 and abs(statistics.fmean(ours)) <= statistics.stdev(ours):
-        return "within the seeds' spread"
-    return "reproduced" if (statistics.fmean(ours) < 0) == (theirs < 0) else "not reproduced"
+    if not ours.clear:
+        return "inside the noise"
+    return "reproduced" if (ours.mean < 0) == (theirs < 0) else "the other way"
 
 
 def _figure7(figures: Figures) -> str:
     parts = []
-    for title, names in (
-        ("Fig. 7a: how the maps are aggregated", ("paper", "paper-early", "paper-uv")),
-        ("Fig. 7b: which maps are aggregated", ("paper-uv", "paper-uv-depth", "paper-uv-normal", "paper")),
+    for title, group in (
+        ("Fig. 7a: how the maps are aggregated", "fig7a"),
+        ("Fig. 7b: which maps are aggregated", "fig7b"),
+        ("Fig. 7c: what the selector is rewarded for", "fig7c"),
     ):
+        names = GROUPS[group]
         if not all(name in figures.rows for name in names):
             continue
         rows = [
-            [ROWS[name].what, *[spread(figures.mean(name, m, figures.scenes), d) for m, _, d in COLUMNS[:6]]]
+            [figures.what[name], *[spread(figures.mean(name, m, figures.scenes), d) for m, _, d in COLUMNS[:4]],
+             *[difference(figures.difference(name, "paper", m), d) for m, d in DIFFERENCES]]
             for name in names
-        ]
-        parts.append(f"### {title}\n\n{table(['', *[head for _, head, _ in COLUMNS[:6]]], rows)}")
+        ]  # fmt: skip
+        head = ["", *[head for _, head, _ in COLUMNS[:4]], "ΔPSNR to `paper`", "ΔSSIM", "ΔLPIPS VGG"]
+        parts.append(f"### {title}\n\n{table(head, rows)}")
     return "\n\n".join(parts)
 
 
 def _ingredients(figures: Figures) -> str:
     """Our ingredients, one changed at a time: differences from ``dnr``."""
-    names = [row for row in figures.rows if ROWS[row].family == "dnr" and row != "dnr"]
+    names = [row for row in figures.rows if row in ROWS and ROWS[row].family == "dnr" and row != "dnr"]
     if "dnr" not in figures.rows or not names:
         return ""
     rows = []
     for name in names:
-        line = [f"`{name}`", ROWS[name].what]
+        line = [f"`{name}`", figures.what[name]]
         if figures.same(name, "dnr"):
             rows.append([*line, "is `dnr`", *[""] * 4])
             continue

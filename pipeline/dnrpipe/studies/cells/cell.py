@@ -24,7 +24,7 @@ from ...core.scene_files import read_frame, split_views
 from ...core.settings import Settings
 from ...core.workspace import Workspace
 from ...stages.trainer import perceptual_weights
-from .measure import base_pictures, measure, network_pictures, rendered_ms
+from .measure import base_pictures, measure, network_pictures, rendered_ms, training_psnr
 from .scenes import base_files, raster_file
 from .tasks import CellResult, CellTask, FileWorker, Step1Result, Step1Task, Training, TrainingCost
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from dnrtrain.dataset import Base, ViewSet
     from dnrtrain.records import Epoch, ModelRecord
 
-CELL_VERSION = 2  # raise when training or measuring changes what a cell holds, or what fingerprints hash
+CELL_VERSION = 3  # raise when training or measuring changes what a cell holds, or what fingerprints hash
 STEP1_SHARE = 1 / 3
 """Share of the training time that step 1 may take where all rows train equally long."""
 
@@ -71,9 +71,10 @@ class Worker(FileWorker):
         training = self._train(task) if task.network else None
         if task.network:
             pictures, frame_ms = network_pictures(task.folder, test, self.device)
+            learned = training_psnr(task.folder, self._training_views(task), self.device)
             shutil.rmtree(task.folder)
         else:
-            pictures, frame_ms = base_pictures(test), None
+            pictures, frame_ms, learned = base_pictures(test), None, None
         return CellResult(
             key=task.fingerprint,
             scene=task.scene,
@@ -84,6 +85,7 @@ class Worker(FileWorker):
             },
             views=task.views,
             training=training,
+            train_psnr=learned,
             frame_ms=frame_ms,
             base_ms=rendered_ms(base_files(workspace, base, "test", test.names)),
             threads=self.threads,
@@ -150,12 +152,12 @@ class Worker(FileWorker):
         if isinstance(task, Step1Task):
             views = self.views(task.workspace, "train", raytraced=False, base="none")
             return run_step1(views, None, model, step1, policy=task.policy, budget=settings.select.most, **run)
-        names = tuple(task.views)
-        views = self.views(
-            task.workspace, "train", names, raytraced=True, base=settings.model.base, targets=task.targets
-        )
         coarse = task.coarse or folder  # not read by a fresh start
-        return run_step2(views, None, coarse, model, step2, weights=self.weights, **run)
+        return run_step2(self._training_views(task), None, coarse, model, step2, weights=self.weights, **run)
+
+    def _training_views(self, task: CellTask) -> ViewSet:
+        names, base = tuple(task.views), task.settings.model.base
+        return self.views(task.workspace, "train", names, raytraced=True, base=base, targets=task.targets)
 
 
 def load_cell_views(

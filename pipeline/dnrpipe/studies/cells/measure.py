@@ -49,6 +49,17 @@ def network_pictures(folder: Path, views: ViewSet, device: str) -> tuple[Tensor,
     return pictures, 1000 * float(np.median(seconds))
 
 
+def training_psnr(folder: Path, views: ViewSet, device: str) -> float:
+    """Mean PSNR of the network on the views that it was trained on, dB: how far it has learned them by heart."""
+    from dnrtrain.checkpoint import load_model
+    from dnrtrain.metrics import psnr
+    from dnrtrain.model import render_views
+
+    target = views.tensors.target
+    assert target is not None  # it was trained on them
+    return float(psnr(render_views(load_model(folder, device), views), target.cpu()).mean())
+
+
 def base_pictures(views: ViewSet) -> Tensor:
     """The base images themselves as display RGB over white in [0, 1], [N, 3, H, W], composed as the network's are."""
     from dnrtrain.model import base_picture

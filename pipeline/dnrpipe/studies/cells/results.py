@@ -104,8 +104,10 @@ def made_line(results: Mapping[str, Any]) -> str:
     commits = sorted({cell["commit"] for cell in results["cells"] if cell["commit"]})
     if len(commits) > 1:
         state += f" (cells of {len(commits)} commits: {', '.join(commit[:12] for commit in commits)})"
+    engines = [engine for engine in results.get("raster_engines", []) if engine]
+    drawn = f", rasterised by {' and '.join(engines)}" if engines else ""
     return (
         f"`{results['command']}`, {results['date'][:10]}, {state}; {box['processor']},"
         f" {box['cores']} cores, torch {results['versions']['torch']}. Preset"
-        f" {results['preset']}, {results['resolution']}"
+        f" {results['preset']}, {results['resolution']}{drawn}"
     )

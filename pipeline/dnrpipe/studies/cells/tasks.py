@@ -153,6 +153,7 @@ class CellResult(BaseModel):
 
     Args:
         settings: "model" and "step2", as they were given.
+        train_psnr: mean PSNR on the training views, dB.
         frame_ms, base_ms: median milliseconds of the network's frame and of a base image.
         tests: a row of metrics per test view.
         finished: unix seconds.
@@ -164,6 +165,7 @@ class CellResult(BaseModel):
     settings: dict[str, dict[str, Any]]
     views: list[str]
     training: Training | None
+    train_psnr: float | None
     frame_ms: float | None
     base_ms: float | None
     threads: int

@@ -16,13 +16,14 @@ from pathlib import Path
 from dnrtrain.atomic import atomic_path, write_json, write_text
 
 from ...core.errors import UserError
+from ...core.presets import SIZES
 from ...core.scene_files import scene_fingerprint, split_views
 from ...core.settings import Settings
 from ...core.workspace import Workspace, digest
 from ...stages.stage import Run
 from ...workers.view_tasks import worker_count
 from ..ablation.ablate import Ablation
-from ..ablation.rows import CLASSIC, ROWS, Row, ViewChoice
+from ..ablation.rows import ROWS, Row
 from ..cells.results import made_by
 from ..cells.scenes import Scene, prepared, without_left_out
 from ..cells.study import WorkerPool
@@ -73,21 +74,20 @@ class Sweep:
         if "random" in self.also:
             found += [self._row(f"{views} random views", views, spp, epochs, "random") for views in self.budgets]
         if "all" in self.also:
-            found.append(self._row("all candidates", None, spp, epochs, "all"))
+            found.append(self._row("all candidates", None, spp, epochs))
         if "paper" in self.also:
-            if settings.preset not in CLASSIC:
-                raise UserError(
-                    f"the paper's row has sizes for the presets {', '.join(CLASSIC)}; leave it out of --also"
-                )
+            if settings.preset not in SIZES:
+                raise UserError(f"the paper's row has sizes for the presets {', '.join(SIZES)}; leave it out of --also")
             found.append(replace(ROWS["paper"], budget=max(self.budgets)))
         if settings.model.base != "none":
             found.append(Row("base image alone", ROWS["base"].what, "dnr", network=False))
         return found
 
     @staticmethod
-    def _row(name: str, views: int | None, spp: int, epochs: int, views_by: ViewChoice = "farthest") -> Row:
-        changes = {"finetune": {"step2": {"epochs": epochs}}}
-        return Row(name, name, "dnr", changes, views_by, budget=views, spp=spp)
+    def _row(name: str, views: int | None, spp: int, epochs: int, policy: str = "farthest") -> Row:
+        """views: None trains on all candidates."""
+        changes = {"finetune": {"step2": {"epochs": epochs}}, "select": {"policy": policy}}
+        return Row(name, name, "dnr", changes, everything=views is None, budget=views, spp=spp)
 
 
 @dataclass(kw_only=True)

@@ -66,9 +66,11 @@ def point_of(swept: Ablation, scene: Scene, row: Row, seed: int, base_ms: float 
 def _kind(row: Row) -> Literal["ours", "random", "all", "paper", "base"]:
     if not row.network:
         return "base"
-    if row.family == "classic":
+    if row.family != "dnr":
         return "paper"
-    return row.views if row.views in ("random", "all") else "ours"
+    if row.everything:
+        return "all"
+    return "random" if row.changes["select"]["policy"] == "random" else "ours"
 
 
 def settle_frames(points: Sequence[Point]) -> list[Point]:

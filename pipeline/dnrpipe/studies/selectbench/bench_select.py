@@ -122,15 +122,24 @@ ChoiceTask = RuleTask | ActiveTask | Step1Task
 class Bench(Study[Place]):
     """The budget of ``base`` is the largest of ``budgets``.
 
-    pools: by (scene, name). chosen: the selections that the cells' views come from.
+    steps: of step 2 for every budget, as near as whole epochs come; None: the preset's epochs. pools: by (scene, name).
+    chosen: the selections that the cells' views come from.
     """
 
     COMMAND, SCHEMA, SINGLE = "bench-select", SCHEMA, True
+    steps: int | None
     pool_names: list[str]
     budgets: list[int]
     policies: list[Contender]
     pools: dict[tuple[str, str], Pool] = field(default_factory=dict, init=False)
     chosen: dict[Place, ChoiceTask] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.steps is not None and self.steps < 1:
+            raise UserError(f"--steps {self.steps}: must be at least 1")
+        if self.steps is not None and self.seconds is not None:
+            raise UserError("--steps and --seconds: choose one of them")
 
     def open_scenes(self) -> None:
         places = [(source, name) for source in self.sources for name in self.pool_names]
@@ -153,11 +162,15 @@ class Bench(Study[Place]):
         chosen: dict[Place, ChoiceTask] = {}
         for pool, budget, contender in itertools.product(self.pools.values(), self.budgets, self.policies):
             place = Place(pool.scene, pool.name, budget, contender.name, seed)
-            settings = settings_of(contender, self._settings(pool), budget)
+            own = self._settings(pool)
+            settings = settings_of(contender, own, budget)
             chosen[place] = task = self._choice_task(pool, contender, settings, seed)
-            if settings.starts_coarse:
-                coarse = isinstance(task, Step1Task)
-                starts[place] = task if coarse else self.step1_task(pool.data, settings, SHARED_COARSE, seed)
+            if own.starts_coarse:
+                if isinstance(task, Step1Task) and settings.model.coarse() == own.model.coarse():
+                    starts[place] = task
+                else:
+                    # Of the largest budget: the coarse model of a rule's cells does not depend on the views it chose.
+                    starts[place] = self.step1_task(pool.data, own, SHARED_COARSE, seed)
         for label, worker, kind in (
             ("selections", "dnrpipe.studies.selectbench.rule_worker", RuleTask),
             ("active selections", "dnrpipe.studies.selectbench.active.active_worker", ActiveTask),
@@ -205,7 +218,7 @@ class Bench(Study[Place]):
             coarse = starts.get(place)
             self.cells[place] = self.cell_task(
                 pool.data,
-                settings,
+                self._for_steps(settings, len(names)),
                 place.seed,
                 {name: traced[name] for name in names},
                 coarse,
@@ -214,6 +227,14 @@ class Bench(Study[Place]):
                 # Where step 2 starts from a coarse model, all policies give step 1 the same share of their time.
                 full_step1=coarse is not None,
             )
+
+    def _for_steps(self, settings: Settings, views: int) -> Settings:
+        """With the epochs of so many views that make ``steps``."""
+        if self.steps is None:
+            return settings
+        changed = settings.model_copy(deep=True)
+        changed.finetune.step2.epochs = max(1, round(self.steps * changed.finetune.step2.batch / views))
+        return changed
 
     def _settings(self, pool: Pool) -> Settings:
         """The run's settings without what the scene's effect plan leaves off."""
@@ -228,6 +249,7 @@ class Bench(Study[Place]):
     def compared(self) -> dict[str, Any]:
         return {
             "candidates": self.base.cameras.train,
+            "step2_steps": self.steps,
             "pools": self.pool_names,
             "budgets": self.budgets,
             "device": self.device,
@@ -261,6 +283,7 @@ class Bench(Study[Place]):
             **asdict(place),
             "key": cell.key,
             **{name: mean_of(cell.tests, name) for name in METRICS},
+            "train_psnr": cell.train_psnr and round(cell.train_psnr, 5),
             "views": choice.views,
             **{name: round(value, 3) for name, value in seconds.items()},
             "total_seconds": round(sum(seconds.values()), 3),

@@ -12,9 +12,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..cells.intervals import LEVEL, Difference, difference
 from ..cells.results import NONE, made_line, read_made, spread, table
-from .figures import LEVEL, SPHERICAL, Difference, Figures
+from .figures import SPHERICAL, Figures
 from .pools import POOLS
+from .views_table import by_views
 
 SCHEMA = 1
 read_results = functools.partial(read_made, command="bench-select", schema=SCHEMA, part="pools")
@@ -31,7 +33,7 @@ def markdown(results: Mapping[str, Any], *, pictures: bool = True) -> str:
     parts.append(_how(figures))
     parts += [_overall(figures, budget) for budget in figures.budgets]
     for pool in figures.pools:
-        parts.append(f"## Pool `{pool}`: {POOLS[pool]}")
+        parts += [f"## Pool `{pool}`: {POOLS[pool]}", by_views(figures, pool)]
         for budget in figures.budgets:
             parts += [_pool(figures, pool, budget), _per_scene(figures, pool, budget)]
     return "\n\n".join(part for part in parts if part) + "\n"
@@ -57,7 +59,11 @@ def together(runs: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _provenance(results: Mapping[str, Any], figures: Figures) -> str:
-    time = f"about {results['seconds']:g} s of training for every cell" if results["seconds"] else "the preset's epochs"
+    time = "the preset's epochs"
+    if results["seconds"]:
+        time = f"about {results['seconds']:g} s of training for every cell"
+    elif results.get("step2_steps"):
+        time = f"{results['step2_steps']} steps of step 2 for every cell"
     return (
         f"{made_line(results)}, {results['candidates']}"
         f" candidates a pool, {len(figures.scenes)} scene(s) ({', '.join(figures.scenes)}), {len(figures.seeds)}"
@@ -75,16 +81,6 @@ def _how(figures: Figures) -> str:
         " is selection, ray tracing of the chosen views with their base images, and training: processor seconds of one"
         " core where the model trains on a CPU."
     )
-
-
-def difference(found: Difference | None) -> str:
-    """``+0.42 [+0.10, +0.74]``, bold where the interval leaves out 0."""
-    if found is None:
-        return NONE
-    if found.half is None:
-        return f"{found.mean:+.2f}"
-    text = f"{found.mean:+.2f} [{found.mean - found.half:+.2f}, {found.mean + found.half:+.2f}]"
-    return f"**{text}**" if found.clear else text
 
 
 def _worst(found: Difference | None) -> str:

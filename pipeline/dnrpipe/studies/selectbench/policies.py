@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from ...core.presets import PAPER
 from ...core.settings import Settings, merge
 from ..cells.request import choose_names
 from ..cells.tasks import StudyTask
@@ -35,8 +36,9 @@ class Contender:
 
 
 def _paper(name: str, what: str, reward: str) -> Contender:
-    what = f"the paper's RL selector, reward: {what}"
-    return Contender(name, what, LEARNED, "step1", changes={"select": {"step1": {"reward": reward}}})
+    """The agent of `core.presets.PAPER`, with the coarse model that it watches; cells train the run's own model."""
+    changes = merge(PAPER, {"select": {"step1": {"reward": reward}}})
+    return Contender(name, f"the paper's RL selector, reward: {what}", LEARNED, "step1", changes)
 
 
 _CONTENDERS = (
