@@ -129,7 +129,12 @@ def write_movie(path: Path, pictures: Sequence[Path], fps: float) -> None:
     pad = ((0, height % 2), (0, width % 2), (0, 0))
     with atomic_path(path) as temporary:
         writer = imageio_ffmpeg.write_frames(
-            str(temporary), even, fps=fps, quality=8, macro_block_size=2, ffmpeg_log_level="error"
+            str(temporary),
+            even,
+            fps=fps,  # pyright: ignore[reportArgumentType]: it is printed with two digits
+            quality=8,
+            macro_block_size=2,
+            ffmpeg_log_level="error",
         )
         writer.send(None)
         for picture in pictures:
