@@ -82,7 +82,8 @@ def shot_cameras(scene: bpy.types.Scene, frames: Sequence[int], name: str | None
     cameras = []
     for frame, camera, seen in _over_frames(scene, frames, lambda frame: chosen or camera_at(scene, frame)):
         if camera is None:
-            raise UserError(f"{_has(scene)}; a shot needs an active one: choose one with --camera")
+            choose = "none of them active: choose one with --camera" if _cameras(scene) else "a shot needs one"
+            raise UserError(f"{_has(scene)}; {choose}")
         if seen is None:
             raise UserError(f"camera '{camera.name}' cannot see at frame {frame}: its lens or scale is 0 or not finite")
         cameras.append(seen)
