@@ -162,7 +162,7 @@ def test_a_scene_is_swept_and_measured_once(
     (tmp_path / "dnrpipe.toml").write_text(
         "cameras = {train = 6, val = 0, test = 2, width = 32, height = 32}\n"
         'passes = {raster = "cycles-direct", coverage_samples = 16, bake_size = 64}\n'
-        "raytrace = {spp = 8, evaluation_spp = 16, max_depth = 3}\n"
+        "raytrace = {spp = 8, evaluation_spp = 16, evaluation_baseline = false, max_depth = 3}\n"
         "base = {light_size = 32, light_spp = 4, samples = 1}\n"
         "model = {texture_size = 32, width = 8, depth = 2}\n"
         'finetune = {step2 = {epochs = 2, start = "fresh"}}\n'

@@ -357,7 +357,7 @@ def test_the_shipped_corrector_is_a_route_where_it_was_judged() -> None:
 SMALL: dict[str, Any] = {
     "cameras": {"train": 8, "val": 0, "test": 2, "width": 48, "height": 48},
     "passes": {"raster": "cycles-direct", "coverage_samples": 16, "bake_size": 64},
-    "raytrace": {"evaluation_spp": 16, "max_depth": 4},
+    "raytrace": {"evaluation_spp": 16, "evaluation_baseline": False, "max_depth": 4},
     "base": {"light_size": 32, "light_spp": 8, "samples": 1},
     "model": {"texture_size": 32, "width": 8, "depth": 2},
     "finetune.step2": {"start": "fresh"},

@@ -207,7 +207,13 @@ def test_a_target_of_tracing_changes_no_fingerprint_where_there_is_none() -> Non
 
     plain = tracing()
     assert plain[0] == {"spp": 128, "max_depth": "auto", "denoise": True, "seed": 0}
-    assert plain[1] == {"evaluation_spp": 512, "max_depth": "auto", "evaluation_denoise": True, "seed": 0}
+    assert plain[1] == {
+        "evaluation_spp": 512,
+        "max_depth": "auto",
+        "evaluation_denoise": True,
+        "evaluation_baseline": True,
+        "seed": 0,
+    }
     assert tracing(max_spp=100) == plain
     assert tracing(noise=0.01) == tracing(noise=0.01, spp=7)
     assert tracing(noise=0.01)[0] != tracing(noise=0.02)[0]

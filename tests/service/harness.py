@@ -22,6 +22,7 @@ TINY: dict[str, bool | int | float | str] = {
     "select.policy": "farthest",
     "raytrace.spp": 8,
     "raytrace.evaluation_spp": 8,
+    "raytrace.evaluation_baseline": False,
     "base.light_size": 64,
     "base.light_spp": 4,
     "base.samples": 2,
