@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import time
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +44,11 @@ def test_held_out_quality(demo: Path) -> None:
     print({key: round(value, 4) for key, value in mean.items() if value is not None})
     assert mean["psnr"] >= (32.0 if whole else 30.5)
     assert mean["ssim"] >= (0.965 if whole else 0.96)
+    rungs = metrics["baseline"]  # path tracing with a denoiser: more samples are better, and take longer
+    assert [rung["spp"] for rung in rungs] == [1, 4, 16, 64]
+    for less, more in pairwise(rungs):
+        assert more["psnr"] > less["psnr"]
+    assert rungs[-1]["seconds"] > 2 * rungs[0]["seconds"]
     # A picture of the scene, not of a mean colour: it beats the best constant inside the mask by far.
     for view in metrics["views"]:
         truth = image(demo / "evaluation" / f"{view['name']}.truth.png")
@@ -66,6 +72,7 @@ def test_the_report_draws_in_a_browser(demo: Path, tmp_path: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert "http://" not in text.replace("http://www.w3.org", "")
     assert "https://" not in text
+    assert "Path tracing with a denoiser" in text
     with open_page(page.as_uri(), width=1200, height=1600) as (drawn, _):
         drawn.screenshot(path=tmp_path / "report.png")
         dom = drawn.content()
