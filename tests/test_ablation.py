@@ -18,7 +18,7 @@ from tools import paper_tables, result_tables
 
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.presets import PAPER, SIZES
-from dnrpipe.core.settings import Settings, parse_assignment, resolve
+from dnrpipe.core.settings import Settings, resolve
 from dnrpipe.studies.ablation.ablation_tables import PUBLISHED, Figures, markdown, ratio
 from dnrpipe.studies.ablation.rows import GROUPS, ROWS, choose_rows, needs_coarse, settings_of
 from dnrpipe.studies.cells.results import spread
@@ -107,7 +107,7 @@ def test_the_commands_of_the_papers_tables_ask_for_what_there_is(name: str) -> N
     command, *words = paper_tables.TABLES[name].command
     options = dict(zip(words[::2], words[1::2], strict=True))
     assert [path.stem for path in find_scenes(options["--scenes"])] and int(options["--seeds"]) >= 3
-    base = resolve(options["--preset"], parse_assignment(options["--set"]), environment={})
+    base = resolve(options["--preset"], {}, environment={})
     assert (base.cameras.train, base.select.most, base.cameras.width) == (100, 25, 128)
     if command == "ablate":
         rows = {row.name for row in choose_rows(options["--rows"])}

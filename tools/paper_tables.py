@@ -21,12 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
-COMMON = (
-    *("--preset", "paper-128", "--scenes", "furniture,bricks,microphone", "--seeds", "3"),
-    *("--set", "passes.raster=cycles-direct"),
-)
-"""The scenes whose views take least to trace; all take as long to train on. One rasteriser everywhere: `auto` would
-choose by a timing."""
+COMMON = ("--preset", "paper-128", "--scenes", "furniture,bricks,microphone", "--seeds", "3")
+"""The scenes whose views take least to trace; all take as long to train on."""
 
 
 @dataclass(frozen=True)
