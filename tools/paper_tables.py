@@ -5,9 +5,10 @@
     python -m tools.paper_tables c      # figures 7a, 7b and 7c
 
 Each is one run of `dnrpipe ablate` or `dnrpipe bench-select` that goes on where it stopped; its results are copied to
-docs/results/, also after Ctrl-C. What stands after `--` goes to that command, before what stands here:
+docs/results/, also after Ctrl-C. What stands after `--` goes to that command and wins:
 
     python -m tools.paper_tables a -- --seeds 1 --scenes furniture
+    python -m tools.paper_tables a --size 256 --results paper-steps-256.json      # on a GPU
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from pathlib import Path
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
 COMMON = ("--preset", "paper-128", "--scenes", "furniture,bricks,microphone", "--seeds", "3")
-"""The scenes whose views take least to trace; all take the same to train on."""
+"""The scenes whose views take least to trace; all take as long to train on."""
 
 
 @dataclass(frozen=True)
@@ -52,19 +53,28 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("table", choices=TABLES)
     parser.add_argument("--out", type=Path, default=Path("paper-tables"), help="where the runs keep their cells")
-    parser.add_argument("more", nargs="*", help="further options of the command")
-    given = parser.parse_args()
+    parser.add_argument("--size", type=int, help="side of the pictures, and of the neural texture (128)")
+    parser.add_argument("--results", help="file name in docs/results/, instead of the table's own")
+    own, more = sys.argv[1:], []
+    if "--" in own:
+        own, more = own[: own.index("--")], own[own.index("--") + 1 :]
+    given = parser.parse_args(own)
     table = TABLES[given.table]
-    out = given.out / table.folder
+    out, size = given.out / table.folder, []
+    if given.size is not None:
+        out = out.with_name(f"{table.folder}-{given.size}")
+        for key in ("cameras.width", "cameras.height", "model.texture_size"):
+            size += ["--set", f"{key}={given.size}"]
+    target = RESULTS / (given.results or table.results)
     try:
-        command = [sys.executable, "-m", "dnrpipe.cli", *table.command, *given.more, "--out", str(out)]
+        command = [sys.executable, "-m", "dnrpipe.cli", *table.command, *size, *more, "--out", str(out)]
         return subprocess.run(command, check=False).returncode
     finally:
         made = out / "results.json"
         if made.exists():
             RESULTS.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(made, RESULTS / table.results)
-            print(f"copied to {RESULTS / table.results}")
+            shutil.copyfile(made, target)
+            print(f"copied to {target}")
 
 
 if __name__ == "__main__":

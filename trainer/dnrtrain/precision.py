@@ -18,7 +18,7 @@ def decide_bfloat16(setting: str, device: str) -> bool:
     if setting != "auto":
         return setting == "bfloat16"
     if device.startswith("cuda"):
-        return torch.cuda.is_bf16_supported()
+        return torch.cuda.is_bf16_supported(including_emulation=False)
     capabilities = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
     return bool(capabilities.get("amx_bf16") or capabilities.get("avx512_bf16"))
 

@@ -43,7 +43,8 @@ def point_of(swept: Ablation, scene: Scene, row: Row, seed: int, base_ms: float 
         candidates = {f"train/{name}" for name in scene.train}
         parts["passes"] = total(r for r in work["passes"] if r.name in candidates).cpu_seconds / cores
         parts["tracing"] = sum(written_seconds(workspace.raytraced(split, name)) for name in cell.views) / cores
-        parts["training"] = training.cpu_seconds / cell.threads
+        on_gpu = cell.device.startswith("cuda")  # the processor's seconds do not say what a GPU took
+        parts["training"] = training.seconds if on_gpu else training.cpu_seconds / cell.threads
         files = base_files(workspace, cell.base, "train", cell.views)
         parts["base images"] = sum(map(written_seconds, files)) / cores
     if cell.base == "baked":
