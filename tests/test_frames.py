@@ -99,6 +99,27 @@ note(worst=worst, level=kept[..., :3].mean(), recorded=frames._kernels["_path_ke
     assert found["other"] > 0
 
 
+def test_many_samples_in_several_launches_are_as_little_noisy(tmp_path: Path) -> None:
+    """64 samples in four launches: other random numbers in each, and the noise of 64, which is half that of 16."""
+    found = _run(
+        tmp_path,
+        LAMP % (0, 0, 2),
+        """
+from dnrpipe.raytrace import frames as module
+exact, _ = engine.frame(folder / "scene.xml", integrator, engine.sensor(views[0]), views[0], 1024, 0)
+def off(frames, spp):
+    return np.abs(frames.path(views[0], spp, 5) - exact).mean()
+note(whole=off(frames, 64), few=off(frames, 16))
+module.MAX_RAYS = 16 * exact[..., 0].size
+other = Frames(engine, folder / "scene.xml", "path", 5, frames.size)
+note(parts=off(other, 64))
+""",
+        views=1,
+    )
+    assert found["parts"] == pytest.approx(found["whole"], rel=0.15)
+    assert found["few"] > 1.6 * found["parts"]
+
+
 def test_auxiliary_images_show_the_surface_and_not_the_lamp_before_it(tmp_path: Path) -> None:
     position = _views(1)[0].position * 0.6  # in front of the camera
     found = _run(
@@ -197,7 +218,7 @@ def test_silhouettes_in_several_launches_are_the_same(tmp_path: Path) -> None:
 from dnrpipe.raytrace import frames as module
 mask = frames.gbuffer(views[0])["mask"] > 0
 whole = frames.coverage(views[0], mask)
-module.MAX_EDGE_RAYS = 16 * 7
+module.MAX_RAYS = 16 * 7
 parts = frames.coverage(views[0], mask)
 note(same=(whole == parts).all(), partial=((whole > 0) & (whole < 1)).sum())
 """,
@@ -216,7 +237,7 @@ def test_cutouts_in_several_launches_cover_as_much(tmp_path: Path) -> None:
 from dnrpipe.raytrace import frames as module
 mask = frames.gbuffer(views[0])["mask"] > 0
 whole = frames.coverage(views[0], mask)
-module.MAX_EDGE_RAYS = 4 * whole.size
+module.MAX_RAYS = 4 * whole.size
 other = Frames(engine, folder / "scene.xml", "path", 5, frames.size)
 parts = other.coverage(views[0], mask)
 again = other.coverage(views[0], mask)

@@ -29,8 +29,8 @@ from .recorded import Recorded, prepare_emitters
 from .sensors import opaque_camera
 from .sequence import GOLDEN, ORDER, TILE, fraction
 
-MAX_RAYS = 1 << 24
-"""Of a launch: bounds its memory (about 4 GiB). Larger pictures are rendered in bands of rows."""
+MAX_RAYS = 1 << 22
+"""Of a launch: bounds its memory (about 1 GiB). Larger pictures are rendered in bands of rows."""
 MEANS = (
     *("base.R", "base.G", "base.B", "base.A", "diffuse.R", "diffuse.G", "diffuse.B"),
     *("albedo.R", "albedo.G", "albedo.B"),
@@ -93,18 +93,18 @@ class BaseRenderer:
         rays = dr.opaque(mi.UInt32, self.samples)  # as data: the kernel is the same for all numbers of them
         turn = dr.opaque(mi.UInt32, number % FRAMES)
         names = (LOST, *MEANS, *CENTRES, NOISE)
-        rows = max(1, min(view.height, MAX_RAYS // (view.width * self.samples)))
-        bands: list[list[np.ndarray]] = []
-        for first in range(0, view.height, rows):
-            start, count = dr.opaque(mi.UInt32, first), min(rows, view.height - first)
-            values = self.kernel(self.scene, self.light, self.tables, axes, film, rays, turn, start, view.width, count)
-            dr.eval(values)
-            bands.append([np.array(value) for value in values])
         shape = (view.height, view.width)
-        channels = {
-            name: (parts[0] if len(parts) == 1 else np.concatenate(parts)).reshape(shape)
-            for name, parts in zip(names, zip(*bands, strict=True), strict=True)
-        }
+        bands = -(-view.height // max(1, MAX_RAYS // (view.width * self.samples)))
+        rows = -(-view.height // bands)
+        channels = {name: np.empty(shape, np.float32) for name in names}
+        for first in range(0, view.height, rows):
+            # All bands have the same height, for which the kernel is recorded: the last one ends with the picture.
+            first = min(first, view.height - rows)
+            start = dr.opaque(mi.UInt32, first)
+            values = self.kernel(self.scene, self.light, self.tables, axes, film, rays, turn, start, view.width, rows)
+            dr.eval(values)
+            for plane, value in zip(channels.values(), values, strict=True):
+                plane[first : first + rows] = np.array(value).reshape(rows, view.width)
         self.repaired = int(np.count_nonzero(channels.pop(LOST)))
         channels, self.masked = masked_channels(channels)
         for name in (*GBUFFER, *CHAIN):

@@ -29,8 +29,8 @@ from .sensors import scaled_view
 from .texels import ATTRIBUTE
 from .visibility import first_visible_of
 
-MAX_EDGE_RAYS = 1 << 24
-"""Of a launch that looks at silhouettes: bounds its memory."""
+MAX_RAYS = 1 << 24
+"""Of a launch: bounds its memory (2 GiB). What needs more is the mean of several launches."""
 WARM_FRAMES = 3
 """Calls until nothing is recorded any more: the first ones teach Dr.Jit which inputs change."""
 
@@ -72,11 +72,11 @@ class Frames:
 
     def path(self, view: View, spp: int, seed: int) -> np.ndarray:
         """Path-traced RGBA, linear Rec.709, premultiplied, box filter, float32 [H, W, 4]; NaN where Mitsuba gave it."""
-        return self._image(self._kernel(self._path_kernel, view, spp)(*self._inputs(view, seed, spp)))
+        return self._mean(self._path_kernel, view, spp, seed)
 
     def auxiliary(self, view: View, rays: int, seed: int) -> Auxiliary:
         """Means over ``rays`` primary rays a pixel; a square number of them is stratified, one per cell."""
-        image = self._image(self._kernel(self._auxiliary_kernel, view, rays)(*self._inputs(view, seed, rays)))
+        image = self._mean(self._auxiliary_kernel, view, rays, seed)
         return Auxiliary(image[..., :3], image[..., 3:6], image[..., 6])
 
     def gbuffer(self, view: View, rays: int = 16) -> dict[str, np.ndarray]:
@@ -84,7 +84,7 @@ class Frames:
 
         coverage: as of `coverage`. The rest is of the ray through the pixel's centre.
         """
-        image = self._image(self._kernel(self._centre_kernel, view, 1)(*self._inputs(view, 0, 1)))
+        image = self._mean(self._centre_kernel, view, 1, 0)
         axis = view.matrix[:3, 2]
         position, mask = image[..., 6:9] / self.engine.unit_scale, image[..., 9] > 0
         names = (
@@ -105,7 +105,7 @@ class Frames:
         neighbour are looked at (a tenth, as a rule); where surfaces let light straight through, all are, at random.
         """
         if self.passing:
-            return self._cover_everywhere(view, rays)
+            return self._mean(self._cover_kernel, view, rays, 0)[..., 0]
         if rays not in self._cover:
             self._cover[rays] = self._edge_kernel(rays)
         kernel = self._cover[rays]
@@ -114,7 +114,7 @@ class Frames:
         if len(edges):
             import drjit as dr
 
-            camera, most = self._inputs(view, 0, rays)[0], max(1, MAX_EDGE_RAYS // rays)
+            camera, most = self._inputs(view, 0, rays)[0], max(1, MAX_RAYS // rays)
             for part in np.split(edges, range(most, len(edges), most)):
                 # Memory of Dr.Jit's own: where numpy's is aligned otherwise, the kernel would be recorded once more.
                 lanes = self.mi.UInt32(part.astype(np.uint32).repeat(rays)) + dr.opaque(self.mi.UInt32, 0)
@@ -125,25 +125,6 @@ class Frames:
                 (hits,) = kernel(camera, lanes, places)
                 result.ravel()[part] = np.array(hits).reshape(-1, rays).mean(axis=1)
         return result
-
-    def _cover_everywhere(self, view: View, rays: int) -> np.ndarray:
-        """`coverage` where surfaces let light through; large pictures in launches of some of the cells."""
-        import drjit as dr
-
-        each = rays
-        while each % 2 == 0 and each * view.width * view.height > MAX_EDGE_RAYS:
-            each //= 2
-        if rays not in self._cover:
-            kernel = self._cover_kernel(rays, each)
-            start = dr.opaque(self.mi.UInt32, 0)
-            self._warmed(lambda *inputs: kernel(*inputs, start), view, each)
-            self._cover[rays] = kernel
-        parts = [
-            self._image(self._cover[rays](*self._inputs(view, launch, each), dr.opaque(self.mi.UInt32, launch * each)))
-            for launch in range(rays // each)
-        ]
-        image = parts[0] if len(parts) == 1 else np.stack(parts).mean(axis=0, dtype=np.float32)
-        return image[..., 0]
 
     def _edge_kernel(self, count: int) -> Any:
         import drjit as dr
@@ -161,16 +142,16 @@ class Frames:
 
         return kernel
 
-    def _centre_kernel(self, count: int) -> Any:
+    def _centre_kernel(self, count: int, each: int) -> Any:
         import drjit as dr
 
         mi, scene, seen = self.mi, self.scene, seen_first(self.mi, self.scene)
         rays, prototype = self._rays, self.mi.load_dict({"type": "independent"})
 
         @Recorded
-        def kernel(camera: list[Any], seed: Any, samples: Any) -> list[Any]:
+        def kernel(camera: list[Any], seed: Any, samples: Any, start: Any) -> list[Any]:
             sampler = prototype.fork()
-            ray = rays(sampler, camera, seed, samples, count, 0)
+            ray = rays(sampler, camera, seed, samples, each, 0, start)
             hit = seen(scene, ray, sampler)
             found = hit.is_valid()
             place = hit.shape.eval_attribute_3(ATTRIBUTE, hit, found & hit.shape.has_attribute(ATTRIBUTE, found))
@@ -184,7 +165,6 @@ class Frames:
         return kernel
 
     def _cover_kernel(self, count: int, each: int) -> Any:
-        """``each`` of ``count`` rays a pixel, from the given one on."""
         import drjit as dr
 
         mi, scene, seen = self.mi, self.scene, seen_first(self.mi, self.scene)
@@ -199,22 +179,22 @@ class Frames:
 
         return kernel
 
-    def _path_kernel(self, spp: int) -> Any:
+    def _path_kernel(self, count: int, each: int) -> Any:
         import drjit as dr
 
         mi, scene, integrator = self.mi, self.scene, self.integrator
         rays, means, prototype = self._rays, self._means, mi.load_dict({"type": "independent"})
 
-        def kernel(camera: list[Any], seed: Any, samples: Any) -> list[Any]:
+        def kernel(camera: list[Any], seed: Any, samples: Any, start: Any) -> list[Any]:
             sampler = prototype.fork()
-            ray = rays(sampler, camera, seed, samples, spp, cells=1)
+            ray = rays(sampler, camera, seed, samples, each, 1, start)
             colour, valid, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(ray), None, mi.Bool(True))
             colour = mi.Color3f(colour)
-            return means([colour.x, colour.y, colour.z, dr.select(valid, mi.Float(1), mi.Float(0))], spp)
+            return means([colour.x, colour.y, colour.z, dr.select(valid, mi.Float(1), mi.Float(0))], each)
 
         return Recorded(kernel, scene)
 
-    def _auxiliary_kernel(self, count: int) -> Any:
+    def _auxiliary_kernel(self, count: int, each: int) -> Any:
         import drjit as dr
 
         mi, scene = self.mi, self.scene
@@ -222,16 +202,16 @@ class Frames:
         shown, cells = shown_first(self.mi, self.scene), math.isqrt(count) if math.isqrt(count) ** 2 == count else 1
 
         @Recorded
-        def kernel(camera: list[Any], seed: Any, samples: Any) -> list[Any]:
+        def kernel(camera: list[Any], seed: Any, samples: Any, start: Any) -> list[Any]:
             sampler = prototype.fork()
-            ray = rays(sampler, camera, seed, samples, count, cells)
+            ray = rays(sampler, camera, seed, samples, each, cells, start)
             albedo, normal, met = shown(scene, ray, sampler, mi.Bool(True))
-            return means([*albedo, *normal, dr.select(met, mi.Float(1), mi.Float(0))], count)
+            return means([*albedo, *normal, dr.select(met, mi.Float(1), mi.Float(0))], each)
 
         return kernel
 
     def _rays(
-        self, sampler: Any, camera: list[Any], seed: Any, samples: Any, count: int, cells: int, start: Any = 0
+        self, sampler: Any, camera: list[Any], seed: Any, samples: Any, count: int, cells: int, start: Any
     ) -> Any:
         """Rays through random points of the pixels, one in each of ``cells``² cells; 0 cells: through the centres.
 
@@ -271,18 +251,35 @@ class Frames:
         camera = [dr.opaque(mi.Float, float(number)) for number in numbers]
         return camera, dr.opaque(mi.UInt32, seed), dr.opaque(mi.UInt32, samples)
 
-    def _kernel(self, make: Callable[[int], Any], view: View, rays: int) -> Any:
-        """The kernel that ``make`` makes for so many rays a pixel: made once, and warm."""
-        key = make.__name__, rays
+    def _mean(self, make: Callable[[int, int], Any], view: View, rays: int, seed: int) -> np.ndarray:
+        """What the kernel of ``make(rays, rays of a launch)`` gives, float32 [H, W, C]: the mean of its launches.
+
+        The kernel is made once, and warm. Of several launches each has a seed of its own.
+        """
+        import drjit as dr
+
+        launches = next(n for n in range(1, rays + 1) if rays % n == 0 and (n == rays or self._fits(rays // n)))
+        each, key = rays // launches, (make.__name__, rays)
         if key not in self._kernels:
-            self._kernels[key] = self._warmed(make(rays), view, rays)
-        return self._kernels[key]
+            self._kernels[key] = self._warmed(make(rays, each), view, each)
+        total: Any = 0
+        for launch in range(launches):
+            start = dr.opaque(self.mi.UInt32, launch * each)
+            inputs = self._inputs(view, seed * launches + launch, each)
+            total = total + self._image(self._kernels[key](*inputs, start)) / np.float32(launches)
+        return total
+
+    def _fits(self, rays: int) -> bool:
+        """Whether so many rays a pixel are no more than MAX_RAYS."""
+        return rays * self.size[0] * self.size[1] <= MAX_RAYS
 
     def _warmed(self, kernel: Any, view: View, samples: int) -> Any:
         """``kernel`` after frames of several cameras and seeds: each input that changes is then known to."""
+        import drjit as dr
+
         for turn in range(WARM_FRAMES):
             nearer = view.model_copy(update={"fl_x": view.fl_x * (1 + 0.01 * turn), "cx": view.cx + 0.1 * turn})
-            self._image(kernel(*self._inputs(nearer, turn, samples)))
+            self._image(kernel(*self._inputs(nearer, turn, samples), dr.opaque(self.mi.UInt32, turn)))
         return kernel
 
     def _image(self, values: list[Any]) -> np.ndarray:
