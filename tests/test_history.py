@@ -160,13 +160,34 @@ def test_light_that_went_away_does_not_stay() -> None:
     assert np.abs(rgb(taken) - rgb(dark)).max() < 1.0
 
 
-def test_a_curved_mirror_begins_anew() -> None:
-    """Where V was, the mirror showed something else: the path through there ended elsewhere."""
+def bent(number: int, *, noise: float) -> dict[str, np.ndarray]:
+    """A frame of a mirror whose paths end elsewhere than in the frame before, as a bent line of sight may."""
+    channels = frame(camera(0.02 * number), mirror=2.0, noise=noise, seed=number)
+    return {**channels, "chain.X": channels["chain.X"] + number}
+
+
+def test_a_mirror_that_shows_something_else_begins_anew() -> None:
     history = History(mi)
     for number in range(4):
-        view = camera(0.02 * number)
-        channels = frame(view, mirror=2.0, noise=0.1, seed=number)
-        channels["chain.X"] = channels["chain.X"] + number  # as far as a bent line of sight may go in a frame
-        taken = history.take(view, channels)
+        channels = bent(number, noise=0.1)
+        taken = history.take(camera(0.02 * number), channels)
     assert (taken["rays"] == 2).all()
     np.testing.assert_allclose(rgb(taken), rgb(channels), atol=1e-6)
+
+
+def test_a_curved_mirror_is_held_to_its_surface_for_a_few_rays() -> None:
+    """And within what is seen now: light from far outside the neighbourhood does not stay."""
+    history = History(mi)
+    rows, columns = np.mgrid[:SIDE, :SIDE]
+    tilt = 0.05 * np.stack([columns % 2, rows % 2])
+    for number in range(4):
+        channels = bent(number, noise=0.1)
+        channels["normal.X"], channels["normal.Y"] = tilt.astype(np.float32)
+        channels["normal.Z"] = np.sqrt(1 - (tilt**2).sum(axis=0)).astype(np.float32)
+        if number == 2:
+            for c in "RGB":
+                channels[f"base.{c}"] = channels[f"base.{c}"] + 5
+        taken = history.take(camera(0.02 * number), channels)
+    inner = (slice(8, -8),) * 2
+    assert np.median(taken["rays"][inner]) == 4, "two remembered, two of the frame"
+    assert np.abs(rgb(taken) - rgb(channels))[inner].max() < 0.5

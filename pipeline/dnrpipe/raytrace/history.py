@@ -10,10 +10,11 @@ Notation
 
     D_t = lerp(D_t-1 where P was, D of frame t, K / R)        S_t likewise, where V was
 
-D looks the same from everywhere: it is followed by P. What a mirror or clear glass shows moves with V, unless it is
-curved and bends the lines of sight: then the path through the place where V was ended elsewhere, and S begins anew.
-Other S follows P, for a few frames and within what the frame's own neighbourhood shows, so that light which moved does
-not stay behind (variance clipping; Salvi 2016). Where nothing is found, a pixel begins anew.
+D looks the same from everywhere: it is followed by P. What a flat mirror or pane shows moves with V; where the path
+through the place where V was ended elsewhere, S begins anew. A curved one bends the lines of sight: what it shows stays
+closer to P than to V (measured). That and other S follow P, for a few frames and within what the frame's own
+neighbourhood shows, so that light which moved does not stay behind (variance clipping; Salvi 2016). Where nothing is
+found, a pixel begins anew.
 
 Places are looked up by Catmull-Rom splines, which keep what is sharp; at rims of surfaces by those corners that lie on
 the same one.
@@ -42,6 +43,8 @@ PLANE = 0.01
 """Distance from P's tangent plane over distance to the camera up to which a point lies on the same surface."""
 TURNED = 0.8
 """Least cosine between its normal and P's."""
+FLAT = 0.9998
+"""Least cosine between normals of neighbouring pixels of a flat mirror: about a degree."""
 DISPLACED = 4.0
 """Pixels, as large as they are at the end of a path, up to which two ends show the same."""
 SPREAD, REACH = 1.5, 2
@@ -141,12 +144,14 @@ class History:
 @dataclass(frozen=True)
 class _Seen:
     """What a frame sees, an array element per pixel: n, P, what is at the centre, whether the neighbours lie on P's
-    surface; V, the end of the path and its length behind P; distance of P and the camera's place."""
+    surface, whether they face as it does; V, the end of the path and its length behind P; distance of P from
+    the camera."""
 
     normal: Any
     point: Any
     kind: Any
     flat: Any
+    even: Any
     virtual: Any
     end: Any
     length: Any
@@ -184,7 +189,7 @@ def _moved(mi: Any, picture: _Picture, earlier: Any, memory: list[Any], seen: _S
     """Looked up where P and V were. specular: S of the frame."""
     import drjit as dr
 
-    mask, narrow = seen.kind == SURFACE, seen.length > 0
+    mask, narrow = seen.kind == SURFACE, (seen.length > 0) & seen.even
     near = DISPLACED * (seen.distance + seen.length) / earlier[1][0]
 
     # ------------------------- Where P was ----------------------------
@@ -283,8 +288,8 @@ class _Picture:
         distance, sight = depth * dr.norm(sight), dr.normalize(sight)
         length, end = planes[17], mi.Point3f(*planes[18:21])
         point, virtual = (mi.Point3f(origin + sight * far) for far in (distance, distance + length))
-        flat = self.is_flat(point, normal, distance, mask)
-        return _Seen(normal, point, kind, flat, virtual, end, length, distance)
+        flat, even = self.is_flat(point, normal, distance, mask), self.is_even(normal)
+        return _Seen(normal, point, kind, flat, even, virtual, end, length, distance)
 
     def is_flat(self, point: Any, normal: Any, distance: Any, mask: Any) -> Any:
         """Whether the four neighbours lie on the pixel's surface."""
@@ -297,6 +302,15 @@ class _Picture:
             beside = dr.gather(mi.Point3f, point, index)
             flat &= dr.gather(mi.Bool, mask, index) & (dr.abs(dr.dot(beside - point, normal)) < PLANE * distance)
         return flat
+
+    def is_even(self, normal: Any) -> Any:
+        """Whether the normals of the four neighbours agree with the pixel's."""
+        import drjit as dr
+
+        even = self.mi.Bool(True)
+        for right, below in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+            even &= dr.dot(dr.gather(self.mi.Normal3f, normal, self.index(right, below)), normal) > FLAT
+        return even
 
     def bounds(self, colour: Any) -> tuple[Any, Any]:
         """(lower, upper) bound of what the neighbourhood shows: mean and standard deviation of nine pixels."""
