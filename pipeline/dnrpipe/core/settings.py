@@ -105,11 +105,16 @@ class RaytraceSettings(Strict):
 class BaseSettings(Strict):
     """The image that the network corrects, where `model.base` is rendered (baked, direct, path)."""
 
+    light: Literal["traced", "gathered"] = Field(
+        default="traced",
+        description="how light is baked: by paths, or by rays that end at a coarse map after one bounce; quicker",
+    )
     light_size: Annotated[int, Field(ge=16, le=16384)] | Literal["auto"] = Field(
         default="auto", description="texels of the baked light's side; auto: about one a pixel"
     )
     light_spp: Annotated[int, Field(ge=1, le=1_000_000)] | Literal["auto"] = Field(
-        default="auto", description="paths per texel of the baked light; auto: 64 up to 512 texels a side, then fewer"
+        default="auto",
+        description="paths or rays per texel of the baked light; auto: 64 up to 512 texels a side, then fewer",
     )
     samples: int = Field(default=8, ge=1, le=64, description="rays per pixel of a base image")
     denoise: bool = Field(
@@ -265,6 +270,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "standard": {
         "cameras": {"train": 100, "val": 10, "test": 50, "width": 384, "height": 384},
+        "base": {"light": "gathered"},
         "raytrace": {"spp": 256, "evaluation_spp": 512, "denoise": True, "evaluation_denoise": True},
         "model": {**DNR, "texture_size": 256, "width": 24, "depth": 3},
         "select": {"step1": {"epochs": 30, "texture_rate_scale": 10.0}},

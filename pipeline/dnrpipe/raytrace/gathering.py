@@ -1,124 +1,141 @@
-"""Final gathering: what a ray from a diffuse surface meets, by a light map instead of a path.
+"""Final gathering: light maps whose rays end after one bounce, at a coarser light map.
 
-A coarse light map, path-traced and denoised, answers each ray of the fine one after a single bounce (Reichert, "A
-Two-Pass Radiosity Method Driven by Lights and Viewer Position", 1992; Jensen, "Realistic Image Synthesis Using Photon
-Mapping", 2001, section 9.3.4): shorter paths, and much less noise. Mirrors, glass and glossy lobes on the way are
-followed as a view follows them (`specular_paths`), which is how caustics come in.
+Notation
+    E_0, S_0   a coarse light map, path-traced and denoised (see `lightmap`)
+    D          what of E comes from emitters
+    I          the rest: what cosine-distributed rays from the texel meet, each answered by E_0 and S_0
+    E          D + I, each with samples of its own and denoised by itself;   S = S_0, enlarged: it is smooth
 
-The map's errors are blurred by the bounce: its texels may be large. What a view's base image leaves out of the scene is
-left out of gathered light as well: lobes of BSDFs that do not split count as diffuse. Media scatter what it does not
-know of: scenes that have any are path-traced.
+One bounce is shorter than a path, and a map that is denoised already answers with far less noise (Reichert, "A Two-Pass
+Radiosity Method Driven by Lights and Viewer Position", 1992; Jensen, "Realistic Image Synthesis Using Photon Mapping",
+2001, section 9.3.4). What is wrong with the coarse map, the bounce blurs. Mirrors, glass and glossy lobes that a ray
+meets first are followed as a view follows them (`specular_paths`), so caustics are in; faint ones end by chance.
+
+The samples of a texel are spread: their pairs of numbers for place, emitter and direction come from shifted R2
+sequences (Roberts 2018), the shifts being each texel's own.
+
+BSDFs that do not split into lobes count as diffuse where rays meet them, as in base images. What media scatter the map
+does not know: scenes that have any are path-traced (`can_gather`).
 """
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from .lightmap import LEAST_RHO, LightBaker
 from .lobes import media_of
-from .sequence import GOLDEN
+from .sequence import GOLDEN, fraction
 
-COARSE, HALF = 8, 2
-BOUNCES = 6
+COARSE, COARSE_PATHS = 256, 1 << 22
+"""Least side of the coarse map, and its paths: 64 per texel of that side."""
+FINER = 8
+"""Sides of the light map per side of the coarse one, at most."""
+DIRECT = 2
+"""Samples of emitters per gathered ray: one costs a quarter of it, and half the noise is theirs."""
+
 
 def can_gather(scene: Any) -> bool:
     """Whether a light map says what a ray of the scene meets."""
     return not media_of(scene)
 
 
+class GatheringBaker(LightBaker):
+    """Bakes E and S of one scene by final gathering.
+
+    Args:
+        integrator: of the coarse map, as `LightBaker`'s, but one bounce less: gathering adds it.
+        caustics: False: light that comes from mirror-like lobes is left out.
+    """
+
+    def __init__(
+        self, mi: Any, scene: Any, integrator: Any, groups: Sequence[tuple[Path, np.ndarray]] = (), *, caustics: bool
+    ) -> None:
+        super().__init__(mi, scene, integrator, groups)
+        self.caustics, self.gathers = caustics, False
+
+    def bake(self, size: int, spp: int, seed: int) -> np.ndarray:
+        """As `LightBaker.bake`. spp: gathered rays per texel."""
+        side = min(size, max(COARSE, size // FINER))
+        coarse = super().bake(side, max(1, COARSE_PATHS // side**2), 2 * seed)
+        traced, lost = self.integrator, self.lost
+        self.integrator, self.gathers = Gathered(self.mi, self.scene, coarse, caustics=self.caustics), True
+        try:
+            emitters = functools.partial(self._light, indirect=False)
+            surfaces = functools.partial(self._light, direct=False)
+            light = self._map(surfaces, size, spp, 8 * seed + 4, LEAST_RHO)
+            light += self._map(emitters, size, DIRECT * spp, 8 * seed + 6, LEAST_RHO)
+        finally:
+            self.integrator, self.gathers = traced, False
+        self.lost += lost
+        return np.stack([light, [enlarged(image, size) for image in coarse[1]]])
+
+    def _numbers(self, sampler: Any, texel: Any, index: Any, count: int, seed: Any) -> Any:
+        return SpreadNumbers(self.mi, sampler, texel, index, count, seed) if self.gathers else sampler
+
+
 class Gathered:
-    """Stands for the integrator of a `LightBaker`.
+    """Stands for the integrator of a `LightBaker` whose numbers are `SpreadNumbers`.
 
     Args:
         light: E and S of the front and of the back, float32 [2, 2, size, size, 3], row 0 at V = 0.
-        caustics: False: light that came by mirror-like lobes after a diffuse one is left out.
+        caustics: False: rays end at mirror-like lobes.
     """
 
     def __init__(self, mi: Any, scene: Any, light: np.ndarray, *, caustics: bool) -> None:
         from .specular_paths import SpecularPaths, light_textures  # imports Mitsuba
 
-        self.mi = mi
-        self.light = light_textures(light)
+        self.mi, self.light = mi, light_textures(light)
         self.paths = SpecularPaths(scene, camera=False, caustics=caustics)
 
-    def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any, active: Any) -> tuple[Any, Any, list[Any]]:
-        """As `mi.SamplingIntegrator.sample`, emitters hidden; ``medium``: None."""
+    def sample(self, scene: Any, numbers: Any, ray: Any, medium: Any, active: Any) -> tuple[Any, Any, list[Any]]:
+        """As `mi.SamplingIntegrator.sample` with emitters hidden. medium: None."""
         import drjit as dr
 
         mi = self.mi
-        number = dr.select(active, mi.Float(0), -1)
-        forward, order = mi.Vector3f(ray.d), sampler.next_1d()
+        forward, number, order = mi.Vector3f(ray.d), dr.select(active, mi.Float(0), -1), mi.Float(0)
         values = self.paths.trace(
-            scene, self.light, self.paths.steps, mi.Ray3f(ray), forward, number, order, getattr(sampler, 'inner', sampler)
+            scene, self.light, self.paths.steps, mi.Ray3f(ray), forward, number, order, numbers.sampler
         )
         return mi.Spectrum(*values[1:4]), active, []
 
 
-class GatheringBaker(LightBaker):
-    def __init__(self, mi, scene, groups=(), caustics=True):
-        super().__init__(mi, scene, None, groups)
-        self.caustics = caustics
-        self.spread = True
+class SpreadNumbers:
+    """Random numbers of a texel's samples; pairs are spread over the square.
 
-    def bake(self, size, spp, seed, gather=8, bounces=BOUNCES, coarse=COARSE, half=HALF, gloss=4):
-        import functools, time
-        self.lost = 0
-        t = [time.process_time()]
-        told = []
-        def tick(name):
-            t.append(time.process_time()); told.append((name, round(t[-1]-t[-2], 1)))
-        lit = functools.partial(self._light, indirect=False)
-        by_surfaces = functools.partial(self._light, direct=False)
-        small = max(size // coarse, 16)
-        direct = self._map(lit, small, 16, 8 * seed, LEAST_RHO)
-        tick('direct small')
-        light = np.stack([direct, 0 * direct])
-        for bounce in range(bounces):
-            self.integrator = Gathered(self.mi, self.scene, light, caustics=self.caustics)
-            light[0] = direct + self._map(by_surfaces, small, 4, 4096*bounce+8 * seed, LEAST_RHO)
-            if self.glossy:
-                light[1] = self._map(self._gloss, small, 4, 4096*bounce+8 * seed + 2)
-            tick('bounce %.4f %.4f' % ((light[0]-direct).mean(), light[1].mean()))
-        self.integrator = Gathered(self.mi, self.scene, light, caustics=self.caustics)
-        found = self._map(by_surfaces, size // half, gather, 8 * seed+2, LEAST_RHO)
-        tick('gather')
-        found = np.stack([resized(x, size) for x in found])
-        tick('resize')
-        found += self._map(lit, size, spp, 8 * seed+4, LEAST_RHO)
-        tick('direct')
-        s = 0 * found
-        if self.glossy:
-            s = self._map(self._gloss, size // half, gloss, 8 * seed + 6)
-            s = np.stack([resized(x, size) for x in s])
-        tick('gloss')
-        print(told)
-        return np.stack([found, s])
+    Args:
+        sampler: of single numbers, and of what loops draw.
+        texel: of each sample.
+        index: of the samples within their texels.
+        count: of a texel's samples.
+        seed: mi.UInt32.
+    """
 
+    def __init__(self, mi: Any, sampler: Any, texel: Any, index: Any, count: int, seed: Any) -> None:
+        self.mi, self.sampler, self.texel, self.index, self.count = mi, sampler, texel, index, count
+        self.seed, self.drawn = seed << 8, 0
 
-def resized(image, size):
-    if image.shape[0] == size:
-        return image
-    at = (np.arange(size) + 0.5) * image.shape[0] / size - 0.5
-    low = np.floor(at).astype(int)
-    t = (at - low).astype(np.float32)
-    a, b = low.clip(0, image.shape[0] - 1), (low + 1).clip(0, image.shape[0] - 1)
-    rows = image[a] + (image[b] - image[a]) * t[:, None, None]
-    return rows[:, a] + (rows[:, b] - rows[:, a]) * t[:, None]
+    def next_1d(self) -> Any:
+        return self.sampler.next_1d()
 
-
-class Spread:
-    """Numbers of a texel's samples: pairs drawn before the path's loop are spread over the square."""
-    def __init__(self, mi, inner, texel, index, seed):
-        self.mi, self.inner, self.texel, self.index, self.seed, self.pairs = mi, inner, texel, index, seed, 0
-    def next_1d(self, active=True):
-        return self.inner.next_1d(active)
-    def next_2d(self, active=True):
-        import drjit as dr
+    def next_2d(self) -> Any:
+        """Of the sequence's first places, in an order of the texel's own: pairs do not depend on each other."""
         mi = self.mi
-        self.pairs += 1
-        a, b = mi.sample_tea_32(self.texel, self.seed + self.pairs)
-        shift = mi.Point2f(mi.Float(a >> 8), mi.Float(b >> 8)) * 2**-24
-        place = shift + mi.Point2f(mi.Float(self.index) * GOLDEN[0], mi.Float(self.index) * GOLDEN[1])
-        return place - dr.floor(place)
+        self.drawn += 1
+        shifts = mi.sample_tea_32(self.texel, self.seed + self.drawn)
+        place = mi.Float(mi.permute_kensler(self.index, self.count, shifts[0] ^ shifts[1]))
+        pair = (fraction(mi.Float(s >> 8) * 2**-24 + place * step) for s, step in zip(shifts, GOLDEN, strict=True))
+        return mi.Point2f(*pair)
+
+
+def enlarged(image: np.ndarray, size: int) -> np.ndarray:
+    """[n, n, C] -> [size, size, C], bilinear between the middles of texels."""
+    at = ((np.arange(size, dtype=np.float32) + 0.5) * (len(image) / size) - 0.5).clip(0, len(image) - 1)
+    low = at.astype(int)
+    high, t = (low + 1).clip(max=len(image) - 1), at - low
+    rows = image[low] + (image[high] - image[low]) * t[:, None, None]
+    return rows[:, low] + (rows[:, high] - rows[:, low]) * t[:, None]

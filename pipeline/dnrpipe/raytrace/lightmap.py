@@ -74,11 +74,11 @@ class LightBaker:
         the atlas alone stay apart. Of closed meshes one side is traced: the other cannot be seen.
         """
         self.lost = 0
-        light = self._map(self._light, size, spp, seed * 4, least=LEAST_RHO)
+        light = self._map(self._light, size, spp, seed * 4, LEAST_RHO)
         return np.stack([light, self._map(self._gloss, size, spp, seed * 4 + 2) if self.glossy else 0 * light])
 
     def _map(self, sample: Any, size: int, spp: int, seed: int, least: float = 0) -> np.ndarray:
-        """[2, size, size, 3], front and back: what ``sample`` says of each texel, the mean of ``spp`` samples, denoised.
+        """[2, size, size, 3], front and back: what ``sample`` says of each texel, mean of ``spp`` samples, denoised.
 
         least: mean denominator of a texel that says anything.
         """
@@ -175,14 +175,17 @@ class LightBaker:
         sampler.seed(number, len(texels) * spp)
         index = dr.arange(mi.UInt32, len(texels) * spp)
         texel = dr.gather(mi.UInt32, mi.UInt32(texels.astype(np.uint32)), index // each)
-        if getattr(self, "spread", False):
-            from .gathering import Spread
-            sampler = Spread(mi, sampler, texel, index % each, number << 8)
-        jitter = sampler.next_2d()
+        numbers = self._numbers(sampler, texel, index % each, spp, number)
+        jitter = numbers.next_2d()
         uv = mi.Point2f(mi.Float(texel % width) + jitter.x, mi.Float(texel // width) + jitter.y) / mi.Float(width)
-        channels = sample(sampler, uv, side)
+        channels = sample(numbers, uv, side)
         dr.eval(channels)  # together: block_sum would run the whole kernel for each channel
         return np.stack([np.array(dr.block_sum(channel, spp)) for channel in channels], axis=1)
+
+    def _numbers(self, sampler: Any, texel: Any, index: Any, count: int, seed: Any) -> Any:
+        """What samples draw their random numbers from. index: of the samples within their texels, of ``count``."""
+        del texel, index, count, seed
+        return sampler
 
     def _surface(self, sampler: Any, uv: Any, side: int) -> tuple[Any, Any]:
         """(surface interaction at each (U, V), seen straight on, whether there is a surface)."""

@@ -75,7 +75,7 @@ class SpecularPaths:
         self.has_unsplit_holes = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in self.unsplit)
         self.translucent = bool(self.unsplit) or any(mi.has_flag(f, mi.BSDFFlags.DiffuseTransmission) for f in flags)
         self.has_glossy = any(mi.has_flag(f, mi.BSDFFlags.GlossyReflection) for f in flags)
-        self.has_glass = any(mirrors_and_refracts(mi, f) for f in flags)
+        self.has_glass = camera and any(mirrors_and_refracts(mi, f) for f in flags)
 
         kinds = mi.BSDFFlags
         self.diffuse = diffuse_context(mi)

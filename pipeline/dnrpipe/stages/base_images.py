@@ -31,8 +31,9 @@ from .stage import Run
 LIGHT_VERSION, BASE_VERSION = 9, 14
 RENDERED = ("baked", "direct", "path")
 """Kinds of base images that are rendered into files of their own."""
-AUTOMATIC_TEXELS = 4
-"""Light map texels per pixel of an image's side: about one texel a pixel where the atlas shows a part of itself."""
+AUTOMATIC_TEXELS = {"traced": 4, "gathered": 2}
+"""Light map texels per pixel of an image's side: four are about one texel a pixel where the atlas shows a part of
+itself. Where seconds are to be saved, more rays for half of them are worth more."""
 CHUNK, WARM_UP = 64, 8
 """Frames of a sequence that remember one another; those before a chunk's first that are rendered for it once more, so
 that no seam is seen. A chunk is what an interrupted run does again at most."""
@@ -79,12 +80,12 @@ def light_size(settings: Settings) -> int:
     """Texels of the light map's side: the setting, else a power of two that suits the images."""
     if settings.base.light_size != "auto":
         return settings.base.light_size
-    wanted = AUTOMATIC_TEXELS * max(settings.cameras.width, settings.cameras.height)
+    wanted = AUTOMATIC_TEXELS[settings.base.light] * max(settings.cameras.width, settings.cameras.height)
     return int(min(max(2 ** round(np.log2(wanted)), SIZES[0]), SIZES[1]))
 
 
 def light_spp(settings: Settings) -> int:
-    """Paths per texel: the setting, else as many as keep their sum what it is at 512², within SPP.
+    """Paths or gathered rays per texel: the setting, else as many as keep their sum what it is at 512², within SPP.
 
     A finer map has more texels on the same surface, and the denoiser averages over them.
     """
@@ -182,11 +183,13 @@ def base_renderer(workspace: Workspace, settings: Settings, plan: EffectPlan) ->
             "output": common["light"],
             "size": light_size(settings),
             "spp": light_spp(settings),
+            "gather": chosen.light == "gathered",
             "integrator": config["integrator"],
             "max_depth": config["max_depth"],
             "seed": settings.raytrace.seed,
         }
-        light["fingerprint"] = digest([LIGHT_VERSION, inputs, {k: v for k, v in light.items() if k != "output"}])
+        decides = {k: v for k, v in light.items() if k != "output" and (k != "gather" or v)}
+        light["fingerprint"] = digest([LIGHT_VERSION, inputs, decides])
         fingerprint = digest([light["fingerprint"], chosen.samples, chosen.denoise])
         return BaseRenderer(common, choice.environment, light, fingerprint)
     direct = kind == "direct"
@@ -220,7 +223,10 @@ def bake_light(run: Run, renderer: BaseRenderer) -> dict[str, Any] | None:
             environment=renderer.environment,
             place=run.place,
         )
-        bar.advance(note=f"{task['size']}² texels, {task['spp']} spp")
+        each = "gathered rays" if result["gathered"] else "paths"
+        bar.advance(note=f"{task['size']}² texels, {task['spp']} {each}")
+    if task["gather"] and not result["gathered"]:
+        run.console.say("baked light: paths were traced: rays are gathered where light bounces and nothing has volume")
     if result["lost"]:
         run.console.warn(f"repaired: {result['lost']} samples of the baked light were not finite and are left out")
     run.book(
