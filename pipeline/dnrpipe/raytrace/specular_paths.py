@@ -57,7 +57,7 @@ class SpecularPaths:
     Args:
         scene: a scene of the current variant (jit variants only).
         camera: the rays are a camera's: they pass lamps and unseen shapes, and what glows is seen. False: a surface's,
-            where emitters were sampled; light of them counts from the first mirror, glass or glossy lobe on.
+            where emitters were sampled: rays end at them, before the first mirror, glass or glossy lobe.
         caustics: False: rays end at sharp lobes (`paths.is_sharp`).
     """
 
@@ -144,6 +144,8 @@ class SpecularPaths:
                 u = [*sampler.next_2d(), sampler.next_1d(), *sampler.next_2d()]
             passed = active & straight & self._is_hidden(si)
             going = active & ~passed
+            if dr.hint(not self.camera, mode="scalar"):
+                going &= ~(straight & si.is_valid() & si.shape.is_emitter())
             throughput *= self._transmittance(medium, ray, si, going)
 
             # ------------------------ Light that is hit -----------------------
