@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from .engine import masked_channels
+from .lightmap import light_textures
 from .recorded import Recorded, prepare_emitters
 from .sensors import opaque_camera
 from .sequence import GOLDEN, ORDER, TILE, fraction
@@ -64,11 +65,11 @@ class BaseRenderer:
     """
 
     def __init__(self, mi: Any, scene: Any, light: np.ndarray, samples: int) -> None:
-        from .specular_paths import SpecularPaths, light_textures  # imports Mitsuba
+        from .specular_paths import SpecularPaths  # imports Mitsuba
 
         self.mi, self.scene, self.samples = mi, scene, samples
         self.repaired = self.masked = 0
-        self.light = light_textures(light)
+        self.light = light_textures(mi, light)
         self.paths = SpecularPaths(scene)
         self.tables = mi.UInt32(ORDER.ravel()), self.paths.steps
         prepare_emitters(mi, scene)

@@ -4,7 +4,7 @@ Notation
     E_0, S_0   a coarse light map, path-traced and denoised (see `lightmap`)
     D          what of E comes from emitters
     I          the rest: what cosine-distributed rays from the texel meet, each answered by E_0 and S_0
-    E          D + I, each with samples of its own and denoised by itself;   S = S_0, enlarged: it is smooth
+    E          D + I, each with samples of its own and denoised by itself, I at half the side;   S = S_0, enlarged
 
 One bounce is shorter than a path, and a map that is denoised already answers with far less noise (Reichert, "A Two-Pass
 Radiosity Method Driven by Lights and Viewer Position", 1992; Jensen, "Realistic Image Synthesis Using Photon Mapping",
@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from .lightmap import LEAST_RHO, LightBaker
+from .lightmap import LEAST_RHO, LightBaker, light_textures
 from .lobes import media_of
 from .sequence import GOLDEN, fraction
 
@@ -35,6 +35,8 @@ COARSE, COARSE_PATHS = 256, 1 << 22
 """Least side of the coarse map, and its paths: 64 per texel of that side."""
 FINER = 8
 """Sides of the light map per side of the coarse one, at most."""
+COARSER = 2
+"""Sides of the light map per side of I: it is smoother than D, which has the shadows."""
 DIRECT = 2
 """Samples of emitters per gathered ray: one costs a quarter of it, and half the noise is theirs."""
 
@@ -59,7 +61,7 @@ class GatheringBaker(LightBaker):
         self.caustics, self.gathers = caustics, False
 
     def bake(self, size: int, spp: int, seed: int) -> np.ndarray:
-        """As `LightBaker.bake`. spp: gathered rays per texel."""
+        """As `LightBaker.bake`. spp: gathered rays per texel of I."""
         side = min(size, max(COARSE, size // FINER))
         coarse = super().bake(side, max(1, COARSE_PATHS // side**2), 2 * seed)
         traced, lost = self.integrator, self.lost
@@ -67,11 +69,13 @@ class GatheringBaker(LightBaker):
         try:
             emitters = functools.partial(self._light, indirect=False)
             surfaces = functools.partial(self._light, direct=False)
-            light = self._map(surfaces, size, spp, 8 * seed + 4, LEAST_RHO)
-            light += self._map(emitters, size, DIRECT * spp, 8 * seed + 6, LEAST_RHO)
+            side, lit = max(1, size // COARSER), max(1, DIRECT * spp // COARSER**2)
+            indirect = self._map(surfaces, side, spp, 8 * seed + 4, LEAST_RHO)
+            light = self._map(emitters, size, lit, 8 * seed + 6, LEAST_RHO)
         finally:
             self.integrator, self.gathers = traced, False
         self.lost += lost
+        light += [enlarged(image, size) for image in indirect]
         return np.stack([light, [enlarged(image, size) for image in coarse[1]]])
 
     def _numbers(self, sampler: Any, texel: Any, index: Any, count: int, seed: Any) -> Any:
@@ -87,9 +91,9 @@ class Gathered:
     """
 
     def __init__(self, mi: Any, scene: Any, light: np.ndarray, *, caustics: bool) -> None:
-        from .specular_paths import SpecularPaths, light_textures  # imports Mitsuba
+        from .specular_paths import SpecularPaths  # imports Mitsuba
 
-        self.mi, self.light = mi, light_textures(light)
+        self.mi, self.light = mi, light_textures(mi, light)
         self.paths = SpecularPaths(scene, camera=False, caustics=caustics)
 
     def sample(self, scene: Any, numbers: Any, ray: Any, medium: Any, active: Any) -> tuple[Any, Any, list[Any]]:

@@ -43,6 +43,14 @@ LEAST_RHO = 1e-3
 """Texels that reflect less hold no light worth knowing."""
 
 
+def light_textures(mi: Any, light: np.ndarray) -> list[Any]:
+    """E and S of the front and of the back, float32 [2, 2, size, size, 3] -> two textures of six channels."""
+    import drjit as dr
+
+    sides = [np.concatenate([light[0, i], light[1, i]], axis=-1) for i in range(2)]
+    return [mi.Texture2f(mi.TensorXf(side), wrap_mode=dr.WrapMode.Clamp) for side in sides]
+
+
 class LightBaker:
     """Bakes E and S of one scene.
 

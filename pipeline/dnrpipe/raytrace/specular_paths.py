@@ -10,7 +10,6 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from .lobes import (
     bsdfs_of,
@@ -43,12 +42,6 @@ NARROW = 1000.0
 """Density of a direction from which a lobe shows a sharp picture of what it reflects: GGX of roughness 0.1."""
 FAR = 1e6
 """Length of a chain's segment that meets no surface."""
-
-
-def light_textures(light: np.ndarray) -> list[Any]:
-    """E and S of the front and of the back, float32 [2, 2, size, size, 3] -> two textures of six channels."""
-    sides = [np.concatenate([light[0, i], light[1, i]], axis=-1) for i in range(2)]
-    return [mi.Texture2f(mi.TensorXf(side), wrap_mode=dr.WrapMode.Clamp) for side in sides]
 
 
 class SpecularPaths:
