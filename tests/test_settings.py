@@ -161,7 +161,7 @@ def test_paths_per_texel_of_the_baked_light() -> None:
     assert of(800)[1] == 16
     assert of(256, light_size=512) == (512, 64)
     assert of(256, light_spp=7) == (1024, 7)
-    assert [of(side, light="gathered") for side in (128, 256, 640)] == [(512, 64), (1024, 64), (2048, 16)]
+    assert [of(side, light="gathered") for side in (128, 256, 640)] == [(256, 64), (512, 64), (1024, 24)]
     draft, standard = (resolve(preset, {"cameras": {"width": 640}}, environment={}) for preset in ("draft", "standard"))
     assert (draft.base.light, standard.base.light) == ("traced", "gathered")
     assert light_paths(standard) < 0.3 * light_paths(draft)

@@ -4,7 +4,7 @@ Notation
     E_0, S_0   a coarse light map, path-traced and denoised (see `lightmap`)
     D          what of E comes from emitters
     I          the rest: what cosine-distributed rays from the texel meet, each answered by E_0 and S_0
-    E          D + I, each with samples of its own and denoised by itself, I at half the side;   S = S_0, enlarged
+    E          D + I, each with samples of its own and denoised by itself;   S = S_0, enlarged: it is smooth
 
 One bounce is shorter than a path, and a map that is denoised already answers with far less noise (Reichert, "A Two-Pass
 Radiosity Method Driven by Lights and Viewer Position", 1992; Jensen, "Realistic Image Synthesis Using Photon Mapping",
@@ -35,8 +35,6 @@ COARSE, COARSE_PATHS = 256, 1 << 22
 """Least side of the coarse map, and its paths: 64 per texel of that side."""
 FINER = 8
 """Sides of the light map per side of the coarse one, at most."""
-COARSER = 2
-"""Sides of the light map per side of I: it is smoother than D, which has the shadows."""
 DIRECT = 2
 """Samples of emitters per gathered ray: one costs a quarter of it, and half the noise is theirs."""
 
@@ -61,7 +59,7 @@ class GatheringBaker(LightBaker):
         self.caustics, self.gathers = caustics, False
 
     def bake(self, size: int, spp: int, seed: int) -> np.ndarray:
-        """As `LightBaker.bake`. spp: gathered rays per texel of I."""
+        """As `LightBaker.bake`. spp: gathered rays per texel."""
         side = min(size, max(COARSE, size // FINER))
         coarse = super().bake(side, max(1, COARSE_PATHS // side**2), 2 * seed)
         traced, lost = self.integrator, self.lost
@@ -69,13 +67,11 @@ class GatheringBaker(LightBaker):
         try:
             emitters = functools.partial(self._light, indirect=False)
             surfaces = functools.partial(self._light, direct=False)
-            side, lit = max(1, size // COARSER), max(1, DIRECT * spp // COARSER**2)
-            indirect = self._map(surfaces, side, spp, 8 * seed + 4, LEAST_RHO)
-            light = self._map(emitters, size, lit, 8 * seed + 6, LEAST_RHO)
+            light = self._map(surfaces, size, spp, 8 * seed + 4, LEAST_RHO)
+            light += self._map(emitters, size, DIRECT * spp, 8 * seed + 6, LEAST_RHO)
         finally:
             self.integrator, self.gathers = traced, False
         self.lost += lost
-        light += [enlarged(image, size) for image in indirect]
         return np.stack([light, [enlarged(image, size) for image in coarse[1]]])
 
     def _numbers(self, sampler: Any, texel: Any, index: Any, count: int, seed: Any) -> Any:

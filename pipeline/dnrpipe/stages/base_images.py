@@ -22,7 +22,7 @@ from ..core.settings import Settings
 from ..core.workspace import Workspace, digest
 from ..effects.plan import EffectPlan
 from ..effects.store import plan_of, trace_config
-from ..raytrace.gathering import COARSE_PATHS, COARSER
+from ..raytrace.gathering import COARSE_PATHS
 from ..raytrace.variants import choose_variant
 from ..workers.placement import HERE
 from ..workers.view_tasks import only_answer, warn_of_repairs
@@ -32,13 +32,14 @@ from .stage import Run
 LIGHT_VERSION, BASE_VERSION = 9, 14
 RENDERED = ("baked", "direct", "path")
 """Kinds of base images that are rendered into files of their own."""
-AUTOMATIC_TEXELS = 4
-"""Light map texels per pixel of an image's side: about one texel a pixel where the atlas shows a part of itself."""
+AUTOMATIC_TEXELS = {"traced": 4, "gathered": 2}
+"""Light map texels per pixel of an image's side. Four are about one texel a pixel where the atlas shows a part of
+itself; gathered light is better of half as many with four times the rays."""
 CHUNK, WARM_UP = 64, 8
 """Frames of a sequence that remember one another; those before a chunk's first that are rendered for it once more, so
 that no seam is seen. A chunk is what an interrupted run does again at most."""
 SIZES = (256, 4096)
-SPP = (16, 64)
+SPP = {"traced": (16, 64), "gathered": (24, 64)}
 RAY = 0.6
 """Seconds of a gathered ray, with its samples of emitters, over those of a path of E and one of S."""
 
@@ -82,26 +83,25 @@ def light_size(settings: Settings) -> int:
     """Texels of the light map's side: the setting, else a power of two that suits the images."""
     if settings.base.light_size != "auto":
         return settings.base.light_size
-    wanted = AUTOMATIC_TEXELS * max(settings.cameras.width, settings.cameras.height)
+    wanted = AUTOMATIC_TEXELS[settings.base.light] * max(settings.cameras.width, settings.cameras.height)
     return int(min(max(2 ** round(np.log2(wanted)), SIZES[0]), SIZES[1]))
 
 
 def light_spp(settings: Settings) -> int:
-    """Paths or gathered rays per texel: the setting, else as many as keep their sum, within SPP, what it is at 512² (of
-    rays at 1024²: they are gathered at half the side).
+    """Paths or gathered rays per texel: the setting, else as many as keep their sum what it is at 512², within SPP.
 
     A finer map has more texels on the same surface, and the denoiser averages over them.
     """
     if settings.base.light_spp != "auto":
         return settings.base.light_spp
-    usual = 1024 if settings.base.light == "gathered" else 512
-    return int(min(max(SPP[1] * (usual / light_size(settings)) ** 2, SPP[0]), SPP[1]))
+    least, most = SPP[settings.base.light]
+    return int(min(max(most * (512 / light_size(settings)) ** 2, least), most))
 
 
 def light_paths(settings: Settings) -> float:
     """Paths that the light of a full atlas takes; gathered light: as many as take its seconds."""
     rays = light_size(settings) ** 2 * light_spp(settings)
-    return rays if settings.base.light == "traced" else COARSE_PATHS + RAY * rays / COARSER**2
+    return rays if settings.base.light == "traced" else COARSE_PATHS + RAY * rays
 
 
 def base_views(
