@@ -107,7 +107,7 @@ class BaseSettings(Strict):
 
     light: Literal["traced", "gathered"] = Field(
         default="traced",
-        description="how light is baked: by paths, or by rays that end at a coarse map after one bounce; quicker",
+        description="how light is baked: by paths, or by rays that end at a coarse map after one bounce",
     )
     light_size: Annotated[int, Field(ge=16, le=16384)] | Literal["auto"] = Field(
         default="auto", description="texels of the baked light's side; auto: about one a pixel"
@@ -270,7 +270,6 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "standard": {
         "cameras": {"train": 100, "val": 10, "test": 50, "width": 384, "height": 384},
-        "base": {"light": "gathered"},
         "raytrace": {"spp": 256, "evaluation_spp": 512, "denoise": True, "evaluation_denoise": True},
         "model": {**DNR, "texture_size": 256, "width": 24, "depth": 3},
         "select": {"step1": {"epochs": 30, "texture_rate_scale": 10.0}},

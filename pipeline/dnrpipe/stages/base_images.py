@@ -32,13 +32,14 @@ from .stage import Run
 LIGHT_VERSION, BASE_VERSION = 9, 14
 RENDERED = ("baked", "direct", "path")
 """Kinds of base images that are rendered into files of their own."""
-AUTOMATIC_TEXELS = 4
-"""Light map texels per pixel of an image's side: about one texel a pixel where the atlas shows a part of itself."""
+AUTOMATIC_TEXELS = {"traced": 4, "gathered": 2}
+"""Light map texels per pixel of an image's side. Four are about one texel a pixel where the atlas shows a part of
+itself; gathered light is better of half as many with four times the rays, where charts are large."""
 CHUNK, WARM_UP = 64, 8
 """Frames of a sequence that remember one another; those before a chunk's first that are rendered for it once more, so
 that no seam is seen. A chunk is what an interrupted run does again at most."""
 SIZES = (256, 4096)
-SPP = {"traced": (16, 64), "gathered": (8, 64)}
+SPP = {"traced": (16, 64), "gathered": (32, 64)}
 RAY = 0.6
 """Seconds of a gathered ray, with its samples of emitters, over those of a path of E and one of S."""
 
@@ -82,7 +83,7 @@ def light_size(settings: Settings) -> int:
     """Texels of the light map's side: the setting, else a power of two that suits the images."""
     if settings.base.light_size != "auto":
         return settings.base.light_size
-    wanted = AUTOMATIC_TEXELS * max(settings.cameras.width, settings.cameras.height)
+    wanted = AUTOMATIC_TEXELS[settings.base.light] * max(settings.cameras.width, settings.cameras.height)
     return int(min(max(2 ** round(np.log2(wanted)), SIZES[0]), SIZES[1]))
 
 
