@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.corner_room import corner_room, onwards, quad, rgb
 
 from dnrpipe.blender.bundle.ply import weld, write_ply
 from dnrpipe.raytrace.base_renderer import CENTRES, MEANS, NOISE, BaseRenderer
@@ -39,37 +40,6 @@ def _variant(mitsuba_variant: str) -> None:
         pytest.skip("base images need a jit variant of Mitsuba; this machine has none")
 
 
-def rgb(*value: float) -> dict[str, Any]:
-    return {"type": "rgb", "value": list(value)}
-
-
-def quad(path: Path, corners: list[list[float]], place: tuple[float, float], bsdf: dict[str, Any]) -> dict[str, Any]:
-    """A square of two triangles; its chart is [place, place + 0.4]² of the atlas."""
-    corner = np.array(corners, np.float32)
-    order = [0, 1, 2, 0, 2, 3]
-    unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
-    normal = np.cross(corner[1] - corner[0], corner[2] - corner[0])
-    normals = np.tile(normal / np.linalg.norm(normal), (6, 1)).astype(np.float32)
-    atlas = np.concatenate([unit * 0.4 + place, np.zeros((4, 1))], axis=1).astype(np.float32)
-    write_ply(path, [weld(corner[order], normals, unit[order], [("atlas", atlas[order])])])
-    return {"type": "ply", "filename": str(path), "bsdf": bsdf}
-
-
-def corner_room(
-    folder: Path, floor: dict[str, Any], wall: dict[str, Any], light: dict[str, Any], **more: dict[str, Any]
-) -> Any:
-    """A floor and a wall behind it."""
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "floor": quad(folder / "f.ply", [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], (0.05, 0.05), floor),
-            "wall": quad(folder / "w.ply", [[-1, 1, 0], [1, 1, 0], [1, 1, 1.5], [-1, 1, 1.5]], (0.55, 0.05), wall),
-            "light": light,
-            **more,
-        }
-    )
-
-
 def camera(azimuth: float = 0.3) -> View:
     """Looks at the room's middle from the front, from above."""
     at = np.array([4 * np.sin(azimuth), -4 * np.cos(azimuth), 2.0])
@@ -81,10 +51,6 @@ def camera(azimuth: float = 0.3) -> View:
     pose[:3, 3] = at
     rows = tuple(tuple(float(x) for x in row) for row in pose)
     return View(name="v", width=SIZE, height=SIZE, fl_x=70, fl_y=70, cx=SIZE / 2, cy=SIZE / 2, c2w=rows)
-
-
-def onwards(depth: int = 7, kind: str = "path") -> Any:
-    return mi.load_dict({"type": kind, "max_depth": depth, "rr_depth": 5, "hide_emitters": True})
 
 
 def traced(scene: Any, view: View, spp: int = 2048, kind: str = "path", depth: int = 8) -> np.ndarray:

@@ -109,11 +109,16 @@ class RaytraceSettings(Strict):
 class BaseSettings(Strict):
     """The image that the network corrects, where `model.base` is rendered (baked, direct, path)."""
 
+    light: Literal["traced", "gathered"] = Field(
+        default="traced",
+        description="how light is baked: by paths, or by rays that end at a coarse map after one bounce",
+    )
     light_size: Annotated[int, Field(ge=16, le=16384)] | Literal["auto"] = Field(
         default="auto", description="texels of the baked light's side; auto: about one a pixel"
     )
     light_spp: Annotated[int, Field(ge=1, le=1_000_000)] | Literal["auto"] = Field(
-        default="auto", description="paths per texel of the baked light; auto: 64 up to 512 texels a side, then fewer"
+        default="auto",
+        description="paths or rays per texel of the baked light; auto: 64 up to 512 texels a side, then fewer",
     )
     samples: int = Field(default=8, ge=1, le=64, description="rays per pixel of a base image")
     denoise: bool = Field(

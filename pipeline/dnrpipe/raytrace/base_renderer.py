@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from .engine import masked_channels
+from .lightmap import light_textures
 from .recorded import Recorded, prepare_emitters
 from .sensors import opaque_camera
 from .sequence import GOLDEN, ORDER, TILE, fraction
@@ -64,14 +65,11 @@ class BaseRenderer:
     """
 
     def __init__(self, mi: Any, scene: Any, light: np.ndarray, samples: int) -> None:
-        import drjit as dr
-
         from .specular_paths import SpecularPaths  # imports Mitsuba
 
         self.mi, self.scene, self.samples = mi, scene, samples
         self.repaired = self.masked = 0
-        sides = [np.concatenate([light[0, i], light[1, i]], axis=-1) for i in range(2)]
-        self.light = [mi.Texture2f(mi.TensorXf(side), wrap_mode=dr.WrapMode.Clamp) for side in sides]
+        self.light = light_textures(mi, light)
         self.paths = SpecularPaths(scene)
         self.tables = mi.UInt32(ORDER.ravel()), self.paths.steps
         prepare_emitters(mi, scene)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from dnrtrain.atomic import atomic_path
 from dnrtrain.contract import NPZ_ERRORS
 
 from .engine import BundleWorker
+from .gathering import GatheringBaker, can_gather
 from .lightmap import LightBaker
 from .tasks import LightAnswer, LightTask, costs_since
 from .texels import grouped_meshes
@@ -32,8 +34,7 @@ class Worker(BundleWorker):
         task = LightTask.model_validate(asked)
         started, cpu = time.monotonic(), time.process_time()
         scene, groups = self.engine.scenes[str(self.bundle)], grouped_meshes(self.bundle)
-        indirect = indirect_integrator(self.engine.mi, scene, task.integrator, task.max_depth)
-        baker = LightBaker(self.engine.mi, scene, indirect, groups)
+        baker = light_baker(self.engine.mi, scene, groups, task)
         light = baker.bake(task.size, task.spp, task.seed)
         with atomic_path(task.output) as temporary, temporary.open("wb") as file:
             np.savez(file, light=light, fingerprint=np.array(task.fingerprint))
@@ -41,8 +42,18 @@ class Worker(BundleWorker):
             **costs_since(started, cpu),
             "texels": int((light[0, 0].sum(axis=-1) > 0).sum()),
             "spp": task.spp,
+            "gathered": isinstance(baker, GatheringBaker),
             "lost": baker.lost,
         }
+
+
+def light_baker(mi: Any, scene: Any, groups: Sequence[tuple[Path, np.ndarray]], task: LightTask) -> LightBaker:
+    """What bakes the light as the task wants it. Paths are traced where rays are wanted but the scene has media."""
+    indirect = indirect_integrator(mi, scene, task.integrator, task.max_depth)
+    if not task.gather or indirect is None or not can_gather(scene):
+        return LightBaker(mi, scene, indirect, groups)
+    coarse = indirect_integrator(mi, scene, task.integrator, task.max_depth - 1)
+    return GatheringBaker(mi, scene, coarse, groups, caustics=task.integrator != "path-without-caustics")
 
 
 def indirect_integrator(mi: Any, scene: Any, kind: str, max_depth: int) -> Any:

@@ -43,6 +43,14 @@ LEAST_RHO = 1e-3
 """Texels that reflect less hold no light worth knowing."""
 
 
+def light_textures(mi: Any, light: np.ndarray) -> list[Any]:
+    """E and S of the front and of the back, float32 [2, 2, size, size, 3] -> two textures of six channels."""
+    import drjit as dr
+
+    sides = [np.concatenate([light[0, i], light[1, i]], axis=-1) for i in range(2)]
+    return [mi.Texture2f(mi.TensorXf(side), wrap_mode=dr.WrapMode.Clamp) for side in sides]
+
+
 class LightBaker:
     """Bakes E and S of one scene.
 
@@ -65,6 +73,7 @@ class LightBaker:
         self.glossy = any(mi.has_flag(b.flags(), mi.BSDFFlags.Glossy) for b in bsdfs)
         self.media = media_of(scene)
         self.lost = 0
+        self._known: dict[int, Any] = {}
 
     def bake(self, size: int, spp: int, seed: int) -> np.ndarray:
         """E and S of the front and of the back, float32 [2, 2, size, size, 3], row 0 at V = 0; no noise, no gaps.
@@ -72,27 +81,37 @@ class LightBaker:
         The denoiser is shown where in space each texel lies and where it faces, so that charts that are neighbours in
         the atlas alone stay apart. Of closed meshes one side is traced: the other cannot be seen.
         """
-        whole, self.lost = np.zeros((2, 2, size, size, 3), np.float32), 0
-        if not self.surface.count:
-            return whole
-        texels, position, normal, sides = self.occupied(size)
-        if not len(texels):
-            return whole
-        low, high = position.min(axis=0), position.max(axis=0)
-        place = (position - low) / np.maximum(high - low, 1e-12)
+        self.lost = 0
+        light = self._map(self._light, size, spp, seed * 4, LEAST_RHO)
+        return np.stack([light, self._map(self._gloss, size, spp, seed * 4 + 2) if self.glossy else 0 * light])
+
+    def _map(self, sample: Any, size: int, spp: int, seed: int, least: float = 0) -> np.ndarray:
+        """[2, size, size, 3], front and back: what ``sample`` says of each texel, mean of ``spp`` samples, denoised.
+
+        least: mean denominator of a texel that says anything.
+        """
+        whole = np.zeros((2, size, size, 3), np.float32)
+        texels, place, normal, sides = self._texels(size)
         for number, side in enumerate((1, -1)):
             wanted = sides[:, number]
             if not wanted.any():
                 continue
             guides = place[wanted], normal[wanted] * side
-            light, rho = self._sums(self._light, texels[wanted], size, spp, seed * 4 + number, side)
-            found = rho.max(axis=1) > LEAST_RHO * spp
-            whole[0, number] = self._smooth(light, rho, 1e-6 * spp, texels[wanted], found, guides, size)
-            if self.glossy:
-                light, weight = self._sums(self._gloss, texels[wanted], size, spp, seed * 4 + 2 + number, side)
-                found = weight.max(axis=1) > 0
-                whole[1, number] = self._smooth(light, weight, 0, texels[wanted], found, guides, size)
+            total, weight = self._sums(sample, texels[wanted], size, spp, seed + number, side)
+            found = weight.max(axis=1) > least * spp
+            whole[number] = self._smooth(total, weight, 1e-3 * least * spp, texels[wanted], found, guides, size)
         return whole
+
+    def _texels(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """`occupied`, with positions in [0, 1] of the scene's extent."""
+        if size not in self._known:
+            if self.surface.count:
+                texels, position, normal, sides = self.occupied(size)
+            else:
+                texels, position, normal, sides = (np.zeros(shape, int) for shape in (0, (0, 3), (0, 3), (0, 2)))
+            low, high = (position.min(axis=0), position.max(axis=0)) if len(texels) else (0, 1)
+            self._known[size] = texels, (position - low) / np.maximum(high - low, 1e-12), normal, sides.astype(bool)
+        return self._known[size]
 
     def _sums(
         self, sample: Any, texels: np.ndarray, size: int, spp: int, seed: int, side: int
@@ -159,13 +178,22 @@ class LightBaker:
 
         mi = self.mi
         sampler = mi.load_dict({"type": "independent"})
-        sampler.seed(dr.opaque(mi.UInt32, seed), len(texels) * spp)  # as data: the kernel is the same for all seeds
-        texel = dr.repeat(mi.UInt32(texels.astype(np.uint32)), spp)
-        jitter = sampler.next_2d()
-        uv = mi.Point2f(mi.Float(texel % size) + jitter.x, mi.Float(texel // size) + jitter.y) / size
-        channels = sample(sampler, uv, side)
+        # As data: the kernel is the same for all seeds, sides and numbers of samples.
+        number, width, each = (dr.opaque(mi.UInt32, value) for value in (seed, size, spp))
+        sampler.seed(number, len(texels) * spp)
+        index = dr.arange(mi.UInt32, len(texels) * spp)
+        texel = dr.gather(mi.UInt32, mi.UInt32(texels.astype(np.uint32)), index // each)
+        numbers = self._numbers(sampler, texel, index % each, spp, number)
+        jitter = numbers.next_2d()
+        uv = mi.Point2f(mi.Float(texel % width) + jitter.x, mi.Float(texel // width) + jitter.y) / mi.Float(width)
+        channels = sample(numbers, uv, side)
         dr.eval(channels)  # together: block_sum would run the whole kernel for each channel
         return np.stack([np.array(dr.block_sum(channel, spp)) for channel in channels], axis=1)
+
+    def _numbers(self, sampler: Any, texel: Any, index: Any, count: int, seed: Any) -> Any:
+        """What samples draw their random numbers from. index: of the samples within their texels, of ``count``."""
+        del texel, index, count, seed
+        return sampler
 
     def _surface(self, sampler: Any, uv: Any, side: int) -> tuple[Any, Any]:
         """(surface interaction at each (U, V), seen straight on, whether there is a surface)."""
@@ -201,28 +229,33 @@ class LightBaker:
         found &= dr.all(dr.isfinite(light))
         return [*dr.select(found, weight * light, 0), *dr.select(found, weight, 0), self._one(wanted & ~found)]
 
-    def _light(self, sampler: Any, uv: Any, side: int) -> list[Any]:
-        """One sample of B and of rho at each (U, V), and 1 where it is not finite."""
+    def _light(self, sampler: Any, uv: Any, side: int, direct: bool = True, indirect: bool = True) -> list[Any]:
+        """One sample of B, or of a part of it, and of rho at each (U, V), and 1 where it is not finite."""
         import drjit as dr
 
-        mi, scene = self.mi, self.scene
+        mi = self.mi
         si, found = self._surface(sampler, uv, side)
         context, bsdf = diffuse_context(mi), si.bsdf()
         rho = reflectance(mi, bsdf, context, si, found)
         wanted = mi.Mask(found)
         found &= dr.all(dr.isfinite(rho))
-
-        toward, arriving = scene.sample_emitter_direction(si, sampler.next_2d(), not self.passing, found)
-        lit = found & (toward.pdf > 0)
-        wo = si.to_local(toward.d)
-        value = bsdf.eval(context, si, wo, lit)
-        if self.passing:
-            arriving *= transmittance(mi, scene, si, toward.p, lit & (dr.max(value) > 0))
-        b = dr.select(lit, value * arriving, 0)
-        if self.integrator is not None:
+        b = self._direct(sampler, si, bsdf, context, found) if direct else mi.Spectrum(0.0)
+        if indirect and self.integrator is not None:
             b += self._bounced(sampler, si, bsdf, context, found)
         fine = found & dr.all(dr.isfinite(b))
         return [*dr.select(fine, b, 0), *dr.select(fine, rho, 0), self._one(wanted & ~fine)]
+
+    def _direct(self, sampler: Any, si: Any, bsdf: Any, context: Any, active: Any) -> Any:
+        """One sample of what comes from emitters."""
+        import drjit as dr
+
+        mi, scene = self.mi, self.scene
+        toward, arriving = scene.sample_emitter_direction(si, sampler.next_2d(), not self.passing, active)
+        lit = active & (toward.pdf > 0)
+        value = bsdf.eval(context, si, si.to_local(toward.d), lit)
+        if self.passing:
+            arriving *= transmittance(mi, scene, si, toward.p, lit & (dr.max(value) > 0))
+        return dr.select(lit, value * arriving, 0)
 
     def _one(self, where: Any) -> Any:
         import drjit as dr

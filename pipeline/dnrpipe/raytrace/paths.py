@@ -35,6 +35,12 @@ def power_heuristic(a: Any, b: Any) -> Any:
     return dr.select(total > 0, squares / total, 0)
 
 
+def is_sharp(mi: Any, bounce: Any) -> Any:
+    """Whether a BSDF sample is of a mirror-like lobe."""
+    glossy = mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Glossy) & (bounce.pdf > SHARP_DENSITY)
+    return mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Delta) | glossy
+
+
 def transmittance(mi: Any, scene: Any, si: Any, point: Any, active: Any) -> Any:
     """Product, per colour, of what the surfaces between ``si`` and ``point`` let straight through."""
     import drjit as dr
@@ -122,8 +128,7 @@ def register(mi: Any) -> None:
                 passed = mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Null)
                 valid |= active & si.is_valid() & ~passed
                 delta = mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Delta) & ~passed
-                glossy = mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Glossy) & (bounce.pdf > SHARP_DENSITY)
-                sharp = delta | glossy
+                sharp = is_sharp(mi, bounce) & ~passed
                 if dr.hint(not self.caustics, mode="scalar"):
                     going &= ~(sharp & diffused)
                     diffused |= going & ~sharp & ~passed

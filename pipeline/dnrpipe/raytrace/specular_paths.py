@@ -24,7 +24,7 @@ from .lobes import (
     reflectance,
     specular_context,
 )
-from .paths import power_heuristic
+from .paths import is_sharp, power_heuristic
 from .sequence import fraction, steps
 from .texels import ATTRIBUTE
 from .visibility import LAMP_PREFIX, UNSEEN_PREFIX, is_one_of
@@ -49,11 +49,16 @@ class SpecularPaths:
 
     Args:
         scene: a scene of the current variant (jit variants only).
+        camera: the rays are a camera's: they pass lamps and unseen shapes, and what glows is seen. False: a surface's,
+            where emitters were sampled: rays end at them, before the first mirror, glass or glossy lobe.
+        caustics: False: rays end at sharp lobes (`paths.is_sharp`).
     """
 
-    def __init__(self, scene: Any) -> None:
+    def __init__(self, scene: Any, *, camera: bool = True, caustics: bool = True) -> None:
+        self.camera, self.caustics = camera, caustics
         self.steps = mi.Float(steps(NUMBERS * (MAX_VERTICES + 1)))
-        self.hidden = [s for s in scene.shapes() if s.id().startswith((LAMP_PREFIX, UNSEEN_PREFIX))]
+        unseen = (LAMP_PREFIX, UNSEEN_PREFIX)
+        self.hidden = [s for s in scene.shapes() if camera and s.id().startswith(unseen)]
         self.has_emitters = bool(scene.emitters())
         self.has_media = any(shape.is_medium_transition() for shape in scene.shapes())
         self.has_holes = lets_through(mi, scene)
@@ -63,7 +68,7 @@ class SpecularPaths:
         self.has_unsplit_holes = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in self.unsplit)
         self.translucent = bool(self.unsplit) or any(mi.has_flag(f, mi.BSDFFlags.DiffuseTransmission) for f in flags)
         self.has_glossy = any(mi.has_flag(f, mi.BSDFFlags.GlossyReflection) for f in flags)
-        self.has_glass = any(mirrors_and_refracts(mi, f) for f in flags)
+        self.has_glass = camera and any(mirrors_and_refracts(mi, f) for f in flags)
 
         kinds = mi.BSDFFlags
         self.diffuse = diffuse_context(mi)
@@ -75,15 +80,26 @@ class SpecularPaths:
         self.refracted = context_of(mi, kinds.DeltaTransmission, kinds.GlossyTransmission)
 
     @dr.syntax
-    def trace(self, scene: Any, light: Any, steps: Any, ray: Any, forward: Any, number: Any, order: Any) -> list[Any]:
+    def trace(
+        self,
+        scene: Any,
+        light: Any,
+        steps: Any,
+        ray: Any,
+        forward: Any,
+        number: Any,
+        order: Any,
+        sampler: Any = None,
+    ) -> list[Any]:
         """One sample along each ray -> the values that `base_renderer` names by LOST, MEANS and CENTRES, in that order.
 
         Args:
             light: E and S of the front and of the back, two textures of six channels.
             steps: of the random numbers, ``self.steps``.
             forward: where the camera looks, in world space.
-            number: the samples' places in the sequences, not negative.
+            number: the samples' places in the sequences; negative: there is no ray.
             order: their places among those of a tile, in [0, 1): which of them the first glass reflects.
+            sampler: numbers come from it instead of the sequences, and faint chains end by chance (Russian roulette).
         """
         origin = mi.Point3f(ray.o)
         every = number >= 0
@@ -115,13 +131,18 @@ class SpecularPaths:
         while dr.hint(active, label="Specular paths"):
             si = scene.ray_intersect(ray, mi.RayFlags.All, True, active)
             bsdf = si.bsdf()
-            u = self._random_numbers(steps, number, vertex)
+            if dr.hint(sampler is None, mode="scalar"):
+                u = self._random_numbers(steps, number, vertex)
+            else:
+                u = [*sampler.next_2d(), sampler.next_1d(), *sampler.next_2d()]
             passed = active & straight & self._is_hidden(si)
             going = active & ~passed
+            if dr.hint(not self.camera, mode="scalar"):
+                going &= ~(straight & si.is_valid() & si.shape.is_emitter())
             throughput *= self._transmittance(medium, ray, si, going)
 
             # ------------------------ Light that is hit -----------------------
-            shows = going & (si.is_valid() | ~straight)
+            shows = going & (~straight | (si.is_valid() & self.camera))
             emission, mis = self._emission(scene, si, prev_si, prev_pdf, prev_sampled, shows)
             here = dr.select(shows, throughput * mis * emission, 0)
 
@@ -172,6 +193,12 @@ class SpecularPaths:
 
             # ------------------------- The next vertex ------------------------
             alive = onwards & (bsdf_sample.pdf > 0) & (dr.max(throughput) > LEAST_THROUGHPUT)
+            if dr.hint(not self.caustics, mode="scalar"):
+                alive &= null | ~is_sharp(mi, bsdf_sample)
+            if dr.hint(sampler is not None, mode="scalar"):
+                kept = dr.minimum(dr.max(throughput), 1)
+                alive &= sampler.next_1d() < kept
+                throughput /= dr.maximum(kept, LEAST_THROUGHPUT)
             covered |= met & ~(null & alive)
             next_ray = si.spawn_ray(dr.select(passed, ray.d, si.to_world(bsdf_sample.wo)))
             medium = self._next_medium(medium, si, bsdf_sample, next_ray, onwards)

@@ -180,11 +180,15 @@ class PassAnswer(TypedDict):
 
 
 class LightTask(Task):
-    """Bake a light map of size² texels with ``spp`` paths each into ``output``, an ``npz``: see `light_worker`."""
+    """Bake a light map of size² texels with ``spp`` paths each into ``output``, an ``npz``: see `light_worker`.
+
+    gather: rays instead of paths, as far as the scene allows (`gathering`).
+    """
 
     output: Path
     size: int
     spp: int
+    gather: bool
     integrator: str
     max_depth: int
     seed: int
@@ -192,10 +196,11 @@ class LightTask(Task):
 
 
 class LightAnswer(Costs):
-    """texels: those that are lit. lost: samples that were not finite."""
+    """texels: those that are lit. gathered: whether rays were gathered. lost: samples that were not finite."""
 
     texels: int
     spp: int
+    gathered: bool
     lost: int
 
 

@@ -22,6 +22,7 @@ from ..core.settings import Settings
 from ..core.workspace import Workspace, digest
 from ..effects.plan import EffectPlan
 from ..effects.store import plan_of, trace_config
+from ..raytrace.gathering import COARSE_PATHS
 from ..raytrace.variants import choose_variant
 from ..workers.placement import HERE
 from ..workers.view_tasks import only_answer, warn_of_repairs
@@ -31,13 +32,16 @@ from .stage import Run
 LIGHT_VERSION, BASE_VERSION = 9, 15
 RENDERED = ("baked", "direct", "path")
 """Kinds of base images that are rendered into files of their own."""
-AUTOMATIC_TEXELS = 4
-"""Light map texels per pixel of an image's side: about one texel a pixel where the atlas shows a part of itself."""
+AUTOMATIC_TEXELS = {"traced": 4, "gathered": 2}
+"""Light map texels per pixel of an image's side. Four are about one texel a pixel where the atlas shows a part of
+itself; gathered light is better of half as many with four times the rays, where charts are large."""
 CHUNK, WARM_UP = 64, 8
 """Frames of a sequence that remember one another; those before a chunk's first that are rendered for it once more, so
 that no seam is seen. A chunk is what an interrupted run does again at most."""
 SIZES = (256, 4096)
-SPP = (16, 64)
+SPP = {"traced": (16, 64), "gathered": (32, 64)}
+RAY = 0.6
+"""Seconds of a gathered ray, with its samples of emitters, over those of a path of E and one of S."""
 
 
 @dataclass(frozen=True)
@@ -79,18 +83,25 @@ def light_size(settings: Settings) -> int:
     """Texels of the light map's side: the setting, else a power of two that suits the images."""
     if settings.base.light_size != "auto":
         return settings.base.light_size
-    wanted = AUTOMATIC_TEXELS * max(settings.cameras.width, settings.cameras.height)
+    wanted = AUTOMATIC_TEXELS[settings.base.light] * max(settings.cameras.width, settings.cameras.height)
     return int(min(max(2 ** round(np.log2(wanted)), SIZES[0]), SIZES[1]))
 
 
 def light_spp(settings: Settings) -> int:
-    """Paths per texel: the setting, else as many as keep their sum what it is at 512², within SPP.
+    """Paths or gathered rays per texel: the setting, else as many as keep their sum what it is at 512², within SPP.
 
     A finer map has more texels on the same surface, and the denoiser averages over them.
     """
     if settings.base.light_spp != "auto":
         return settings.base.light_spp
-    return int(min(max(SPP[1] * (512 / light_size(settings)) ** 2, SPP[0]), SPP[1]))
+    least, most = SPP[settings.base.light]
+    return int(min(max(most * (512 / light_size(settings)) ** 2, least), most))
+
+
+def light_paths(settings: Settings) -> float:
+    """Paths that the light of a full atlas takes; gathered light: as many as take its seconds."""
+    rays = light_size(settings) ** 2 * light_spp(settings)
+    return rays if settings.base.light == "traced" else COARSE_PATHS + RAY * rays
 
 
 def base_views(
@@ -182,11 +193,14 @@ def base_renderer(workspace: Workspace, settings: Settings, plan: EffectPlan) ->
             "output": common["light"],
             "size": light_size(settings),
             "spp": light_spp(settings),
+            "gather": chosen.light == "gathered",
             "integrator": config["integrator"],
             "max_depth": config["max_depth"],
             "seed": settings.raytrace.seed,
         }
-        light["fingerprint"] = digest([LIGHT_VERSION, inputs, {k: v for k, v in light.items() if k != "output"}])
+        # Without ``gather`` where paths are traced: light that was baked before there was a choice stays.
+        decides = {k: v for k, v in light.items() if k != "output" and (k != "gather" or v)}
+        light["fingerprint"] = digest([LIGHT_VERSION, inputs, decides])
         fingerprint = digest([light["fingerprint"], chosen.samples, chosen.denoise])
         return BaseRenderer(common, choice.environment, light, fingerprint)
     direct = kind == "direct"
@@ -220,7 +234,10 @@ def bake_light(run: Run, renderer: BaseRenderer) -> dict[str, Any] | None:
             environment=renderer.environment,
             place=run.place,
         )
-        bar.advance(note=f"{task['size']}² texels, {task['spp']} spp")
+        each = "gathered rays" if result["gathered"] else "paths"
+        bar.advance(note=f"{task['size']}² texels, {task['spp']} {each}")
+    if task["gather"] and not result["gathered"]:
+        run.console.say("baked light: paths were traced: rays are gathered where light bounces and nothing has volume")
     if result["lost"]:
         run.console.warn(f"repaired: {result['lost']} samples of the baked light were not finite and are left out")
     run.book(

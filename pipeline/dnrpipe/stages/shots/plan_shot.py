@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ...core.units import duration
-from ..base_images import base_renderer, light_size, light_spp
+from ..base_images import base_renderer, light_paths
 from ..stage import Run
 from ..worth import worth
 from .frame_tasks import Way
@@ -140,8 +140,7 @@ def _no_baked_light(
         return ""
     most = ladder[-1]
     tracing = path_option(most, shape).seconds
-    texels = light_size(run.settings) ** 2
-    light = texels * light_spp(run.settings) * LIGHT_PATH * most.pixel / most.way.spp
+    light = light_paths(run.settings) * LIGHT_PATH * most.pixel / most.way.spp
     if tracing < light:
         return (
             f"path tracing all frames at {most.way.spp} samples takes {duration(tracing)}, baking the light about"
