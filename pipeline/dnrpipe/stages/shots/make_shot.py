@@ -20,6 +20,7 @@ from ...core.units import duration
 from ...core.workspace import digest, file_sha256
 from ...workers.view_tasks import is_made
 from ..base_images import BASE_VERSION
+from ..effect_plan import resolve_plan
 from ..session import Session
 from ..shot_scene import convert_frames, scene_at
 from ..stage import Run
@@ -35,6 +36,9 @@ from .renderers import Renderer, path_tracer, shipped_renderer, trained_renderer
 CHECKED = 2
 """Frames of a shot that are traced to check it."""
 PLAN_VERSION = 1
+GATHER_FROM = 0.4
+"""Share of the light that direct light alone would miss, from which on it is gathered: it pays at 0.49 (`interior`) and
+does not at 0.21 (`materials`)."""
 BATCH = 8
 """Bundles of single frames that are on disk at once."""
 
@@ -59,6 +63,7 @@ class Shot:
 def plan_shot(session: Session, shot: Shot) -> ShotPlan:
     """Measure ways to make the shot on small frames, choose, and say so. A plan of the same shot is kept."""
     started = time.monotonic()
+    _choose_light(session)
     run = session.run.for_stage("render")
     tracer, path = path_tracer(run, shot.background), folder_of(run, shot) / PLAN
     inputs = [tracer.common.model_dump(mode="json"), run.scene_fingerprint, shot.wanted.model_dump(mode="json")]
@@ -79,6 +84,16 @@ def plan_shot(session: Session, shot: Shot) -> ShotPlan:
     for line in lines(plan.options, plan.chosen, plan.why):
         run.console.say(line)
     return plan
+
+
+def _choose_light(session: Session) -> None:
+    """Gather light where much of it has bounced, unless the user said how it is baked (figures: docs/base.md)."""
+    if "light" in session.workspace.manifest.overrides.get("base", {}):
+        return
+    pilot = resolve_plan(session.run.for_stage("render")).pilot
+    bounced = next((step["mean"] for step in pilot.steps if step["depth"] == 2), 0.0) if pilot else 0.0
+    if bounced >= GATHER_FROM:
+        session.adopt({"base": {"light": "gathered"}})
 
 
 def make_shot(session: Session, shot: Shot, plan: ShotPlan) -> ShotRecord:
