@@ -91,7 +91,7 @@ def _choose_light(session: Session) -> None:
     if "light" in session.workspace.manifest.overrides.get("base", {}):
         return
     pilot = resolve_plan(session.run.for_stage("render")).pilot
-    bounced = next((step["mean"] for step in pilot.steps if step["depth"] == 2), 0.0) if pilot else 0.0
+    bounced = next((step.mean for step in pilot.steps if step.depth == 2), 0.0) if pilot else 0.0
     if bounced >= GATHER_FROM:
         session.adopt({"base": {"light": "gathered"}})
 
