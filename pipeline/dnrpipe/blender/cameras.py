@@ -25,7 +25,7 @@ def scene_cameras(scene: bpy.types.Scene) -> list[SceneCamera]:
     with _alone(scene, cameras) as helper:
         helper.frame_set(scene.frame_current, subframe=scene.frame_subframe)
         evaluated = [(obj, obj.evaluated_get(helper.view_layers[0].depsgraph)) for obj in cameras]
-        seeing = [(describe(found), obj == scene.camera) for obj, found in evaluated if usable(found)]
+        seeing = [(describe(found, scene.render), obj == scene.camera) for obj, found in evaluated if usable(found)]
     return [camera.model_copy(update={"active": active}) for camera, active in seeing]
 
 
@@ -68,7 +68,7 @@ def camera_animation(scene: bpy.types.Scene, max_frames: int = MAX_FRAMES) -> li
             helper.frame_set(frame)
             evaluated = None if camera is None else camera.evaluated_get(helper.view_layers[0].depsgraph)
             if evaluated is not None and usable(evaluated):
-                frames.append(describe(evaluated).model_copy(update={"frame": frame}))
+                frames.append(describe(evaluated, scene.render).model_copy(update={"frame": frame}))
     seen = [camera.model_copy(update={"frame": 0, "name": ""}) for camera in frames]
     return frames if any(camera != seen[0] for camera in seen) else []
 

@@ -29,7 +29,6 @@ ENCLOSED = 0.75
 """Share of all directions in which the scene's camera meets a surface, from which on it stands inside."""
 DEFAULT_LENS = 50.0  # mm on a 36 mm sensor: Blender's default camera
 DEFAULT_SENSOR = 36.0
-SQUARE_PIXELS = 1e-4  # largest relative difference of fl_x and fl_y that counts as square
 LOWEST, HIGHEST = math.radians(5.0), math.radians(85.0)
 # Splits drawn from different streams, so that asking for more of one leaves the others as they were.
 _STREAM = {"train": 0, "val": 1, "test": 2}
@@ -130,8 +129,7 @@ def _own_views(summary: SceneSummary, settings: CameraSettings) -> list[tuple[Vi
 def read_camera_file(path: Path, settings: CameraSettings) -> list[View]:
     """Views of a NeRF ``transforms.json`` that the whole pipeline can use.
 
-    Raises UserError: broken, several image sizes (the trainer needs one), or pixels that are not square
-    (Mitsuba has square pixels only).
+    Raises UserError: broken, or several image sizes (the trainer needs one).
     """
     try:
         views = parse_transforms(path, (settings.width, settings.height))
@@ -141,12 +139,6 @@ def read_camera_file(path: Path, settings: CameraSettings) -> list[View]:
     if len(sizes) > 1:
         listed = ", ".join(f"{w}x{h}" for w, h in sizes[:4])
         raise UserError(f"{path}: has several image sizes ({listed}); training needs one: resample the cameras")
-    for view in views:
-        if abs(view.fl_x - view.fl_y) > SQUARE_PIXELS * view.fl_x:
-            raise UserError(
-                f"{path}: view {view.name} has fl_x {view.fl_x:g} and fl_y {view.fl_y:g}; the ray tracer needs"
-                " square pixels: resample the cameras"
-            )
     return views
 
 
@@ -277,22 +269,22 @@ def look_at_view(name: str, position: np.ndarray, target: np.ndarray, focal: flo
 
 def _scene_view(camera: SceneCamera, settings: CameraSettings) -> View:
     """Blender camera -> View. Sensor fit and shift as in Blender's manual, "Camera / Lens"."""
-    width, height = settings.width, settings.height
+    width, height, aspect = settings.width, settings.height, camera.pixel_aspect
     if camera.sensor_fit == "AUTO":
-        side, sensor = max(width, height), camera.sensor_width
+        side, sensor = max(width, aspect * height), camera.sensor_width
     elif camera.sensor_fit == "HORIZONTAL":
         side, sensor = width, camera.sensor_width
     else:
-        side, sensor = height, camera.sensor_height
-    focal = camera.lens / sensor * side
+        side, sensor = aspect * height, camera.sensor_height
+    focal = camera.lens / sensor * side  # in widths of a pixel, as side is
     name = f"frame{camera.frame:05d}" if camera.frame is not None else camera.name
     return View(
         name=file_name(name),
         width=width,
         height=height,
         fl_x=focal,
-        fl_y=focal,
+        fl_y=focal / aspect,
         cx=width / 2 - camera.shift_x * side,
-        cy=height / 2 + camera.shift_y * side,
+        cy=height / 2 + camera.shift_y * side / aspect,
         c2w=camera.c2w,
     )
