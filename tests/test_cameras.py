@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -151,14 +153,55 @@ def test_files_that_are_no_camera_files(tmp_path: Path, text: str) -> None:
         parse_transforms(path)
 
 
-def test_camera_files_must_have_one_size_and_square_pixels(tmp_path: Path) -> None:
+def test_camera_files_must_have_one_size(tmp_path: Path) -> None:
     frame = {"transform_matrix": np.eye(4).tolist(), "fl_x": 50.0, "w": 64, "h": 64}
     sizes = _transforms(tmp_path, [frame, frame | {"w": 32}])
     with pytest.raises(UserError, match="several image sizes"):
         make_cameras(SUMMARY, CameraSettings(source=str(sizes)))
     stretched = _transforms(tmp_path, [frame | {"fl_y": 60.0}])
-    with pytest.raises(UserError, match="square pixels"):
-        make_cameras(SUMMARY, CameraSettings(source=str(stretched)))
+    (view,) = make_cameras(SUMMARY, CameraSettings(source=str(stretched)))["train"]
+    assert (view.fl_x, view.fl_y) == (50.0, 60.0)
+
+
+BLENDER = """
+import json, sys
+import bpy
+from mathutils import Euler, Matrix
+from dnrpipe.blender.passes.camera import apply_view, describe
+from dnrpipe.core.cameras import _scene_view
+from dnrpipe.core.settings import CameraSettings
+scene, worst = bpy.context.scene, 0.0
+own, other = (bpy.data.objects.new(name, bpy.data.cameras.new(name)) for name in ("own", "other"))
+for camera in (own, other):
+    scene.collection.objects.link(camera)
+own.matrix_world = Matrix.Translation((1, 2, 3)) @ Euler((0.3, 0.1, 2)).to_matrix().to_4x4()
+data, render = own.data, scene.render
+data.lens, data.sensor_width, data.sensor_height, data.shift_x, data.shift_y = 28, 30, 20, 0.1, -0.2
+def seen(camera, size):
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    scales = {"scale_x": render.pixel_aspect_x, "scale_y": render.pixel_aspect_y}
+    return camera.calc_matrix_camera(depsgraph, x=size[0], y=size[1], **scales)
+for size in ((120, 80), (80, 120), (100, 100)):
+    for data.sensor_fit in ("AUTO", "HORIZONTAL", "VERTICAL"):
+        for aspect in ((1, 1), (2, 1), (1, 1.5)):
+            render.pixel_aspect_x, render.pixel_aspect_y = aspect
+            view = _scene_view(describe(own, render), *size)
+            wanted = seen(own, size)
+            apply_view(view, other, render, (data.clip_start, data.clip_end))
+            found = seen(other, size)
+            worst = max(worst, *(abs(a - b) for x, y in zip(wanted, found) for a, b in zip(x, y)))
+            worst = max(worst, abs(view.fl_x * 2 / size[0] - wanted[0][0]), abs(view.fl_y * 2 / size[1] - wanted[1][1]))
+            worst = max(worst, *(abs(a - b) for x, y in zip(own.matrix_world, view.c2w) for a, b in zip(x, y)))
+print(worst)
+"""
+
+
+def test_a_camera_of_blender_and_its_view_see_the_same() -> None:
+    """Blender's own projection, for every sensor fit and pixel aspect, off-centre; and back again."""
+    pytest.importorskip("bpy")
+    done = subprocess.run([sys.executable, "-c", BLENDER], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert float(done.stdout.splitlines()[-1]) < 1e-5
 
 
 def test_names_are_safe_and_unique() -> None:

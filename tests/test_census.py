@@ -112,7 +112,7 @@ def test_cameras_with_depth_of_field_and_moving_objects_are_named(scene: Any) ->
     report = take_census(scene, findings, freeze_scene(scene).meshes)
     assert report.depth_of_field == ["Close-up"] and report.motion == ["Plane"]
     assert [(f.kind, f.object) for f in findings] == [("ignored", "Plane")]
-    lens = describe(camera).dof
+    lens = describe(camera, scene.render).dof
     assert lens == {"aperture_radius": pytest.approx(50 / 4000), "focus_distance": pytest.approx(5.0)}
 
 

@@ -18,7 +18,6 @@ from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import CameraSettings, Settings, resolve
 from dnrpipe.effects.bundle import bundle_facts, write_without
 from dnrpipe.effects.plan import DepthPilot, EffectPlan, plan_effects
-from dnrpipe.raytrace.sensors import _centred
 from dnrpipe.raytrace.statistics import DepthStep, difference, enough, remaining, significance
 from dnrpipe.studies.effect_costs import override_settings, table
 from dnrtrain.settings import ModelSettings
@@ -310,10 +309,3 @@ def test_only_the_scenes_own_cameras_have_lenses() -> None:
     summary = scene_summary(cameras=[camera | {"dof": lens}, camera | {"dof": None}])
     assert view_lenses(summary, CameraSettings(source="scene")) == {"Main": lens}
     assert view_lenses(summary, CameraSettings()) == {}
-
-
-@given(st.integers(8, 400), st.integers(-100, 900))
-def test_a_film_about_the_principal_point_holds_the_picture(size: int, twice: int) -> None:
-    width, offset = _centred(size, twice / 2)
-    assert width / 2 - offset == twice / 2
-    assert offset >= 0 and offset + size <= width

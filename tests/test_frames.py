@@ -70,8 +70,10 @@ def _run(folder: Path, extra: str, code: str, views: int = 3) -> dict[str, Any]:
 
 
 def _views(count: int) -> list[Any]:
+    """Off-centre, and with pixels that are not square."""
     camera = CameraSettings(train=count, val=0, test=0, width=48, height=32)
-    return [view.model_copy(update={"cx": 22.0, "cy": 17.5}) for view in make_cameras(SUMMARY, camera)["train"]]
+    views = make_cameras(SUMMARY, camera)["train"]
+    return [view.model_copy(update={"fl_y": 0.9 * view.fl_x, "cx": 22.0, "cy": 17.5}) for view in views]
 
 
 def test_a_frame_is_what_mitsuba_itself_renders(tmp_path: Path) -> None:

@@ -106,11 +106,11 @@ def test_a_lost_sample_file_is_said(folder: Path) -> None:
 def test_the_noise_of_a_rendered_view_is_estimated_without_bias(folder: Path) -> None:
     """t-test over seeds: mean squares estimated from the passes against those measured with a long reference.
 
-    Off-centre and with a lens (cropped film, no sensors side by side) as well: the pictures agree with frames.
+    Off-centre, with pixels that are not square, and with a lens as well: the pictures agree with frames.
     """
     plain = [_task(folder, f"{seed}", seed=seed, add=40) for seed in range(16)]
     shifted = _task(folder, "shifted", add=1200)
-    shifted["view"] = {**shifted["view"], "cx": 8.0, "cy": 13.5}
+    shifted["view"] = {**shifted["view"], "fl_y": 30.0, "cx": 8.0, "cy": 13.5}
     lens = {"aperture_radius": 0.08, "focus_distance": 3.0}
     pictures = {"0": {}, "shifted": {"view": shifted["view"]}, "lens": {"view": shifted["view"], "lens": lens}}
     added = [shifted, {**shifted, **_named(folder, "lens"), "lens": lens}]

@@ -63,15 +63,18 @@ def _task(folder: Path, name: str, **changes) -> dict:
 
 
 def test_mitsuba_looks_where_the_view_says() -> None:
-    """Rays of the perspective sensor at pixel centres equal View.ray_directions, off-centre lens included."""
+    """Rays of the sensor at pixel centres equal View.ray_directions: off-centre lens, pixels that are not square, and
+    through the middle of a lens with an aperture; through its rim they meet those in the plane that is in focus."""
     code = """
 import json, sys, numpy as np
 from dnrtrain.contract import View
+from dnrpipe.raytrace import plugins
 from dnrpipe.raytrace.sensors import sensor_dict
 import mitsuba as mi
 mi.set_variant("scalar_rgb")
-view = View.model_validate(json.loads(sys.argv[1]))
-sensor = mi.load_dict(sensor_dict(mi, view))
+plugins.register(mi)
+view, lens = View.model_validate(json.loads(sys.argv[1])), json.loads(sys.argv[2])
+sensor = mi.load_dict(sensor_dict(mi, view, lens))
 directions = view.ray_directions()
 worst = 0.0
 for row in range(0, view.height, 5):
@@ -79,11 +82,21 @@ for row in range(0, view.height, 5):
         at = [(column + 0.5) / view.width, (row + 0.5) / view.height]
         ray, _ = sensor.sample_ray(0, 0, at, [0.5, 0.5])
         worst = max(worst, float(np.abs(np.array(ray.d) - directions[row, column]).max()))
+        assert np.abs(np.array(ray.o) - view.position).max() < 1e-3
+        if lens is not None:
+            rim, _ = sensor.sample_ray(0, 0, at, [0.9, 0.7])
+            assert np.linalg.norm(np.array(rim.o) - view.position) > 0.5 * lens["aperture_radius"]
+            ends = [
+                np.array(one.o) + np.array(one.d) * (lens["focus_distance"] / -(np.array(one.d) @ view.matrix[:3, 2]))
+                for one in (ray, rim)
+            ]
+            worst = max(worst, float(np.abs(ends[0] - ends[1]).max()))
 print(worst)
 """
-    for changes in ({}, {"cx": 10.0, "cy": 25.5}):
-        data = json.dumps(_view(**changes).model_dump(mode="json"))
-        done = subprocess.run([sys.executable, "-c", code, data], capture_output=True, text=True, check=False)
+    aspect, lens = {"fl_y": 1.25 * _view().fl_x}, {"aperture_radius": 0.2, "focus_distance": 3.0}
+    for changes, given in (({}, None), ({"cx": 10.0, "cy": 25.5}, None), (aspect, None), ({**aspect, "cx": 9.7}, lens)):
+        data = [json.dumps(value) for value in (_view(**changes).model_dump(mode="json"), given)]
+        done = subprocess.run([sys.executable, "-c", code, *data], capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
         assert float(done.stdout) < 1e-5
 

@@ -25,7 +25,7 @@ def scene_cameras(scene: bpy.types.Scene) -> list[SceneCamera]:
     with _alone(scene, cameras) as helper:
         helper.frame_set(scene.frame_current, subframe=scene.frame_subframe)
         evaluated = [(obj, obj.evaluated_get(helper.view_layers[0].depsgraph)) for obj in cameras]
-        seeing = [(describe(found), obj == scene.camera) for obj, found in evaluated if usable(found)]
+        seeing = [(describe(found, scene.render), obj == scene.camera) for obj, found in evaluated if usable(found)]
     return [camera.model_copy(update={"active": active}) for camera, active in seeing]
 
 
@@ -99,18 +99,20 @@ def cameras_in_place(scene: bpy.types.Scene, cameras: Sequence[SceneCamera]) -> 
         frames = [camera.frame for camera in cameras if camera.name == name]
         scene.camera = own  # what pictures are taken with is evaluated, wherever it lies
         found |= with_render_graph(
-            scene, lambda engine, graph, own=own, frames=frames: _seen(engine, graph, own, frames)
+            scene, lambda engine, graph, own=own, frames=frames: _seen(scene, engine, graph, own, frames)
         )
     scene.camera = active
     return [found[camera.frame] for camera in cameras]
 
 
-def _seen(engine: Any, graph: Any, camera: Any, frames: Sequence[int | None]) -> dict[int | None, SceneCamera]:
+def _seen(
+    scene: bpy.types.Scene, engine: Any, graph: Any, camera: Any, frames: Sequence[int | None]
+) -> dict[int | None, SceneCamera]:
     now, subframe = graph.scene.frame_current, graph.scene.frame_subframe
     found = {}
     for frame in frames:
         engine.frame_set(frame, 0.0)
-        found[frame] = describe(camera.evaluated_get(graph)).model_copy(update={"frame": frame})
+        found[frame] = describe(camera.evaluated_get(graph), scene.render).model_copy(update={"frame": frame})
     engine.frame_set(now, subframe)
     return found
 
@@ -150,7 +152,9 @@ def _over_frames(
                 scene.frame_current = frame  # drivers may read it of the scene itself
                 helper.frame_set(frame)
                 evaluated = None if camera is None else camera.evaluated_get(helper.view_layers[0].depsgraph)
-                seen = describe(evaluated).model_copy(update={"frame": frame}) if usable(evaluated) else None
+                seen = (
+                    describe(evaluated, scene.render).model_copy(update={"frame": frame}) if usable(evaluated) else None
+                )
                 found.append((frame, camera, seen))
     finally:
         scene.frame_current = before

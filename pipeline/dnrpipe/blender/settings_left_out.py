@@ -27,7 +27,7 @@ def settings_left_out(scene: bpy.types.Scene) -> Iterator[tuple[Any, str, str]]:
     layer = render_layer(scene)
     if render.pixel_aspect_x != render.pixel_aspect_y:
         aspect = f"{render.pixel_aspect_x:g} : {render.pixel_aspect_y:g}"
-        yield "ignored", "pixel aspect", f"pixels are square, not {aspect}"
+        yield "ignored", "pixel aspect", f"{aspect} in views of the scene's own cameras, others have square pixels"
     if render.use_border:
         yield "ignored", "render border", "whole pictures are made"
     if render.use_multiview:

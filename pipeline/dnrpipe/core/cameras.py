@@ -30,7 +30,6 @@ ENCLOSED = 0.75
 """Share of all directions in which the scene's camera meets a surface, from which on it stands inside."""
 DEFAULT_LENS = 50.0  # mm on a 36 mm sensor: Blender's default camera
 DEFAULT_SENSOR = 36.0
-SQUARE_PIXELS = 1e-4  # largest relative difference of fl_x and fl_y that counts as square
 LOWEST, HIGHEST = math.radians(5.0), math.radians(85.0)
 # Splits drawn from different streams, so that asking for more of one leaves the others as they were.
 _STREAM = {"train": 0, "val": 1, "test": 2}
@@ -132,8 +131,7 @@ def _own_views(summary: SceneSummary, settings: CameraSettings) -> list[tuple[Vi
 def read_camera_file(path: Path, settings: CameraSettings) -> list[View]:
     """Views of a NeRF ``transforms.json`` that the whole pipeline can use.
 
-    Raises UserError: broken, several image sizes (the trainer needs one), or pixels that are not square
-    (Mitsuba has square pixels only).
+    Raises UserError: broken, or several image sizes (the trainer needs one).
     """
     try:
         views = parse_transforms(path, (settings.width, settings.height))
@@ -143,12 +141,6 @@ def read_camera_file(path: Path, settings: CameraSettings) -> list[View]:
     if len(sizes) > 1:
         listed = ", ".join(f"{w}x{h}" for w, h in sizes[:4])
         raise UserError(f"{path}: has several image sizes ({listed}); training needs one: resample the cameras")
-    for view in views:
-        if abs(view.fl_x - view.fl_y) > SQUARE_PIXELS * view.fl_x:
-            raise UserError(
-                f"{path}: view {view.name} has fl_x {view.fl_x:g} and fl_y {view.fl_y:g}; the ray tracer needs"
-                " square pixels: resample the cameras"
-            )
     return views
 
 
@@ -285,7 +277,7 @@ def shot_views(shot: ShotFacts, width: int, height: int) -> list[View]:
     Raises UserError: a camera is orthographic or panoramic.
     """
     require_perspective(shot.cameras)
-    return [_scene_view(camera, width, height, shot.pixel_aspect) for camera in shot.cameras]
+    return [_scene_view(camera, width, height) for camera in shot.cameras]
 
 
 def require_perspective(cameras: Sequence[SceneCamera]) -> None:
@@ -299,12 +291,13 @@ def require_perspective(cameras: Sequence[SceneCamera]) -> None:
             )
 
 
-def _scene_view(camera: SceneCamera, width: int, height: int, pixel_aspect: float = 1.0) -> View:
+def _scene_view(camera: SceneCamera, width: int, height: int) -> View:
     """Blender camera -> View. Sensor fit and shift as in Blender's manual, "Camera / Lens".
 
-    pixel_aspect: height of a pixel by its width. Blender measures in widths of pixels: the picture is
-    ``height * pixel_aspect`` of them high (BKE_camera_params_compute_viewplane).
+    Blender measures in widths of pixels: the picture is ``height * pixel_aspect`` of them high
+    (BKE_camera_params_compute_viewplane).
     """
+    pixel_aspect = camera.pixel_aspect
     if camera.sensor_fit == "AUTO":
         side, sensor = max(width, height * pixel_aspect), camera.sensor_width
     elif camera.sensor_fit == "HORIZONTAL":

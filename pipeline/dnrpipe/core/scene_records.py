@@ -48,6 +48,7 @@ class SceneCamera(SceneRecord):
         sensor_fit: "AUTO", "HORIZONTAL" or "VERTICAL".
         shift_x, shift_y: of the longer side of the image, or of the side that ``sensor_fit`` names.
         clip_start, clip_end, ortho_scale: scene units.
+        pixel_aspect: height of a pixel over its width.
     """
 
     frame: int | None = None
@@ -65,6 +66,7 @@ class SceneCamera(SceneRecord):
     clip_end: float
     ortho_scale: float
     dof: Lens | None
+    pixel_aspect: float = 1.0
 
 
 class Standpoint(SceneRecord):

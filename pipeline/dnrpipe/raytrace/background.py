@@ -12,7 +12,7 @@ from dnrtrain.contract import View
 from .engine import Engine
 from .frames import pinhole
 from .recorded import Recorded
-from .sensors import scaled_view
+from .sensors import opaque_camera, scaled_view
 
 CELLS = 2
 """Rays per pixel and side: a sun or a sharp horizon is not jagged."""
@@ -28,18 +28,14 @@ class Background:
 
     def frame(self, view: View) -> np.ndarray:
         """Linear Rec.709, float32 [H, W, 3]."""
-        import drjit as dr
-
         if self.scene.environment() is None:
             return np.zeros((view.height, view.width, 3), np.float32)
-        mi, moved = self.mi, scaled_view(view, self.engine.unit_scale)
-        numbers = (*moved.matrix[:3].ravel(), moved.fl_x, moved.cx, moved.cy)
-        camera = [dr.opaque(mi.Float, float(number)) for number in numbers]
+        camera = opaque_camera(self.mi, scaled_view(view, self.engine.unit_scale))
         values = self.kernel(self.scene, camera, view.width, view.height)
         planes = [np.broadcast_to(np.array(value), view.width * view.height) for value in values]  # a colour may be one
         return np.stack(planes, axis=-1).reshape(view.height, view.width, 3)
 
-    def _kernel(self, scene: Any, camera: list[Any], width: int, height: int) -> list[Any]:
+    def _kernel(self, scene: Any, camera: tuple[list[Any], list[Any]], width: int, height: int) -> list[Any]:
         import drjit as dr
 
         mi = self.mi

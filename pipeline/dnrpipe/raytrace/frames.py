@@ -25,7 +25,7 @@ from .auxiliary import shown_first
 from .engine import Engine
 from .lobes import lets_through, mean_of
 from .recorded import Recorded, prepare_emitters
-from .sensors import scaled_view
+from .sensors import opaque_camera, scaled_view
 from .texels import ATTRIBUTE
 from .visibility import first_visible_of
 
@@ -135,7 +135,7 @@ class Frames:
             raise ValueError(f"rays: is {count}, expected a square number")
 
         @Recorded
-        def kernel(camera: list[Any], pixel: Any, place: Any) -> list[Any]:
+        def kernel(camera: Any, pixel: Any, place: Any) -> list[Any]:
             offset = (mi.Point2f(place % cells, place // cells) + 0.5) / cells
             hit = seen(scene, pinhole(mi, camera, pixel, offset, width), None)
             return [dr.select(hit.is_valid(), mi.Float(1), mi.Float(0))]
@@ -149,7 +149,7 @@ class Frames:
         rays, prototype = self._rays, self.mi.load_dict({"type": "independent"})
 
         @Recorded
-        def kernel(camera: list[Any], seed: Any, samples: Any, start: Any) -> list[Any]:
+        def kernel(camera: Any, seed: Any, samples: Any, start: Any) -> list[Any]:
             sampler = prototype.fork()
             ray = rays(sampler, camera, seed, samples, each, 0, start)
             hit = seen(scene, ray, sampler)
@@ -172,7 +172,7 @@ class Frames:
         cells = math.isqrt(count) if math.isqrt(count) ** 2 == count else 1
 
         @Recorded
-        def kernel(camera: list[Any], seed: Any, samples: Any, start: Any) -> list[Any]:
+        def kernel(camera: Any, seed: Any, samples: Any, start: Any) -> list[Any]:
             sampler = prototype.fork()
             hit = seen(scene, rays(sampler, camera, seed, samples, each, cells, start), sampler)
             return means([dr.select(hit.is_valid(), mi.Float(1), mi.Float(0))], each)
@@ -185,7 +185,7 @@ class Frames:
         mi, scene, integrator = self.mi, self.scene, self.integrator
         rays, means, prototype = self._rays, self._means, mi.load_dict({"type": "independent"})
 
-        def kernel(camera: list[Any], seed: Any, samples: Any, start: Any) -> list[Any]:
+        def kernel(camera: Any, seed: Any, samples: Any, start: Any) -> list[Any]:
             sampler = prototype.fork()
             ray = rays(sampler, camera, seed, samples, each, 1, start)
             colour, valid, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(ray), None, mi.Bool(True))
@@ -202,7 +202,7 @@ class Frames:
         shown, cells = shown_first(self.mi, self.scene), math.isqrt(count) if math.isqrt(count) ** 2 == count else 1
 
         @Recorded
-        def kernel(camera: list[Any], seed: Any, samples: Any, start: Any) -> list[Any]:
+        def kernel(camera: Any, seed: Any, samples: Any, start: Any) -> list[Any]:
             sampler = prototype.fork()
             ray = rays(sampler, camera, seed, samples, each, cells, start)
             albedo, normal, met = shown(scene, ray, sampler, mi.Bool(True))
@@ -210,9 +210,7 @@ class Frames:
 
         return kernel
 
-    def _rays(
-        self, sampler: Any, camera: list[Any], seed: Any, samples: Any, count: int, cells: int, start: Any
-    ) -> Any:
+    def _rays(self, sampler: Any, camera: Any, seed: Any, samples: Any, count: int, cells: int, start: Any) -> Any:
         """Rays through random points of the pixels, one in each of ``cells``² cells; 0 cells: through the centres.
 
         start: the cell of the first of ``count`` rays.
@@ -240,15 +238,14 @@ class Frames:
         dr.eval(values)
         return [dr.block_sum(value, count) / count for value in values]
 
-    def _inputs(self, view: View, seed: int, samples: int) -> tuple[list[Any], Any, Any]:
-        """Camera (c2w's first three rows, focal length, principal point), seed and samples as opaque numbers."""
+    def _inputs(self, view: View, seed: int, samples: int) -> tuple[Any, Any, Any]:
+        """Camera, seed and samples as opaque numbers."""
         import drjit as dr
 
         if (view.width, view.height) != self.size:
             raise ValueError(f"view {view.name}: is {view.width}x{view.height}, the kernels are for {self.size}")
-        mi, moved = self.mi, scaled_view(view, self.engine.unit_scale)
-        numbers = (*moved.matrix[:3].ravel(), moved.fl_x, moved.cx, moved.cy)
-        camera = [dr.opaque(mi.Float, float(number)) for number in numbers]
+        mi = self.mi
+        camera = opaque_camera(mi, scaled_view(view, self.engine.unit_scale))
         return camera, dr.opaque(mi.UInt32, seed), dr.opaque(mi.UInt32, samples)
 
     def _mean(self, make: Callable[[int, int], Any], view: View, rays: int, seed: int) -> np.ndarray:
@@ -295,18 +292,14 @@ def _differs(mask: np.ndarray) -> np.ndarray:
     return np.any(shifted, axis=0) & ~np.all(shifted, axis=0)
 
 
-def pinhole(mi: Any, camera: list[Any], pixel: Any, offset: Any, width: int) -> Any:
-    """Rays through places (0..1, 0..1) of pixels, numbered row by row.
-
-    camera: c2w's first three rows, focal length, principal point (x, y), lengths of the latter in pixels.
-    """
+def pinhole(mi: Any, camera: tuple[list[Any], list[Any]], pixel: Any, offset: Any, width: int) -> Any:
+    """Rays through places (0..1, 0..1) of pixels, numbered row by row. camera: see `sensors.opaque_camera`."""
     import drjit as dr
 
-    x = (mi.Float(pixel % width) + offset.x - camera[13]) / camera[12]
-    y = (mi.Float(pixel // width) + offset.y - camera[14]) / camera[12]
-    # Camera axes are OpenGL's: y up, looking along -z.
-    world = [camera[4 * row] * x - camera[4 * row + 1] * y - camera[4 * row + 2] for row in range(3)]
-    return mi.Ray3f(mi.Point3f(camera[3], camera[7], camera[11]), dr.normalize(mi.Vector3f(*world)))
+    (right, up, back, origin), (fl_x, fl_y, cx, cy) = camera
+    x = (mi.Float(pixel % width) + offset.x - cx) / fl_x
+    y = (mi.Float(pixel // width) + offset.y - cy) / fl_y
+    return mi.Ray3f(mi.Point3f(origin), dr.normalize(right * x - up * y - back))
 
 
 def seen_first(mi: Any, scene: Any) -> Any:

@@ -38,8 +38,6 @@ class GroupedSensor:
         self.together = GROUPS
         while self.together > 1 and self.together * pixels > MAX_WAVEFRONT:
             self.together //= 2
-        if "crop_width" in one["film"]:  # Mitsuba's batch sensor does not know of crops
-            self.together = 1
         self.largest = max(1, MAX_WAVEFRONT // (self.together * pixels))
         sensor = one
         if self.together > 1:

@@ -14,6 +14,9 @@ import numpy as np
 
 from dnrtrain.contract import View
 
+SQUARE = 1e-6
+"""Relative difference of the focal lengths up to which pixels count as square."""
+
 
 def opaque_camera(mi: Any, view: View) -> tuple[list[Any], list[Any]]:
     """(right, up, backwards and place: columns of c2w; fl_x, fl_y, cx, cy in pixels), as data of recorded kernels."""
@@ -25,70 +28,40 @@ def opaque_camera(mi: Any, view: View) -> tuple[list[Any], list[Any]]:
 
 
 def sensor_dict(mi: Any, view: View, lens: dict[str, float] | None = None) -> dict[str, Any]:
-    """Mitsuba ``perspective`` (``thinlens`` with a lens) sensor of a view: box filter, RGBA film.
+    """Mitsuba sensor of a view: box filter, RGBA film.
 
-    Mitsuba looks along +Z with +X left; flipping X and Z takes our OpenGL axes there.
-    The field of view is along x; pixels may be non-square only together with fl_x = fl_y.
+    Mitsuba's ``perspective`` for a pinhole with square pixels, else ``dnr_camera`` (`plugins.cameras`), which scalar
+    variants are slow with. Mitsuba looks along +Z with +X left; flipping X and Z takes our OpenGL axes there.
 
     lens: {"aperture_radius", "focus_distance"}, scene units; Blender's camera with depth of field:
     aperture_radius = lens / (2000 fstop).
     """
     to_world = view.matrix @ np.diag([-1.0, 1.0, -1.0, 1.0])
-    if abs(view.fl_x - view.fl_y) > 1e-3 * view.fl_x:
-        raise ValueError(
-            f"view {view.name}: fl_x and fl_y differ ({view.fl_x:g}, {view.fl_y:g});"
-            " Mitsuba has square pixels only: resample the camera file"
-        )
     common: dict[str, Any] = {
-        "fov_axis": "x",
-        "near_clip": 1e-4,
-        "far_clip": 1e7,
         "to_world": mi.ScalarTransform4f(to_world.tolist()),
         "sampler": {"type": "independent"},
+        "film": {
+            "type": "hdrfilm",
+            "pixel_format": "rgba",
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+            "width": view.width,
+            "height": view.height,
+        },
     }
-    film: dict[str, Any] = {
-        "type": "hdrfilm",
-        "pixel_format": "rgba",
-        "component_format": "float32",
-        "rfilter": {"type": "box"},
-    }
-    if lens is None:
+    if lens is None and math.isclose(view.fl_x, view.fl_y, rel_tol=SQUARE):
         return {
             **common,
             "type": "perspective",
-            "fov": _fov(view.width, view.fl_x),
+            "fov_axis": "x",
+            "near_clip": 1e-4,
+            "far_clip": 1e7,
+            "fov": math.degrees(2 * math.atan(0.5 * view.width / view.fl_x)),
             "principal_point_offset_x": (view.width / 2 - view.cx) / view.width,
             "principal_point_offset_y": (view.height / 2 - view.cy) / view.height,
-            "film": {**film, "width": view.width, "height": view.height},
         }
-    width, left = _centred(view.width, view.cx)
-    height, top = _centred(view.height, view.cy)
-    film |= {"width": width, "height": height}
-    if (width, height) != (view.width, view.height):
-        film |= {"crop_width": view.width, "crop_height": view.height, "crop_offset_x": left, "crop_offset_y": top}
-    return {
-        **common,
-        "type": "thinlens",
-        "fov": _fov(width, view.fl_x),
-        "aperture_radius": lens["aperture_radius"],
-        "focus_distance": lens["focus_distance"],
-        "film": film,
-    }
-
-
-def _fov(width: int, focal: float) -> float:
-    return math.degrees(2 * math.atan(0.5 * width / focal))
-
-
-def _centred(size: int, centre: float) -> tuple[int, int]:
-    """(film size, crop offset) of the smallest film about the principal point that holds the picture.
-
-    ``thinlens`` has no shifted lens: the film is symmetric about ``centre`` and cropped. Exact for a centre at
-    whole or half pixels, else off by at most a quarter of a pixel.
-    """
-    twice = round(2 * centre)
-    offset = max(0, size - twice)
-    return twice + 2 * offset, offset
+    intrinsics = view.model_dump(include={"fl_x", "fl_y", "cx", "cy"})
+    return {**common, "type": "dnr_camera", **intrinsics, **(lens or {})}
 
 
 def unit_scale(bundle: Path) -> float:

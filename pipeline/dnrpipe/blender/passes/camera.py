@@ -64,13 +64,14 @@ def rigid(matrix: mathutils.Matrix) -> list[list[float]]:
     return result.tolist()
 
 
-def describe(camera: bpy.types.Object) -> SceneCamera:
-    """Pose and lens of a camera object."""
+def describe(camera: bpy.types.Object, render: bpy.types.RenderSettings) -> SceneCamera:
+    """Pose and lens of a camera object, with the pixels of the scene's render settings."""
     return SceneCamera(
         name=camera.name,
         c2w=tuple(map(tuple, rigid(camera.matrix_world))),
         **{name: getattr(camera.data, name) for name in LENS},
         dof=_depth_of_field(camera),
+        pixel_aspect=render.pixel_aspect_y / render.pixel_aspect_x,
     )
 
 

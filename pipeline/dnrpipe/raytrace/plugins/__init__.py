@@ -1,4 +1,4 @@
-"""Mitsuba plugins for what Blender has and Mitsuba has not: small Python textures and BSDFs.
+"""Mitsuba plugins for what Blender has and Mitsuba has not: small Python textures, BSDFs, emitters and a camera.
 
 The bundle names them in ``scene.xml`` (types ``dnr_*``), so whoever loads a bundle calls `register` after
 ``mi.set_variant`` and before ``mi.load_file``. In jit variants Dr.Jit compiles them into the render kernel (no
@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 from .. import paths
-from . import emitters, layers, lookups, normals, refraction, sums, transparency
+from . import cameras, emitters, layers, lookups, normals, refraction, sums, transparency
 
 
 def register(mi: Any) -> None:
@@ -23,5 +23,5 @@ def register(mi: Any) -> None:
 
     if dr.is_jit_v(mi.Float):
         paths.register(mi)
-    for family in (lookups, normals, sums, transparency, refraction, emitters, layers):
+    for family in (lookups, normals, sums, transparency, refraction, emitters, layers, cameras):
         family.register(mi)
