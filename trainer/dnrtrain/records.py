@@ -76,7 +76,7 @@ class Progress(Record):
     """How far an unfinished training is.
 
     run: fingerprint of the run that may go on from here. epoch: epochs done. reward_mean: running mean loss of step 1's
-    agent; largest_reward: the largest |r| that it met. average_steps: steps in step 2's averaged weights.
+    agent; reward_unit, largest_reward: running mean and maximum of |r|. average_steps: of step 2's averaged weights.
     """
 
     run: str
@@ -85,6 +85,7 @@ class Progress(Record):
     restarts: list[Restart] = Field(default_factory=list)
     history: list[Epoch]
     reward_mean: float | None = None
+    reward_unit: float | None = None
     largest_reward: float = 0.0
     average_steps: int = 0
 

@@ -161,7 +161,8 @@ class _Step1(TrainingRun[Step1Settings]):
     def more_state(self) -> tuple[checkpoint.Parts, dict[str, Any]]:
         if self.walker is None:
             return {}, {}
-        known = {"reward_mean": self.walker.scale.mean, "largest_reward": self.walker.largest_reward}
+        scale, unit = self.walker.scale, self.walker.unit
+        known = {"reward_mean": scale.mean, "reward_unit": unit, "largest_reward": self.walker.largest_reward}
         return self.walker.parts(), known
 
     def load_more(self, saved: checkpoint.State) -> None:

@@ -22,6 +22,9 @@ PROBES = 4
 MARGIN = 2.0
 """An agent has diverged when its values leave the range that its rewards allow by more than this factor."""
 
+KEEP = 0.95
+"""Share of itself that the unit of Q keeps per reward."""
+
 Look = Callable[[int], tuple[Tensor, Tensor]]
 """A candidate -> (L_DNRc of the renderer on it, with its graph; T of the view, detached)."""
 Step = Callable[[Tensor], bool]
@@ -31,7 +34,9 @@ Step = Callable[[Tensor], bool]
 class Walker:
     """The agent: Q-network, its slow copy, the scale of rewards, and how large rewards and values have been.
 
-    Its weights are trained by the caller, in one loss with the renderer's.
+    Its weights are trained by the caller, in one loss with the renderer's. With raw rewards Q is the network's output
+    times ``unit``, the running mean of |r|: a step of Adam moves the output by some tenths whatever the rewards are,
+    which would be ten times all of −L.
 
     Args:
         candidates: all N views.
@@ -51,6 +56,7 @@ class Walker:
         elif settings.reward == "improvement-all":
             self.probes = list(range(self.count))
         self.scale = RewardScale(raw=settings.reward_scale == "raw")
+        self.unit: float | None = None
         self.largest_reward = 0.0
         self.largest_value = 0.0
 
@@ -96,7 +102,7 @@ class Walker:
             selected[view] = True
             slow = self.slow if s.q_target == "double" else agent
             last = taken == self.budget - 1
-            unit = self._unit()
+            unit = self._worth(reward)
             target = td_target(agent, slow, reward / unit, s.gamma, selected, agent.encode(texture), last)
             loss_rl = (values[view] - target).square()
             if after_the_step:
@@ -123,9 +129,12 @@ class Walker:
             f" allow {allowed / MARGIN:.3g}"
         )
 
-    def _unit(self) -> float:
-        """What the network's output is multiplied by to give Q."""
-        return 1.0 if self.settings.reward.startswith("improvement") else self.scale.unit
+    def _worth(self, reward: float) -> float:
+        """What an output of 1 is worth, once the reward is taken in."""
+        if not self.scale.raw:
+            return 1.0
+        self.unit = abs(reward) if self.unit is None else KEEP * self.unit + (1.0 - KEEP) * abs(reward)
+        return max(self.unit, 1e-8)
 
     @torch.no_grad()
     def _loss_on(self, views: list[int], look: Look) -> float | None:
@@ -144,7 +153,7 @@ class Walker:
             q = self.agent(selected, self.agent.encode(look(order[-1])[1]))
             order.append(best_action(q, selected))
             selected[order[-1]] = True
-            values.append(self._unit() * float(q[order[-1]]))
+            values.append((self.unit or 1.0) * float(q[order[-1]]))
         details: dict[str, Any] = {"reward": self.settings.reward, "measure": "action value when it was taken"}
         if values and np.isfinite(values).all():
             details["action_values"] = values
@@ -160,6 +169,6 @@ class Walker:
     def load(self, saved: checkpoint.State) -> None:
         """Go on from step 1's checkpoint."""
         self.scale = RewardScale(saved.progress.reward_mean, raw=self.settings.reward_scale == "raw")
-        self.largest_reward = saved.progress.largest_reward
+        self.unit, self.largest_reward = saved.progress.reward_unit, saved.progress.largest_reward
         self.agent.load_state_dict(saved.parts["agent"])
         self.slow.load_state_dict(saved.parts["slow"])

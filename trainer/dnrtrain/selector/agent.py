@@ -68,23 +68,17 @@ def epsilon_at(epoch: int, epochs: int, start: float, end: float) -> float:
 
 
 class RewardScale:
-    """Running mean of the coarse loss: the yardstick of loss rewards, and of the values that the network gives.
+    """Running mean of the coarse loss: the yardstick of loss rewards.
 
     −L shrinks fifty-fold while the DNR converges. ``relative`` rewards are (mean − L) / mean: the same ranking of
     episodes (all have equal length, and the mean is common to all views), but of order one throughout training.
-    ``raw`` keeps −L, the paper's. Its values are the network's output times ``unit``, the mean: a step of Adam moves
-    the output by some tenths, whatever the rewards are, which would be ten times all of −L.
+    ``raw`` keeps −L, the paper's.
     """
 
     KEEP = 0.95
 
     def __init__(self, mean: float | None = None, *, raw: bool = False) -> None:
         self.mean, self.raw = mean, raw
-
-    @property
-    def unit(self) -> float:
-        """What an output of 1 is worth."""
-        return max(self.mean, 1e-8) if self.raw and self.mean is not None else 1.0
 
     def reward(self, loss: float) -> float:
         """−loss, or (mean − loss) / mean with the mean before this loss; then takes it in. Non-finite losses are 0."""
