@@ -53,7 +53,6 @@ def look_at_shot(task: ShotTask) -> ShotFacts:
         frame_start=scene.frame_start,
         frame_end=scene.frame_end,
         resolution=picture_size(scene),
-        pixel_aspect=render.pixel_aspect_y / render.pixel_aspect_x,
         film_transparent=render.film_transparent,
         converted=scene.frame_current,
         changes=changes,

@@ -42,7 +42,6 @@ class ShotFacts(SceneRecord):
         fps: frames per second.
         frame_start, frame_end: the file's own range.
         resolution: width and height of the file's pictures, its percentage applied; pixels.
-        pixel_aspect: height of a pixel by its width.
         film_transparent: the file's pictures leave the world behind everything out.
         converted: the frame that a conversion of the file freezes.
         changes: what differs from it, cameras apart; by name.
@@ -56,7 +55,6 @@ class ShotFacts(SceneRecord):
     frame_start: int
     frame_end: int
     resolution: tuple[int, int]
-    pixel_aspect: float
     film_transparent: bool
     converted: int
     changes: list[Change]
