@@ -143,7 +143,8 @@ def markdown(results: dict[str, Any]) -> str:
             worst, least = min(found.scenes.items(), key=lambda item: item[1])
             told = f"over {len(found.scenes)} scenes, {len(both)} pairs, worst {least:+.2f} ({worst})"
             lines.append(f"- {name} to {other}: {interval(found)} dB {told}")
-    timed = [(s, seed) for s in scenes for seed in seeds[:1] if {(s, "untrained", seed), (s, "fresh", seed)} <= set(rows)]
+    first = seeds[0]
+    timed = [(s, first) for s in scenes if {(s, "untrained", first), (s, "fresh", first)} <= set(rows)]
     if timed:
         shares = [rows[s, "untrained", seed]["seconds"] / rows[s, "fresh", seed]["seconds"] for s, seed in timed]
         lines.append(f"- untrained, of fresh's seconds before the first frame: {np.mean(shares):.0%}")
