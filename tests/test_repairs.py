@@ -130,8 +130,8 @@ def test_light_that_is_not_finite_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The baker's count reaches the terminal and the ledger."""
-    task = {"output": str(tmp_path / "light.npz"), "fingerprint": "f", "size": 16, "spp": 4}
-    result = {"seconds": 1.0, "cpu_seconds": 1.0, "peak_mb": 1.0, "texels": 9, "lost": 12}
+    task = {"output": str(tmp_path / "light.npz"), "fingerprint": "f", "size": 16, "spp": 4, "gather": False}
+    result = {"seconds": 1.0, "cpu_seconds": 1.0, "peak_mb": 1.0, "texels": 9, "lost": 12, "gathered": False}
     monkeypatch.setattr(view_tasks, "run_tasks", lambda *_, **__: [TaskResult(task, result)])
     workspace = Workspace.create(tmp_path / "a.dnr", Source(path="a.blend", sha256=""))
     run = Run(workspace, Settings(), Console(quiet=True), "raytrace", "r")
