@@ -86,7 +86,7 @@ def test_an_agent_that_diverges_is_said_and_taken_back(
     def wild(*given: Any) -> float:
         nonlocal calls
         calls += 1
-        return 1e4 if calls <= 60 else td_target(*given)
+        return 1e4 if calls <= 30 else td_target(*given)
 
     monkeypatch.setattr(walker, "td_target", wild)
     settings = Step1Settings(

@@ -76,7 +76,7 @@ class Progress(Record):
     """How far an unfinished training is.
 
     run: fingerprint of the run that may go on from here. epoch: epochs done. reward_mean: running mean loss of step 1's
-    agent; reward_unit, largest_reward: running mean and maximum of |r|. average_steps: of step 2's averaged weights.
+    agent; reward_unit: running mean of its |r|. average_steps: steps in step 2's averaged weights.
     """
 
     run: str
@@ -86,7 +86,6 @@ class Progress(Record):
     history: list[Epoch]
     reward_mean: float | None = None
     reward_unit: float | None = None
-    largest_reward: float = 0.0
     average_steps: int = 0
 
 

@@ -161,9 +161,8 @@ class _Step1(TrainingRun[Step1Settings]):
     def more_state(self) -> tuple[checkpoint.Parts, dict[str, Any]]:
         if self.walker is None:
             return {}, {}
-        scale, unit = self.walker.scale, self.walker.unit
-        known = {"reward_mean": scale.mean, "reward_unit": unit, "largest_reward": self.walker.largest_reward}
-        return self.walker.parts(), known
+        walker = self.walker
+        return walker.parts(), {"reward_mean": walker.scale.mean, "reward_unit": walker.unit}
 
     def load_more(self, saved: checkpoint.State) -> None:
         if self.walker is not None:

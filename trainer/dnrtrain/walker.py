@@ -57,8 +57,7 @@ class Walker:
             self.probes = list(range(self.count))
         self.scale = RewardScale(raw=settings.reward_scale == "raw")
         self.unit: float | None = None
-        self.largest_reward = 0.0
-        self.largest_value = 0.0
+        self.largest_reward = self.largest_value = 0.0  # of the epoch
 
     def episode(self, epoch: int, episode: int, look: Look, step: Step, book: EpochBook) -> None:
         """Select ``budget`` views one after the other; each trains the renderer and the agent.
@@ -73,7 +72,7 @@ class Walker:
         """
         s, agent = self.settings, self.agent
         if episode == 0:
-            self.largest_value = 0.0
+            self.largest_reward = self.largest_value = 0.0
         random = step_random(self.seed, STEP1, epoch, episode)
         epsilon = epsilon_at(epoch, s.epochs, s.epsilon_start, s.epsilon_end)
         selected = torch.zeros(self.count, dtype=torch.bool, device=self.device)
@@ -169,6 +168,6 @@ class Walker:
     def load(self, saved: checkpoint.State) -> None:
         """Go on from step 1's checkpoint."""
         self.scale = RewardScale(saved.progress.reward_mean, raw=self.settings.reward_scale == "raw")
-        self.unit, self.largest_reward = saved.progress.reward_unit, saved.progress.largest_reward
+        self.unit = saved.progress.reward_unit
         self.agent.load_state_dict(saved.parts["agent"])
         self.slow.load_state_dict(saved.parts["slow"])
