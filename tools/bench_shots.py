@@ -244,6 +244,8 @@ def equal_rung(row: dict[str, Any], names: Sequence[str]) -> dict[str, Any] | No
 
 def markdown(results: dict[str, Any]) -> str:
     """Seconds and quality of every shot, and path tracing at equal quality."""
+    if not results["rows"]:
+        return "Not measured yet."
     lines = [
         f"Measured on {results['machine']}.",
         "",

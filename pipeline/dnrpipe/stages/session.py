@@ -113,7 +113,7 @@ class Session:
                 if name == "prepare":
                     self._take_back()
                 raise
-        if self.command not in ("run", "plan", "frontier"):  # these have an answer of their own
+        if self.command not in ("run", "plan", "frontier", "shot"):  # these have an answer of their own
             self.console.result({"workspace": str(self.workspace.root), **self.answers})
 
     def renderer(self) -> None:
