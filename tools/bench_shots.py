@@ -35,11 +35,10 @@ from dnrpipe.stages.shot_scene import look_at_shot
 from dnrpipe.stages.shots.frame_tasks import FrameTask, Way
 from dnrpipe.stages.shots.make_shot import lpips_of
 from dnrpipe.stages.shots.open_shot import parse_size
-from dnrpipe.stages.shots.pilot import REFERENCE, REFERENCE_SEED, compared, shown
-from dnrpipe.stages.shots.render_frames import FRAMES_FOLDER
+from dnrpipe.stages.shots.pilot import REFERENCE, REFERENCE_SEED, compared, display_of, shown
+from dnrpipe.stages.shots.render_frames import FRAMES_FOLDER, frame_outcomes
 from dnrpipe.stages.shots.renderers import path_tracer
 from dnrpipe.stages.stage import Run
-from dnrpipe.workers.task_list import run_tasks
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import View, write_cameras
 from dnrtrain.exr import read_exr
@@ -101,7 +100,7 @@ def measured(scene: Path, root: Path, size: tuple[int, int], frames: int) -> dic
     shot = json.loads(answer.stdout)
     print(f"{scene.stem}: {frames} frames in {seconds:.0f} s by {shot['chosen']['way']['name']}", flush=True)
     pairs = [(i - 1, i) for i in (frames // 3, 2 * frames // 3, frames - 1)]
-    found = beside(root, views, pairs, shot["chosen"]["way"])
+    found = beside(root, views, pairs)
     after = seconds - shot["check"]["seconds"]
     frame = float(np.median(frame_seconds(root)))
     return {
@@ -142,11 +141,12 @@ def arc(scene: Path, root: Path, size: tuple[int, int], frames: int) -> list[Vie
     return views
 
 
-def beside(root: Path, views: Sequence[View], pairs: Sequence[tuple[int, int]], way: dict[str, Any]) -> dict[str, Any]:
+def beside(root: Path, views: Sequence[View], pairs: Sequence[tuple[int, int]]) -> dict[str, Any]:
     """Quality of the shot's frames, and of path tracing with seconds per frame, on pairs of frames."""
     workspace = Workspace.open(root)
     run = Run(workspace, resolve_settings(workspace, {}, None), Console(quiet=True), "render", "bench")
-    lpips, tracer, folder = lpips_of(run), path_tracer(run, background=True), root / "beside"
+    lpips, display, folder = lpips_of(run), display_of(run), root / "beside"
+    tracer = path_tracer(run, background=True)
     numbers = sorted({number for pair in pairs for number in pair})
     ways = [REFERENCE, *(Way(name="path", spp=spp) for spp in LADDER)]
     tasks = [
@@ -162,23 +162,15 @@ def beside(root: Path, views: Sequence[View], pairs: Sequence[tuple[int, int]], 
         for number in numbers
     ]
     spent: dict[int, list[float]] = {}
-    outcomes = run_tasks(
-        "dnrpipe.stages.shots.frame_worker",
-        tracer.common.data(),
-        [task.data() for task in tasks],
-        workers=1,
-        log=root / "logs" / "beside.log",
-        environment=tracer.environment,
-    )
-    for task, outcome in zip(tasks, outcomes, strict=True):
+    for task, outcome in zip(tasks, frame_outcomes(run, tracer, tasks, "beside"), strict=True):
         if outcome.result is None:
             raise SystemExit(f"{task.output}: {outcome.error}")
         spent.setdefault(task.way.spp, []).append(outcome.result["seconds"] + outcome.result["write_seconds"])
-    truth = {n: shown(run, folder / f"{REFERENCE.spp}" / f"{n:05d}.exr") for n in numbers}
+    truth = {n: shown(display, folder / f"{REFERENCE.spp}" / f"{n:05d}.exr") for n in numbers}
     surfaces = {n: surface_of(views[n], folder / f"{REFERENCE.spp}" / f"{n:05d}.exr") for n in numbers}
 
     def figures(path_of: Any) -> dict[str, float]:
-        return quality({n: shown(run, path_of(n)) for n in numbers}, truth, surfaces, pairs, lpips)
+        return quality({n: shown(display, path_of(n)) for n in numbers}, truth, surfaces, pairs, lpips)
 
     ours = figures(lambda n: root / "shots" / "arc" / FRAMES_FOLDER / f"{n + 1:05d}.exr")
     rungs = [

@@ -25,14 +25,17 @@ from .reading.names import find_material
 from .reading.opening import open_scene
 from .shading.materials import MaterialConverter
 from .shading.textures import ImageReader, TextureStore
-from .tasks import BakeOptions, FrameCommon, FrameTask, PendingBakes, PrepareAnswer
+from .tasks import BakeOptions, PendingBakes, PrepareAnswer, SceneAtCommon, SceneAtTask
 
 
 class Worker:
-    """Opens a scene file once, and converts it at one frame per task. common: a `FrameCommon`, task: a `FrameTask`."""
+    """Opens a scene file once, and converts it at one frame per task.
+
+    common: a `SceneAtCommon`, task: a `SceneAtTask`.
+    """
 
     def __init__(self, common: dict[str, Any]) -> None:
-        self.common = FrameCommon.model_validate(common)
+        self.common = SceneAtCommon.model_validate(common)
         open_scene(self.common.source)
         self.scene: Any = bpy.context.scene
         self.world = render_layer(self.scene).world_override or self.scene.world
@@ -42,7 +45,7 @@ class Worker:
         _evaluate_materials(self.scene)
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
-        wanted = FrameTask.model_validate(task)
+        wanted = SceneAtTask.model_validate(task)
         options = self.common.bakes.model_copy(update={"refused": wanted.refused})
         return PrepareAnswer(bakes=self._convert(wanted.frame, wanted.output, options)).data()
 

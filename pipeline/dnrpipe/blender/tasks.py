@@ -109,7 +109,7 @@ class ShotTask(Task):
 # -- scene_at_frame: a converted scene, as it is at other frames ----------------------------------------------------
 
 
-class FrameCommon(Task):
+class SceneAtCommon(Task):
     """A scene file and its conversion.
 
     Args:
@@ -125,7 +125,7 @@ class FrameCommon(Task):
     lit: bool
 
 
-class FrameTask(Task):
+class SceneAtTask(Task):
     """Write the bundle of the scene at ``frame`` into the folder ``output``. Answers a `PrepareAnswer`."""
 
     frame: int

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dnrtrain.atomic import atomic_path
+
+if TYPE_CHECKING:
+    from dnrtrain.display import DisplayTransform
 
 
 def flip_error(truth: np.ndarray, prediction: np.ndarray) -> tuple[float, np.ndarray]:
@@ -21,6 +24,14 @@ def flip_error(truth: np.ndarray, prediction: np.ndarray) -> tuple[float, np.nda
         np.ascontiguousarray(truth, np.float32), np.ascontiguousarray(prediction, np.float32), "LDR"
     )
     return float(mean), np.asarray(heat)
+
+
+def over_white(display: DisplayTransform, image: np.ndarray) -> Any:
+    """Premultiplied linear RGBA [H, W, 4] -> display RGB over white, torch [1, 3, H, W]."""
+    import torch
+
+    planes = torch.from_numpy(np.ascontiguousarray(image, dtype=np.float32)).permute(2, 0, 1)[None]
+    return display.over_white(planes[:, :3], planes[:, 3:])
 
 
 def picture_of(tensor: Any) -> np.ndarray:

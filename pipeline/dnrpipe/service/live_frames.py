@@ -25,7 +25,7 @@ import numpy as np
 from PIL import Image
 
 from dnrpipe.core.errors import UserError
-from dnrpipe.core.images import flip_error, picture_of
+from dnrpipe.core.images import flip_error, over_white, picture_of
 from dnrpipe.core.settings import Settings
 from dnrpipe.raytrace.base_renderer import BaseRenderer
 from dnrpipe.raytrace.base_worker import Worker as BaseWorker
@@ -34,7 +34,6 @@ from dnrpipe.raytrace.frames import Frames
 from dnrpipe.raytrace.history import History
 from dnrpipe.raytrace.light_worker import read_light
 from dnrpipe.stages.trainer import torch_device
-from dnrpipe.studies.frames.scene import shown
 from dnrtrain.checkpoint import load_model
 from dnrtrain.contract import RASTER_CHANNELS, SceneFrame, View, require_channels
 from dnrtrain.dataset import view_in_memory
@@ -189,7 +188,7 @@ class Worker:
 
     def _over_white(self, rgba: np.ndarray) -> np.ndarray:
         """Linear premultiplied RGBA [H, W, 4] -> display RGB over white, float32 [H, W, 3]."""
-        return shown(self.display, rgba)[0].permute(1, 2, 0).numpy()
+        return over_white(self.display, rgba)[0].permute(1, 2, 0).numpy()
 
 
 def encode(picture: np.ndarray, fine: bool) -> tuple[bytes, str]:

@@ -15,23 +15,20 @@ import numpy as np
 
 from dnrtrain.contract import View
 
-from ..core.cameras import spread
 from ..effects.store import lenses
 from ..raytrace.variants import choose_variant
-from ..workers.task_list import run_tasks
-from ..workers.view_tasks import warn_of_retries
 from .records import BaselineRung
 from .shots.frame_tasks import FrameTask, Way
-from .shots.pilot import LADDER, compared, shown
+from .shots.pilot import LADDER, compared, display_of, shown
+from .shots.render_frames import frame_outcomes
 from .shots.renderers import path_tracer
 from .stage import Run
 
-VIEWS = 2
 SEED = 3
 
 
 def measure_baseline(run: Run, views: Sequence[View], truths: dict[str, Any], lpips: Any) -> list[BaselineRung]:
-    """Path tracing at the samples of LADDER on VIEWS of the views, denoised, with what a frame takes.
+    """Path tracing at the samples of LADDER, denoised, with what a frame takes; means of the views.
 
     Args:
         truths: references by view name, display RGB over white, torch [1, 3, H, W].
@@ -41,10 +38,10 @@ def measure_baseline(run: Run, views: Sequence[View], truths: dict[str, Any], lp
     """
     if choose_variant(run.settings.raytrace.variant).variant.startswith("scalar"):
         return []
-    chosen, tracer = spread(views, VIEWS), path_tracer(run, background=False)
+    tracer, display = path_tracer(run, background=False), display_of(run)
     known = lenses(run.workspace, run.settings) if run.effect_plan.on("depth-of-field") else {}
     rows: dict[int, list[tuple[float, dict[str, float]]]] = {}
-    with tempfile.TemporaryDirectory() as scratch, run.console.bar("rival", len(LADDER) * len(chosen)) as bar:
+    with tempfile.TemporaryDirectory() as scratch, run.console.bar("rival", len(LADDER) * len(views)) as bar:
         tasks = [
             FrameTask(
                 view=view,
@@ -56,25 +53,16 @@ def measure_baseline(run: Run, views: Sequence[View], truths: dict[str, Any], lp
                 fingerprint="",
             )
             for spp in LADDER
-            for view in chosen
+            for view in views
         ]
-        outcomes = run_tasks(
-            "dnrpipe.stages.shots.frame_worker",
-            tracer.common.data(),
-            [task.data() for task in tasks],
-            workers=1,  # it has the machine, as the renderer's frames have
-            log=run.log,
-            retried=warn_of_retries("rival", run.console),
-            environment=tracer.environment,
-        )
-        for task, outcome in zip(tasks, outcomes, strict=True):
+        for task, outcome in zip(tasks, frame_outcomes(run, tracer, tasks, "rival"), strict=True):
             if outcome.result is None:
                 run.console.warn(f"path tracing with a denoiser was not measured: {outcome.error}")
                 return []
             seconds = outcome.result["seconds"]
             size = {"width": task.view.width, "height": task.view.height}
             run.book("evaluation", "view", f"rival/{task.output.stem}", seconds, spp=task.way.spp, **size)
-            figures = compared(shown(run, task.output), truths[task.view.name], lpips)
+            figures = compared(shown(display, task.output), truths[task.view.name], lpips)
             rows.setdefault(task.way.spp, []).append((seconds, figures))
             bar.advance()
     return [

@@ -21,7 +21,6 @@ from ..core.settings import Settings
 from ..core.units import duration
 from ..core.workspace import Workspace, digest
 from .base_images import RENDERED, base_path, base_views
-from .baseline import VIEWS as BASELINE_VIEWS
 from .baseline import measure_baseline
 from .raytrace import trace_views
 from .records import METRICS, Metrics, ViewMetrics, equal_rung
@@ -33,6 +32,8 @@ if TYPE_CHECKING:
     from dnrtrain.model import DNR
 
 NEURAL_REPEATS = 5
+BASELINE_VIEWS = 2
+"""Test views on which path tracing with a denoiser is timed."""
 
 
 def evaluate(run: Run) -> Outcome:
@@ -112,7 +113,6 @@ def evaluate(run: Run) -> Outcome:
         neural_ms=1000 * float(np.median(neural_seconds)),
         **_baseline(run, views, truths, rows, lpips["alex"] if lpips else None),
     )
-    told = _tell_baseline(metrics)
     names = {view.name for view in views}
     for path in workspace.evaluation.glob("[!.]*.png"):
         if path.name.rsplit(".", 2)[0] not in names:  # of other cameras
@@ -126,7 +126,7 @@ def evaluate(run: Run) -> Outcome:
         + (f"; base image {mean['psnr_base']:.2f} dB" if mean["psnr_base"] is not None else "")
         + (f", shipped corrector {mean['psnr_shipped']:.2f} dB" if mean["psnr_shipped"] is not None else "")
     )
-    if told:
+    if told := _tell_baseline(metrics):
         console.say(told)
     stable = [{k: v for k, v in row.data().items() if not k.startswith("seconds")} for row in rows]
     return Outcome(digest(stable), {"mean": mean, "views": len(rows), "perceptual": perceptual is not None})
@@ -138,9 +138,10 @@ def _baseline(
     """Fields of `Metrics` on path tracing with a denoiser; none where the settings leave it out."""
     if not run.settings.raytrace.evaluation_baseline:
         return {}
-    rungs = measure_baseline(run, views, truths, lpips)
-    chosen = {view.name for view in spread(views, BASELINE_VIEWS)}
-    own = [row.psnr for row in rows if row.name in chosen and row.psnr is not None]
+    chosen = spread(views, BASELINE_VIEWS)
+    rungs = measure_baseline(run, chosen, truths, lpips)
+    names = {view.name for view in chosen}
+    own = [row.psnr for row in rows if row.name in names and row.psnr is not None]
     return {"baseline": rungs, "baseline_psnr": float(np.mean(own)) if own else None}
 
 

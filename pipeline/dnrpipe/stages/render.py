@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -153,24 +154,30 @@ def write_frame_exr(path: Path, picture: np.ndarray, radiance: Any, data: Any, v
     write_exr(path, {c: rgba[..., i] for i, c in enumerate("RGBA")}, {"view": view.model_dump(mode="json")})
 
 
-def write_mp4(path: Path, pictures: Sequence[np.ndarray]) -> None:
-    """H.264 in MP4 by ffmpeg (imageio-ffmpeg carries it); uint8 [H, W, 3] each. Odd sizes are padded white."""
+def write_mp4(path: Path, pictures: Iterable[np.ndarray], fps: float = FPS, *, edge: bool = False) -> None:
+    """H.264 in MP4 by ffmpeg (imageio-ffmpeg carries it); uint8 [H, W, 3] each, one after the other.
+
+    edge: odd sizes are padded with the picture's edge, instead of white.
+    """
     import imageio_ffmpeg
 
-    height, width = pictures[0].shape[:2]
+    left = iter(pictures)
+    first = next(left)
+    height, width = first.shape[:2]
     pad = ((0, height % 2), (0, width % 2), (0, 0))
     with atomic_path(path) as temporary:
         writer = imageio_ffmpeg.write_frames(
             str(temporary),
             (width + width % 2, height + height % 2),
-            fps=FPS,
+            fps=fps,  # pyright: ignore[reportArgumentType]: it is printed with two digits
             quality=8,
             macro_block_size=2,
             ffmpeg_log_level="error",
         )
         writer.send(None)
-        for picture in pictures:
-            writer.send(np.ascontiguousarray(np.pad(picture, pad, constant_values=255)))
+        for picture in chain([first], left):
+            padded = np.pad(picture, pad, mode="edge") if edge else np.pad(picture, pad, constant_values=255)
+            writer.send(np.ascontiguousarray(padded))
         writer.close()
 
 

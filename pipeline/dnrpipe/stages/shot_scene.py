@@ -9,7 +9,7 @@ from pathlib import Path
 
 from dnrtrain.atomic import write_json
 
-from ..blender.tasks import BakeOptions, FrameCommon, FrameTask, PrepareAnswer, ShotTask
+from ..blender.tasks import BakeOptions, PrepareAnswer, SceneAtCommon, SceneAtTask, ShotTask
 from ..core.errors import UserError
 from ..core.scene_files import read_conversion, read_summary
 from ..core.scene_records import Conversion
@@ -72,7 +72,7 @@ def convert_frames(run: Run, frames: Sequence[int], done: Callable[[int, Path], 
     if not source.is_file():
         raise UserError(f"{source}: the scene file is gone; moving things are converted from it, frame by frame")
     size = run.settings.passes.bake_size
-    common = FrameCommon(
+    common = SceneAtCommon(
         source=source.resolve(),
         scene_dir=workspace.scene.resolve(),
         bakes=BakeOptions(folder=(workspace.root / BAKES).resolve(), size=size),
@@ -102,11 +102,11 @@ def convert_frames(run: Run, frames: Sequence[int], done: Callable[[int, Path], 
 
 
 def _answers(
-    run: Run, common: FrameCommon, frames: Sequence[int], refused: tuple[str, ...]
+    run: Run, common: SceneAtCommon, frames: Sequence[int], refused: tuple[str, ...]
 ) -> Iterator[tuple[int, PrepareAnswer]]:
     """(frame, what its worker answers), as they come."""
     tasks = [
-        FrameTask(frame=frame, output=_fresh(scene_at(run.workspace, frame)).resolve(), refused=refused)
+        SceneAtTask(frame=frame, output=_fresh(scene_at(run.workspace, frame)).resolve(), refused=refused)
         for frame in frames
     ]
     for outcome in run_tasks(
@@ -119,7 +119,7 @@ def _answers(
     ):
         if outcome.result is None:
             raise UserError(str(outcome.error))
-        yield FrameTask.model_validate(outcome.task).frame, PrepareAnswer.model_validate(outcome.result)
+        yield SceneAtTask.model_validate(outcome.task).frame, PrepareAnswer.model_validate(outcome.result)
 
 
 def _fresh(folder: Path) -> Path:

@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from ...core.cameras import spread
 from ...core.images import flip_error, picture_of, write_png
+from ...core.workspace import digest
 from ..stage import Run
 from .frame_tasks import FrameTask, Way
-from .pilot import REFERENCE_SEED, compared, shown
+from .pilot import REFERENCE_SEED, compared, display_of, shown
 from .records import Check, ShotFrame
 from .render_frames import frame_path, render_frames
 from .renderers import Renderer
@@ -22,8 +24,6 @@ SPP = 256
 
 def held_out(frames: Sequence[ShotFrame], count: int) -> list[int]:
     """Places of the frames to check: spread over the shot; of those with moving things one, where there are any."""
-    from ...core.cameras import spread
-
     still = [i for i, frame in enumerate(frames) if not frame.moving]
     moving = [i for i, frame in enumerate(frames) if frame.moving]
     if not moving or not still:
@@ -43,7 +43,7 @@ def check(
 
     tracers: (path tracer, places of the frames to check by it).
     """
-    started = time.monotonic()
+    started, display = time.monotonic(), display_of(run)
     way = Way(name="path", spp=SPP)
     rows: list[dict[str, float]] = []
     numbers: list[int] = []
@@ -66,7 +66,7 @@ def check(
         render_frames(run, tracer, tasks, label="frames to check by", purpose="evaluation")
         for place, task in zip(places, tasks, strict=True):
             frame = frames[place]
-            ours, truth = shown(run, frame_path(folder, frame)), shown(run, task.output)
+            ours, truth = shown(display, frame_path(folder, frame)), shown(display, task.output)
             flip, heat = flip_error(picture_of(truth[0]), picture_of(ours[0]))
             write_png(task.output.with_suffix(".error.png"), heat)
             write_png(task.output.with_suffix(".ours.png"), picture_of(ours[0]))
@@ -85,6 +85,4 @@ def check(
 
 
 def _fingerprint(inputs: Any, frame: ShotFrame, way: Way) -> str:
-    from ...core.workspace import digest
-
     return digest(["check", inputs, frame.model_dump(mode="json"), way.model_dump(mode="json")])

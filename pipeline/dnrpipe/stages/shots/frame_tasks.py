@@ -22,23 +22,21 @@ from ...core.scene_records import Lens
 from ...raytrace.tasks import Costs, Task
 
 WayName = Literal["path", "base", "neural"]
-Quality = Literal["high", "fast"]
 
 
 class Way(BaseModel):
-    """How a frame is rendered. spp, quality: samples per pixel and the denoiser's network, of ``path``."""
+    """How a frame is rendered. spp: samples per pixel, of ``path``."""
 
     model_config = ConfigDict(frozen=True)
 
     name: WayName
     spp: int = 0
-    quality: Quality = "high"
 
     @property
     def told(self) -> str:
         """In words, for tables."""
         if self.name == "path":
-            return f"path tracing, {self.spp} samples, denoised" + (" (fast)" if self.quality == "fast" else "")
+            return f"path tracing, {self.spp} samples, denoised"
         return "base images alone" if self.name == "base" else "neural renderer"
 
 

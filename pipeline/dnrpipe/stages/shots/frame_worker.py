@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from dnrpipe.core.errors import UserError
-from dnrpipe.core.images import write_png
+from dnrpipe.core.images import over_white, write_png
 from dnrpipe.core.settings import Settings
 from dnrpipe.raytrace.background import Background
 from dnrpipe.raytrace.base_worker import Worker as BaseWorker
@@ -29,7 +29,7 @@ from dnrtrain.exr import write_exr
 from dnrtrain.model import render
 
 from ..trainer import torch_device
-from .frame_tasks import FrameAnswer, FrameCommon, FrameTask, Way
+from .frame_tasks import FrameAnswer, FrameCommon, FrameTask
 
 COLOUR = ("R", "G", "B", "A")
 LAYERS = (*COLOUR, "depth.Z", "normal.X", "normal.Y", "normal.Z", "albedo.R", "albedo.G", "albedo.B", "object.Id")
@@ -50,10 +50,7 @@ class Worker:
         self.common = settings = FrameCommon.model_validate(common)
         self.display = DisplayTransform(settings.frame, settings.scene)
         self.base = None if settings.base is None else BaseWorker(settings.base)
-        if self.base is not None and self.base.bundle == settings.bundle:
-            self.engine = self.base.engine
-        else:
-            self.engine = Engine(settings.variant, 0, [settings.bundle])
+        self.engine = self.base.engine if self.base is not None else Engine(settings.variant, 0, [settings.bundle])
         if not self.engine.compiled:
             raise UserError("shots need a jit variant of Mitsuba (LLVM or CUDA); see `dnrpipe doctor`")
         self.frames = functools.cache(
@@ -128,10 +125,8 @@ class Worker:
 
     def shown(self, layers: dict[str, np.ndarray]) -> np.ndarray:
         """Display RGB over white, float32 [H, W, 3] in [0, 1]."""
-        import torch
-
-        planes = torch.from_numpy(np.stack([layers[name] for name in COLOUR]).astype(np.float32))[None]
-        return self.display.over_white(planes[:, :3], planes[:, 3:])[0].permute(1, 2, 0).numpy()
+        image = np.stack([layers[name] for name in COLOUR], axis=-1)
+        return over_white(self.display, image)[0].permute(1, 2, 0).numpy()
 
     def _from_base(self, task: FrameTask, timed: Callable[..., Any]) -> tuple[dict[str, np.ndarray], int]:
         if self.base is None:
@@ -160,11 +155,11 @@ class Worker:
         return radiance[0].permute(1, 2, 0).numpy()
 
     def _path(self, task: FrameTask, timed: Callable[..., Any]) -> tuple[dict[str, np.ndarray], int]:
-        view, way = task.view, task.way
+        view = task.view
         frames = self.frames((view.width, view.height))
         image, lost = masked(timed("path tracing", self._traced, task, frames))
         guide = timed("primary rays", frames.auxiliary, view, GUIDE_RAYS, task.seed)
-        clean = timed("denoiser", _denoised, image, guide, way)
+        clean = timed("denoiser", denoise, image, guide.albedo, guide.normal)
         gbuffer, more = masked_channels(timed("G-buffer", frames.gbuffer, view))
         alpha = guide.coverage if task.lens is None else image[..., 3]
         layers = {name: clean[..., i] for i, name in enumerate("RGB")} | {"A": alpha}
@@ -189,7 +184,3 @@ def _at_once(task: FrameTask) -> int:
     """Samples per pixel of one launch: a power of two, so that few kernels are compiled."""
     most = min(task.way.spp, MAX_RAYS // (task.view.width * task.view.height))
     return 1 << max(0, most.bit_length() - 1)
-
-
-def _denoised(image: np.ndarray, guide: Any, way: Way) -> np.ndarray:
-    return denoise(image, guide.albedo, guide.normal, clean=True, quality=way.quality)

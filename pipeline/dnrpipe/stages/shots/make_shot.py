@@ -19,8 +19,9 @@ from ...core.scene_files import scene_fingerprint
 from ...core.units import duration
 from ...core.workspace import digest, file_sha256
 from ...workers.view_tasks import is_made
-from ..base_images import BASE_VERSION
+from ..base_images import BASE_VERSION, base_renderer
 from ..effect_plan import resolve_plan
+from ..render import write_mp4
 from ..session import Session
 from ..shot_scene import convert_frames, scene_at
 from ..stage import Run
@@ -30,12 +31,12 @@ from .frame_tasks import Way
 from .options import Wanted, choose
 from .plan_shot import lines, moving_way, weigh
 from .records import PLAN, RECORD, ShotFrame, ShotPlan, ShotRecord, facts
-from .render_frames import frame_tasks, picture_path, render_frames, write_movie
+from .render_frames import frame_tasks, pictures, render_frames
 from .renderers import Renderer, path_tracer, shipped_renderer, trained_renderer
 
 CHECKED = 2
 """Frames of a shot that are traced to check it."""
-PLAN_VERSION = 1
+PLAN_VERSION = 2
 GATHER_FROM = 0.4
 """Share of the light that direct light alone would miss, from which on it is gathered: it pays at 0.49 (`interior`) and
 does not at 0.21 (`materials`)."""
@@ -71,13 +72,14 @@ def plan_shot(session: Session, shot: Shot) -> ShotPlan:
     fingerprint = digest([PLAN_VERSION, *inputs, frames, run.settings.model_dump(mode="json")])
     plan = read(path, ShotPlan) if path.exists() and not session.options["force"] else None
     if plan is None or plan.fingerprint != fingerprint:
-        options = weigh(run, shot.frames, folder_of(run, shot) / "pilot", shot.wanted, tracer, lpips_of(run))
+        options, trust = weigh(run, shot.frames, folder_of(run, shot) / "pilot", shot.wanted, tracer, lpips_of(run))
         chosen, why = choose(options, shot.wanted)
         plan = ShotPlan(
             fingerprint=fingerprint,
             options=tuple(options),
             chosen=chosen,
             why=why,
+            trust=trust,
             seconds=time.monotonic() - started,
         )
         write(path, plan)
@@ -104,14 +106,16 @@ def make_shot(session: Session, shot: Shot, plan: ShotPlan) -> ShotRecord:
     started = time.monotonic()
     run, chosen = session.run.for_stage("render"), plan.chosen
     folder, tracer = folder_of(run, shot), path_tracer(run, shot.background)
-    renderer = tracer
-    if chosen.way.name != "path":
-        renderer = shipped_renderer(run, shot.background)
-        if chosen.views:
-            session.settings = session.settings.with_budget(chosen.views)
-            session.stages("select", "raytrace", "finetune")
-            run = session.run.for_stage("render")
-            renderer = trained_renderer(run, shot.background)
+    if chosen.way.name == "path":
+        renderer = tracer
+    elif chosen.views:
+        session.settings = session.settings.with_budget(chosen.views)
+        session.stages("select", "raytrace", "finetune")
+        run = session.run.for_stage("render")
+        renderer = trained_renderer(run, shot.background)
+    else:
+        assert plan.trust is not None  # ways with baked light were weighed
+        renderer = shipped_renderer(run, shot.background, plan.trust)
     inputs = _inputs(run, renderer)
     still = [place for place, frame in enumerate(shot.frames) if not frame.moving]
     tasks = frame_tasks(shot.frames, folder, chosen.way, inputs, still)
@@ -119,7 +123,7 @@ def make_shot(session: Session, shot: Shot, plan: ShotPlan) -> ShotRecord:
     places = held_out(shot.frames, CHECKED)
     way_of_moving = render_moving(run, shot, plan, tracer, inputs, places)
     movie = folder / f"{shot.name}.mp4"
-    write_movie(movie, [picture_path(folder, frame) for frame in shot.frames], shot.fps)
+    write_mp4(movie, pictures(folder, shot.frames), shot.fps, edge=True)
     spent = time.monotonic() - started
     tracers = [(tracer, [place for place in places if not shot.frames[place].moving])]
     tracers += [
@@ -199,14 +203,10 @@ def _inputs(run: Run, renderer: Renderer) -> str:
         from dnrtrain.shipped import WEIGHTS
 
         model = [file_sha256(WEIGHTS)]
-    light = base_fingerprint(run) if renderer.common.base is not None else ""
+    light = ""
+    if renderer.common.base is not None:
+        light = base_renderer(run.workspace, run.settings, run.effect_plan).fingerprint
     return digest([BASE_VERSION, scene_fingerprint(run.workspace), common, model, light])
-
-
-def base_fingerprint(run: Run) -> str:
-    from ..base_images import base_renderer
-
-    return base_renderer(run.workspace, run.settings, run.effect_plan).fingerprint
 
 
 def _tell(run: Run, record: ShotRecord) -> None:

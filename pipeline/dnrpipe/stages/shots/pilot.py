@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,12 +20,17 @@ from dnrtrain.exr import read_exr
 
 from ...core.cameras import scaled_to, spread
 from ...core.errors import UserError
-from ...workers.task_list import run_tasks
-from ...workers.view_tasks import warn_of_retries
+from ...core.images import over_white
+from ...core.scene_files import read_frame
 from ..stage import Run
-from .frame_tasks import FrameCommon, FrameTask, Way
+from .frame_tasks import FrameTask, Way
 from .frame_worker import COLOUR
 from .records import ShotFrame
+from .render_frames import frame_outcomes
+from .renderers import Renderer
+
+if TYPE_CHECKING:
+    from dnrtrain.display import DisplayTransform
 
 FRAMES, SIDE = 2, 256
 """Frames of the pilot, and pixels of their longer side."""
@@ -50,16 +55,16 @@ class Measured:
 
 
 class Pilot:
-    """Renders the pilot's frames of a shot. common: of the process that renders its frames."""
+    """Renders the pilot's frames of a shot."""
 
     def __init__(self, run: Run, frames: Sequence[ShotFrame], folder: Path, lpips: Any) -> None:
         still = [i for i, frame in enumerate(frames) if not frame.moving]
         self.run, self.frames, self.folder, self.lpips = run, frames, folder, lpips
+        self.display = display_of(run)
         self.chosen = spread(still or range(len(frames)), FRAMES)  # where all move: as converted
-        self.seconds = 0.0
         self.references: dict[int, Any] = {}
 
-    def measure(self, common: FrameCommon, environment: dict[str, str], ways: Sequence[Way]) -> list[Measured]:
+    def measure(self, renderer: Renderer, ways: Sequence[Way]) -> list[Measured]:
         """The ways on the frames, one after the other in a process of its own.
 
         Raises UserError: a frame failed twice.
@@ -78,30 +83,21 @@ class Pilot:
         found: dict[Way, list[tuple[float, float, Any]]] = {}
         label = "pilot: " + ("path tracing" if ways[-1].name == "path" else "base image and network")
         with self.run.console.bar(label, len(tasks)) as bar:
-            outcomes = run_tasks(
-                "dnrpipe.stages.shots.frame_worker",
-                common.data(),
-                [task.data() for task in tasks],
-                workers=1,
-                log=self.run.log,
-                retried=warn_of_retries("pilot", self.run.console),
-                environment=environment,
-            )
+            outcomes = frame_outcomes(self.run, renderer, tasks, "pilot")
             for (way, index, counts), task, outcome in zip(keys, tasks, outcomes, strict=True):
                 if outcome.result is None:
                     raise UserError(f"{label} failed twice: {outcome.error}; see {self.run.log}")
-                self.seconds += outcome.seconds
                 self.run.book(
                     "training",
                     "view",
-                    f"pilot/{way.name} {way.spp}".rstrip(" 0") if way.name != "path" else f"pilot/path {way.spp}",
+                    f"pilot/path {way.spp}" if way.name == "path" else f"pilot/{way.name}",
                     outcome.result["seconds"],
                     cpu_seconds=outcome.result["cpu_seconds"],
                     width=task.view.width,
                     height=task.view.height,
                 )
                 if counts:
-                    picture = self._picture(task.output)
+                    picture = shown(self.display, task.output)
                     spent = outcome.result["seconds"] + outcome.result["write_seconds"]
                     found.setdefault(way, []).append((spent, outcome.seconds - spent, (index, picture)))
                 bar.advance(note=way.told)
@@ -144,10 +140,6 @@ class Pilot:
             fingerprint="",
         )
 
-    def _picture(self, path: Path) -> Any:
-        """Display RGB over white, torch [1, 3, H, W]."""
-        return shown(self.run, path)
-
 
 def compared(picture: Any, truth: Any, lpips: Any) -> dict[str, float]:
     """psnr (dB), ssim and, where the pictures are large enough for it, lpips of display pictures [1, 3, H, W]."""
@@ -161,18 +153,17 @@ def compared(picture: Any, truth: Any, lpips: Any) -> dict[str, float]:
     return {name: value for name, value in named.items() if value is not None}
 
 
-def shown(run: Run, path: Path) -> Any:
-    """A frame's file as display RGB over white, torch [1, 3, H, W]. Raises DamagedFile."""
-    import torch
-
+def display_of(run: Run) -> DisplayTransform:
+    """The scene's display transform. Raises DamagedFile."""
     from dnrtrain.display import DisplayTransform
 
-    from ...core.scene_files import read_frame
+    return DisplayTransform(read_frame(run.workspace), run.workspace.scene)
 
+
+def shown(display: DisplayTransform, path: Path) -> Any:
+    """A frame's file as display RGB over white, torch [1, 3, H, W]. Raises DamagedFile."""
     channels, _ = read_exr(path)
-    display = DisplayTransform(read_frame(run.workspace), run.workspace.scene)
-    planes = torch.from_numpy(np.stack([channels[name] for name in COLOUR]))[None]
-    return display.over_white(planes[:, :3], planes[:, 3:]).clamp(0, 1)
+    return over_white(display, np.stack([channels[name] for name in COLOUR], axis=-1)).clamp(0, 1)
 
 
 def between(measured: Sequence[Measured]) -> list[Measured]:

@@ -19,7 +19,7 @@ from .frame_tasks import Way
 from .options import Option, Wanted
 from .pilot import LADDER, Measured, Pilot, between
 from .records import ShotFrame
-from .renderers import Renderer, shipped_renderer
+from .renderers import Renderer, shipped_renderer, trusted_share
 
 OURS = (Way(name="base"), Way(name="neural"))
 LIGHT_PATH = 2.5
@@ -41,20 +41,20 @@ class Shape:
 
 def weigh(
     run: Run, frames: Sequence[ShotFrame], folder: Path, wanted: Wanted, tracer: Renderer, lpips: Any
-) -> list[Option]:
-    """Ways to make the shot."""
+) -> tuple[list[Option], float | None]:
+    """(ways to make the shot, share of the shipped corrector that is trusted or None where it is not weighed)."""
     view = frames[0].view
     moving = sum(bool(frame.moving) for frame in frames)
     shape = Shape(len(frames) - moving, moving, view.width * view.height, _conversion_seconds(run))
     pilot = Pilot(run, frames, folder, lpips)
     rungs = [Way(name="path", spp=spp) for spp in LADDER]
-    ladder = between(pilot.measure(tracer.common, tracer.environment, rungs))
+    ladder = between(pilot.measure(tracer, rungs))
     options = [path_option(found, shape) for found in ladder]
     if why := _no_baked_light(run, frames, shape, ladder, wanted):
         run.console.say(f"baked light is not weighed: {why}")
-        return options
-    ours = shipped_renderer(run, tracer.common.background)
-    measured = pilot.measure(ours.common, ours.environment, OURS)
+        return options, None
+    trust = trusted_share(run)
+    measured = pilot.measure(shipped_renderer(run, tracer.common.background, trust), OURS)
     options += [baked_option(found, options, shape) for found in measured]
     if _wants_more(options, wanted) and wanted.way in (None, "neural"):
         found = worth(run, shape.still)
@@ -72,7 +72,7 @@ def weigh(
                     }
                 )
             )
-    return options
+    return options, trust
 
 
 def path_option(found: Measured, shape: Shape) -> Option:

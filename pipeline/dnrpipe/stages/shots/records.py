@@ -41,6 +41,7 @@ class ShotPlan(Record):
     Args:
         fingerprint: of all that it was made from.
         options: what was weighed. chosen: of them; why: in a sentence.
+        trust: share of the shipped corrector's correction that is applied; None where it was not weighed.
         seconds: what it took, baked light included.
     """
 
@@ -49,6 +50,7 @@ class ShotPlan(Record):
     chosen: Option
     why: str
     seconds: float
+    trust: float | None = None
 
 
 class Check(Record):

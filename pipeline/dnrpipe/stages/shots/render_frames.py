@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dnrtrain.atomic import atomic_path
-
 from ...core.ledger import Purpose
 from ...core.workspace import digest
 from ...workers.placement import HERE
+from ...workers.task_list import TaskResult, run_tasks
+from ...workers.view_tasks import warn_of_retries
 from ..base_images import CHUNK, WARM_UP
 from ..stage import Run
 from .frame_tasks import FrameTask, Way
@@ -20,6 +20,7 @@ from .records import ShotFrame
 from .renderers import Renderer
 
 FRAMES_VERSION = 1
+FRAME_WORKER = "dnrpipe.stages.shots.frame_worker"
 FRAMES_FOLDER = "frames"
 """Of a shot's folder."""
 
@@ -108,7 +109,7 @@ def render_frames(
             task.output.unlink(missing_ok=True)
     run.view_tasks(
         label,
-        "dnrpipe.stages.shots.frame_worker",
+        FRAME_WORKER,
         renderer.common.data(),
         [task.data() for task in tasks],
         workers=1,  # its kernels keep all cores busy
@@ -118,26 +119,23 @@ def render_frames(
     )
 
 
-def write_movie(path: Path, pictures: Sequence[Path], fps: float) -> None:
-    """H.264 in MP4 of PNG files of one size, one after the other: memory does not grow with the shot."""
-    import imageio_ffmpeg
+def pictures(folder: Path, frames: Sequence[ShotFrame]) -> Iterator[np.ndarray]:
+    """The frames as they are displayed, uint8 [H, W, 3], one after the other: memory does not grow with the shot."""
     from PIL import Image
 
-    with Image.open(pictures[0]) as first:
-        width, height = first.size
-    even = (width + width % 2, height + height % 2)
-    pad = ((0, height % 2), (0, width % 2), (0, 0))
-    with atomic_path(path) as temporary:
-        writer = imageio_ffmpeg.write_frames(
-            str(temporary),
-            even,
-            fps=fps,  # pyright: ignore[reportArgumentType]: it is printed with two digits
-            quality=8,
-            macro_block_size=2,
-            ffmpeg_log_level="error",
-        )
-        writer.send(None)
-        for picture in pictures:
-            with Image.open(picture) as image:
-                writer.send(np.ascontiguousarray(np.pad(np.asarray(image.convert("RGB")), pad, mode="edge")))
-        writer.close()
+    for frame in frames:
+        with Image.open(picture_path(folder, frame)) as image:
+            yield np.asarray(image.convert("RGB"))
+
+
+def frame_outcomes(run: Run, renderer: Renderer, tasks: Sequence[FrameTask], label: str) -> Iterator[TaskResult]:
+    """Render frames to be measured, each with the whole machine -> their outcomes, in order, whatever is on disk."""
+    return run_tasks(
+        FRAME_WORKER,
+        renderer.common.data(),
+        [task.data() for task in tasks],
+        workers=1,
+        log=run.log,
+        retried=warn_of_retries(label, run.console),
+        environment=renderer.environment,
+    )

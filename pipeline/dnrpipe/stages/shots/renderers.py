@@ -53,13 +53,18 @@ def path_tracer(run: Run, background: bool) -> Renderer:
     return Renderer(common, choice.environment)
 
 
-def shipped_renderer(run: Run, background: bool) -> Renderer:
-    """The shipped corrector, as far as it is trusted on the scene, on baked light: bakes that where it is missing."""
+def trusted_share(run: Run) -> float:
+    """The share of the shipped corrector's correction that does best on the scene; told to the user."""
     from dnrtrain.shipped import corrector
 
     trust = measure_trust(run, corrector())
     run.console.say(trust.told)
-    return _neural(run, background, trust=trust.share, checkpoint=None)
+    return trust.share
+
+
+def shipped_renderer(run: Run, background: bool, trust: float) -> Renderer:
+    """The shipped corrector, ``trust`` of it, on baked light: bakes that where it is missing."""
+    return _neural(run, background, trust=trust, checkpoint=None)
 
 
 def trained_renderer(run: Run, background: bool) -> Renderer:

@@ -16,6 +16,7 @@ from dnrtrain.display import DisplayTransform
 
 from ...core.console import Console
 from ...core.errors import UserError
+from ...core.images import over_white
 from ...core.scene_files import read_frame, read_summary, scene_fingerprint, split_views
 from ...core.scene_records import SceneSummary
 from ...core.settings import Settings
@@ -69,15 +70,7 @@ class BenchScene:
 
     def shown(self, image: np.ndarray) -> Any:
         """Premultiplied linear RGBA [H, W, 4] -> display RGB over white, torch [1, 3, H, W]."""
-        return shown(self.display, image)
-
-
-def shown(display: DisplayTransform, image: np.ndarray) -> Any:
-    """Premultiplied linear RGBA [H, W, 4] -> display RGB over white, torch [1, 3, H, W]."""
-    import torch
-
-    planes = torch.from_numpy(np.ascontiguousarray(image, dtype=np.float32)).permute(2, 0, 1)[None]
-    return display.over_white(planes[:, :3], planes[:, 3:])
+        return over_white(self.display, image)
 
 
 def open_scene(root: Path, views: int | list[View], threads: int, settings: Settings | None = None) -> BenchScene:

@@ -19,6 +19,7 @@ from dnrtrain.exr import read_exr
 from dnrtrain.perceptual import build_lpips
 
 from ...blender.tasks import CyclesAnswer
+from ...core.images import over_white
 from ...core.scene_files import read_frame, read_record, split_views
 from ...core.workspace import Workspace
 from ...stages.trainer import perceptual_weights
@@ -27,7 +28,7 @@ from ..cells.tasks import FileWorker
 from ..frames.baselines import METHODS as ALL
 from ..frames.baselines import make_baselines, render_baselines
 from ..frames.ours import BASE, Ours
-from ..frames.scene import Clock, open_scene, shown
+from ..frames.scene import Clock, open_scene
 from .records import CYCLES_PREFIX, BaselineFile, BaselinePoint, CyclesMeasureTask, PathTracingTask
 
 METHODS = ("raw", "colour-fast", "clean16-fast", "clean16")
@@ -80,7 +81,7 @@ class Worker(FileWorker):
         display = DisplayTransform(read_frame(workspace), workspace.scene)
 
         def pictures(name: str) -> list[Any]:
-            return [shown(display, _read_rgba(task.folder / name / f"{view}.exr")) for view in task.views]
+            return [over_white(display, _read_rgba(task.folder / name / f"{view}.exr")) for view in task.views]
 
         judge = Judge(workspace, task.views, pictures("reference"))
         points = [
