@@ -60,7 +60,7 @@ def traced(scene: Any, view: View, spp: int = 2048, kind: str = "path", depth: i
 
 
 def rendered(scene: Any, light: np.ndarray, view: View, samples: int = 4) -> dict[str, np.ndarray]:
-    return BaseRenderer(mi, scene, light, samples).frame(view)
+    return BaseRenderer(mi, scene, light).frame(view, samples)
 
 
 def colour(channels: dict[str, np.ndarray]) -> np.ndarray:
@@ -99,12 +99,12 @@ def test_samples_that_are_not_finite_are_counted(
     scene = poisoned_room(tmp_path, name)
     baker = LightBaker(mi, scene, onwards())
     light = baker.bake(16, 16, 0)
-    renderer = BaseRenderer(mi, scene, light, 2)
-    channels = renderer.frame(camera())
+    renderer = BaseRenderer(mi, scene, light)
+    channels = renderer.frame(camera(), 2)
     assert np.isfinite(light).all() and all(np.isfinite(values).all() for values in channels.values())
     assert (baker.lost > 0, renderer.repaired > 0, renderer.masked > 0) == (lost, repaired, masked)
     assert renderer.repaired + renderer.masked < SIZE * SIZE
-    assert np.isfinite(BaseRenderer(mi, scene, light, 1).frame(camera())["base.R"]).all()
+    assert np.isfinite(BaseRenderer(mi, scene, light).frame(camera(), 1)["base.R"]).all()
     mapper = SurfaceMapper(mi, scene, None)
     assert all(np.isfinite(values).all() for values in mapper.maps(16, 4, 0).values())
     assert (mapper.lost > 0) == (name == "floor.bsdf.reflectance.value")
@@ -116,13 +116,13 @@ def test_large_pictures_in_bands_have_the_same_bits(tmp_path: Path, monkeypatch:
 
     scene = poisoned_room(tmp_path, "")
     light = np.ones((2, 2, 16, 16, 3), np.float32)
-    whole = BaseRenderer(mi, scene, light, 2).frame(camera())
+    whole = BaseRenderer(mi, scene, light).frame(camera(), 2)
     monkeypatch.setattr(base_renderer, "MAX_RAYS", 2 * SIZE * 11)
-    renderer = BaseRenderer(mi, scene, light, 2)
+    renderer = BaseRenderer(mi, scene, light)
     launches: list[int] = []
     kernel = renderer.kernel
-    monkeypatch.setattr(renderer, "kernel", lambda *given: launches.append(given[-1]) or kernel(*given))
-    banded = renderer.frame(camera())
+    monkeypatch.setattr(renderer, "kernel", lambda *given: launches.append(given[-2]) or kernel(*given))
+    banded = renderer.frame(camera(), 2)
     assert launches == [10] * 5 and kernel.n_recordings == 1
     assert all((banded[name] == whole[name]).all() for name in whole)
 
@@ -175,8 +175,8 @@ def test_scenes_lit_by_shining_meshes_alone_are_recorded_at_the_first_call(tmp_p
     bulb = quad(tmp_path / "b.ply", [[-1, 0, 2], [-1, 1, 2], [1, 1, 2], [1, 0, 2]], (0.55, 0.55), grey)
     bulb["emitter"] = {"type": "area", "radiance": rgb(3, 3, 3)}
     scene = corner_room(tmp_path, grey, grey, screen | {"emitter": shining}, bulb=bulb)
-    renderer = BaseRenderer(mi, scene, np.ones((2, 2, 16, 16, 3), np.float32), 2)
-    assert colour(renderer.frame(camera())).max() > 0.5
+    renderer = BaseRenderer(mi, scene, np.ones((2, 2, 16, 16, 3), np.float32))
+    assert colour(renderer.frame(camera(), 2)).max() > 0.5
     assert renderer.kernel.n_recordings == 1
 
 
@@ -397,12 +397,12 @@ def test_frames_repeat_bit_for_bit_and_views_share_one_kernel(tmp_path: Path) ->
     glossy = {"type": "twosided", "b": {"type": "roughconductor", "alpha": 0.2}}
     wall = {"type": "twosided", "b": {"type": "diffuse"}}
     scene = corner_room(tmp_path, glossy, wall, {"type": "constant"})
-    renderer = BaseRenderer(mi, scene, np.ones((2, 2, 8, 8, 3), np.float32), 2)
-    first = renderer.frame(camera(0.3))
-    other = renderer.frame(camera(0.5))
+    renderer = BaseRenderer(mi, scene, np.ones((2, 2, 8, 8, 3), np.float32))
+    first = renderer.frame(camera(0.3), 2)
+    other = renderer.frame(camera(0.5), 2)
     recorded = renderer.kernel.n_recordings
-    again = renderer.frame(camera(0.3))
-    renderer.frame(camera(0.7))
+    again = renderer.frame(camera(0.3), 2)
+    renderer.frame(camera(0.7), 2)
     assert {*BASE_CHANNELS, "coverage"} <= set(first) == {*MEANS, *CENTRES, NOISE, "coverage", "rays"}
     assert all(np.isfinite(values).all() for values in first.values())
     assert all(np.array_equal(first[name], again[name]) for name in first)
@@ -487,12 +487,12 @@ def test_lobes_of_the_principled_plugin_add_up() -> None:
     assert (np.array(found.sampled_type) == int(mi.BSDFFlags.GlossyReflection)).all()
 
 
-def remembering(renderer: BaseRenderer, views: list[View], number: int = 0) -> dict[str, np.ndarray]:
+def remembering(renderer: BaseRenderer, views: list[View], samples: int, number: int = 0) -> dict[str, np.ndarray]:
     """Channels of the last of the frames, with what those before it saw. number: of the first."""
     history = History(mi)
     history.begin(number)
     for view in views:
-        channels = history.take(view, renderer.frame(view, history.number))
+        channels = history.take(view, renderer.frame(view, samples, history.number))
     return channels
 
 
@@ -506,8 +506,8 @@ def test_highlights_that_wander_and_mirrors_leave_no_ghosts(tmp_path: Path) -> N
     scene = corner_room(tmp_path, glossy, mirror, {"type": "constant", "radiance": rgb(0.2, 0.3, 0.4)}, b=ball, l=lamp)
     dark = np.zeros((2, 2, 8, 8, 3), np.float32)
     way = [camera(0.3 + 0.02 * number) for number in range(24)]
-    few, many = (BaseRenderer(mi, scene, dark, samples) for samples in (2, 512))
-    truth, fresh, kept = many.frame(way[-1]), few.frame(way[-1]), remembering(few, way)
+    renderer = BaseRenderer(mi, scene, dark)
+    truth, fresh, kept = renderer.frame(way[-1], 512), renderer.frame(way[-1], 2), remembering(renderer, way, 2)
 
     def error(channels: dict[str, np.ndarray]) -> np.ndarray:
         shown = [np.clip(colour(c), 0, 1) ** (1 / 2.2) for c in (channels, truth)]
@@ -529,12 +529,12 @@ def test_a_chunk_of_a_sequence_begins_without_a_seam(tmp_path: Path) -> None:
     matt = {"type": "twosided", "b": {"type": "diffuse"}}
     lamp = {"type": "point", "position": [0.0, -0.5, 1.5], "intensity": rgb(6, 6, 6)}
     scene = corner_room(tmp_path, glossy, matt, lamp)
-    renderer = BaseRenderer(mi, scene, np.ones((2, 2, 8, 8, 3), np.float32), 4)
+    renderer = BaseRenderer(mi, scene, np.ones((2, 2, 8, 8, 3), np.float32))
     way = [camera(0.3 + 0.01 * number) for number in range(2 * WARM_UP + 1)]
-    before, onwards = (colour(remembering(renderer, frames)) for frames in (way[:-1], way))
-    begun = colour(remembering(renderer, way[WARM_UP:], WARM_UP))
+    before, onwards = (colour(remembering(renderer, frames, 4)) for frames in (way[:-1], way))
+    begun = colour(remembering(renderer, way[WARM_UP:], 4, WARM_UP))
     within, across, alone = (
-        np.abs(frame - before).mean() for frame in (onwards, begun, colour(renderer.frame(way[-1])))
+        np.abs(frame - before).mean() for frame in (onwards, begun, colour(renderer.frame(way[-1], 4)))
     )
     assert across < 1.05 * within < 0.9 * alone, "what a frame that remembers nothing changes by"
     assert np.abs(begun - onwards).mean() < 0.2 * within

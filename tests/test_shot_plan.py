@@ -53,6 +53,13 @@ def test_path_tracing_that_is_as_good_and_cheaper_wins() -> None:
     assert choose([*ALL, blurred], Wanted())[0] is OURS
 
 
+def test_as_few_rays_as_cost_next_to_nothing() -> None:
+    few, some, most = (option("neural", 10.0 * n, 30 + n / 10, 0.1, spp=n) for n in (2, 6, 8))
+    assert choose([few, some, most], Wanted())[0] is some, "0.2 dB below the best"
+    smeared = some.model_copy(update={"lpips": 0.12})
+    assert choose([few, smeared, most], Wanted())[0] is most, "PSNR alone is not enough"
+
+
 def test_rungs_between_those_measured() -> None:
     low = Measured(Way(name="path", spp=4), pixel=1.0, start=2.0, psnr=30.0, lpips=0.1)
     high = Measured(Way(name="path", spp=16), pixel=4.0, start=1.0, psnr=34.0, lpips=None)
@@ -68,7 +75,7 @@ def test_seconds_of_a_shot_add_up() -> None:
     rung = Measured(Way(name="path", spp=4), pixel=0.001, start=3.0, psnr=30.0, lpips=0.1)
     more = Measured(Way(name="path", spp=16), pixel=0.004, start=3.0, psnr=34.0, lpips=0.05)
     assert path_option(rung, shape).seconds == pytest.approx(3 + 10 + 2 * (1 + 3 + 5))
-    ours = Measured(Way(name="neural"), pixel=0.002, start=4.0, psnr=33.0, lpips=0.06)
+    ours = Measured(Way(name="neural", spp=8), pixel=0.002, start=4.0, psnr=33.0, lpips=0.06)
     paths = [path_option(rung, shape), path_option(more, shape)]
     found = baked_option(ours, paths, shape)
     assert found.seconds == pytest.approx(4 + 20 + 2 * (4 + 3 + 5))  # moving frames by the rung that is as good
@@ -93,7 +100,7 @@ def frames(count: int, cut: int, moving: tuple[int, ...] = ()) -> list[ShotFrame
 
 def test_frames_remember_back_to_the_cut_and_no_further_than_a_chunk(tmp_path) -> None:  # type: ignore[no-untyped-def]
     shot = frames(CHUNK + 20, cut=10)
-    tasks = frame_tasks(shot, tmp_path, Way(name="neural"), "inputs")
+    tasks = frame_tasks(shot, tmp_path, Way(name="neural", spp=8), "inputs")
     remembered = [len(task.earlier or ()) for task in tasks]
     assert remembered[:12] == [*range(10), 0, 1]
     assert remembered[CHUNK - 1] == CHUNK - 11
@@ -101,19 +108,19 @@ def test_frames_remember_back_to_the_cut_and_no_further_than_a_chunk(tmp_path) -
     assert tasks[CHUNK].earlier == tuple(frame.view for frame in shot[CHUNK - WARM_UP : CHUNK])
     assert tasks[CHUNK].number == CHUNK - WARM_UP
     assert all(task.earlier is None for task in frame_tasks(shot, tmp_path, Way(name="path", spp=4), "inputs"))
-    again = frame_tasks(shot, tmp_path, Way(name="neural"), "other inputs")
+    again = frame_tasks(shot, tmp_path, Way(name="neural", spp=8), "other inputs")
     assert {task.fingerprint for task in tasks}.isdisjoint(task.fingerprint for task in again)
 
 
 def test_what_is_rendered_does_not_depend_on_where_a_run_begins(tmp_path) -> None:  # type: ignore[no-untyped-def]
     shot = frames(30, cut=30)
-    whole = frame_tasks(shot, tmp_path, Way(name="neural"), "inputs")
-    assert frame_tasks(shot, tmp_path, Way(name="neural"), "inputs", [17]) == [whole[17]]
+    whole = frame_tasks(shot, tmp_path, Way(name="neural", spp=8), "inputs")
+    assert frame_tasks(shot, tmp_path, Way(name="neural", spp=8), "inputs", [17]) == [whole[17]]
 
 
 def test_a_frame_in_which_things_move_is_not_remembered(tmp_path) -> None:  # type: ignore[no-untyped-def]
     shot = frames(8, cut=8, moving=(3,))
-    tasks = frame_tasks(shot, tmp_path, Way(name="neural"), "inputs", [2, 4, 5])
+    tasks = frame_tasks(shot, tmp_path, Way(name="neural", spp=8), "inputs", [2, 4, 5])
     assert [len(task.earlier or ()) for task in tasks] == [2, 0, 1]
 
 

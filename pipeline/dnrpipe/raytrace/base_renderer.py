@@ -58,16 +58,15 @@ class BaseRenderer:
     Args:
         mi: the mitsuba module, a jit variant set.
         light: E and S of the front and of the back, float32 [2, 2, size, size, 3], row 0 at V = 0.
-        samples: K, rays per pixel.
 
     Of the last frame: ``repaired`` pixels had samples with parts that were not finite and are left out; ``masked``
     pixels were not finite all the same, and are 0.
     """
 
-    def __init__(self, mi: Any, scene: Any, light: np.ndarray, samples: int) -> None:
+    def __init__(self, mi: Any, scene: Any, light: np.ndarray) -> None:
         from .specular_paths import SpecularPaths  # imports Mitsuba
 
-        self.mi, self.scene, self.samples = mi, scene, samples
+        self.mi, self.scene = mi, scene
         self.repaired = self.masked = 0
         self.light = light_textures(mi, light)
         self.paths = SpecularPaths(scene)
@@ -76,30 +75,31 @@ class BaseRenderer:
         # Recorded at the first call: tracing the plugins anew would take longer than the frame itself.
         self.kernel = Recorded(self._kernel, scene)
 
-    def frame(self, view: Any, number: int = 0) -> dict[str, np.ndarray]:
+    def frame(self, view: Any, samples: int, number: int = 0) -> dict[str, np.ndarray]:
         """Channels of BASE_CHANNELS and of the G-buffer: float32 [H, W] each, linear Rec.709, premultiplied.
 
-        view: in the bundle's units, as are ``depth.Z`` and those of CHAIN. number: of the frame among those that
-        remember; frames of other numbers cast other rays but for the first of each pixel. ``coverage`` is base.A, at
-        most 1. Where cut-outs stand one behind the other, base.A can be above 1 as the colours are: each surface adds
-        its opaque share.
+        view: in the bundle's units, as are ``depth.Z`` and those of CHAIN. samples: K, rays per pixel. number: of the
+        frame among those that remember; frames of other numbers cast other rays but for the first of each pixel.
+        ``coverage`` is base.A, at most 1. Where cut-outs stand one behind the other, base.A can be above 1 as the
+        colours are: each surface adds its opaque share.
         """
         import drjit as dr
 
         mi = self.mi
         axes, film = opaque_camera(mi, view)
-        rays = dr.opaque(mi.UInt32, self.samples)  # as data: the kernel is the same for all numbers of them
+        rays = dr.opaque(mi.UInt32, samples)  # as data: the kernel is the same for all numbers of them
         turn = dr.opaque(mi.UInt32, number % FRAMES)
         names = (LOST, *MEANS, *CENTRES, NOISE)
         shape = (view.height, view.width)
-        bands = -(-view.height // max(1, MAX_RAYS // (view.width * self.samples)))
+        bands = -(-view.height // max(1, MAX_RAYS // (view.width * samples)))
         rows = -(-view.height // bands)
         channels = {name: np.empty(shape, np.float32) for name in names}
         for first in range(0, view.height, rows):
             # All bands have the same height, for which the kernel is recorded: the last one ends with the picture.
             first = min(first, view.height - rows)
             start = dr.opaque(mi.UInt32, first)
-            values = self.kernel(self.scene, self.light, self.tables, axes, film, rays, turn, start, view.width, rows)
+            size = view.width, rows, samples
+            values = self.kernel(self.scene, self.light, self.tables, axes, film, rays, turn, start, *size)
             dr.eval(values)
             for plane, value in zip(channels.values(), values, strict=True):
                 plane[first : first + rows] = np.array(value).reshape(rows, view.width)
@@ -107,7 +107,7 @@ class BaseRenderer:
         channels, self.masked = masked_channels(channels)
         for name in (*GBUFFER, *CHAIN):
             channels[name] = channels[name] * channels["mask"]
-        rays = np.full(shape, self.samples, np.float32)
+        rays = np.full(shape, samples, np.float32)
         return channels | {"coverage": np.minimum(channels["base.A"], 1), "rays": rays}
 
     def _kernel(
@@ -122,10 +122,11 @@ class BaseRenderer:
         start: Any,
         width: int,
         height: int,
+        samples: int,
     ) -> list[Any]:
         """Values [height * width] of LOST, MEANS, CENTRES and NOISE.
 
-        Recorded once, replayed for every view of that size.
+        Recorded once, replayed for every view of that size and as many rays.
         A pixel's samples lie side by side; the first goes through the pixel's centre.
 
         Args:
@@ -133,13 +134,13 @@ class BaseRenderer:
             tables: places within a tile, steps of the random numbers.
             axes: the camera's axes and its place, columns of c2w.
             film: fl_x, fl_y, cx, cy in pixels.
-            rays: ``self.samples``.
+            rays: ``samples``, as data.
             turn: number of the frame.
             start: the first row.
         """
         import drjit as dr
 
-        mi, samples = self.mi, self.samples
+        mi = self.mi
         index = dr.arange(mi.UInt32, width * height * samples)
         pixel, sample = index // rays, index % rays
         x, y = pixel % width, start + pixel // width

@@ -37,10 +37,10 @@ class Worker(BundleWorker):
         dark = np.zeros((2, 2, 2, 2, 3), np.float32)
         light = read_light(self.common.light) if isinstance(self.common, BakedCommon) else dark
         scene = self.engine.scenes[str(self.bundle)]
-        self.renderer = BaseRenderer(self.engine.mi, scene, light, self.common.samples)
+        self.renderer = BaseRenderer(self.engine.mi, scene, light)
         self.silhouettes: dict[tuple[int, int], Frames] = {}
-        self.history, self.seen = History(self.engine.mi), list[View]()
-        """Of the frames ``seen``."""
+        self.history, self.seen = History(self.engine.mi), list[tuple[View, int | None]]()
+        """Of the frames ``seen``, and their rays per pixel."""
         self.warm = False
         self.repaired = self.masked = 0  # pixels of the view at hand: samples left out, set to zero
 
@@ -65,13 +65,13 @@ class Worker(BundleWorker):
         write_exr(task.output, {name: plane for name, plane in channels.items() if name not in CHAIN}, header)
         return answer
 
-    def channels(self, view: View, renderer: BaseRenderer | None = None, number: int = 0) -> dict[str, np.ndarray]:
+    def channels(self, view: View, samples: int | None = None, number: int = 0) -> dict[str, np.ndarray]:
         """Base image and G-buffer of a view in scene units: linear Rec.709, float32 [H, W] each.
 
-        renderer: one with another number of samples. number: see `BaseRenderer.frame`.
+        samples: rays per pixel, if not the workspace's. number: see `BaseRenderer.frame`.
         """
-        renderer = renderer or self.renderer
-        channels = renderer.frame(scaled_view(view, self.engine.unit_scale), number)
+        renderer, scaled = self.renderer, scaled_view(view, self.engine.unit_scale)
+        channels = renderer.frame(scaled, samples or self.common.samples, number)
         self.repaired, self.masked = self.repaired + renderer.repaired, self.masked + renderer.masked
         for name in ("depth.Z", *CHAIN):
             channels[name] = channels[name] / self.engine.unit_scale
@@ -80,22 +80,25 @@ class Worker(BundleWorker):
             return channels | self._traced(self.common, view, channels)
         return channels | denoised(channels) if self.common.denoise else channels
 
-    def remembered(self, view: View, earlier: Sequence[View], number: int = 0) -> dict[str, np.ndarray]:
+    def remembered(
+        self, view: View, earlier: Sequence[View], number: int = 0, samples: int | None = None
+    ) -> dict[str, np.ndarray]:
         """`channels` of a view, with what the frames ``earlier`` of a camera's way saw, the first of that number.
 
-        Those that were the last to be seen are not rendered again: one frame after the other costs one each.
+        Those that were the last to be seen, by as many rays, are not rendered again: one frame after the other costs
+        one each.
         """
-        way = [*earlier, view]
+        way = [(other, samples) for other in (*earlier, view)]
         known = len(self.seen) if self.seen == way[: len(self.seen)] and len(self.seen) < len(way) else 0
         if not known:
             self.history.begin(number)
         self.seen = way
-        for frame in way[known:-1]:
-            self._taken(frame)
-        return self._taken(view)
+        for frame, _ in way[known:-1]:
+            self._taken(frame, samples)
+        return self._taken(view, samples)
 
-    def _taken(self, view: View) -> dict[str, np.ndarray]:
-        return self.history.take(view, self.channels(view, number=self.history.number))
+    def _taken(self, view: View, samples: int | None) -> dict[str, np.ndarray]:
+        return self.history.take(view, self.channels(view, samples, self.history.number))
 
     def _frames(self, view: View) -> Frames:
         """Finer silhouettes than the base image's few rays give, for views of one size."""

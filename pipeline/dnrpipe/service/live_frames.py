@@ -27,12 +27,10 @@ from PIL import Image
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.images import flip_error, over_white, picture_of
 from dnrpipe.core.settings import Settings
-from dnrpipe.raytrace.base_renderer import BaseRenderer
 from dnrpipe.raytrace.base_worker import Worker as BaseWorker
 from dnrpipe.raytrace.engine import Engine, masked, masked_channels
 from dnrpipe.raytrace.frames import Frames
 from dnrpipe.raytrace.history import History
-from dnrpipe.raytrace.light_worker import read_light
 from dnrpipe.stages.trainer import torch_device
 from dnrtrain.checkpoint import load_model
 from dnrtrain.contract import RASTER_CHANNELS, SceneFrame, View, require_channels
@@ -73,7 +71,6 @@ class Worker:
         self.frames = functools.cache(
             functools.partial(Frames, self.engine, self.bundle, *tracing)
         )  # by (width, height)
-        self.renderers: dict[int, BaseRenderer] = {}
         remembers = self.kind == "baked" and not (common["base"] or {}).get("denoise")
         self.history = History(self.engine.mi) if remembers else None
         self.resting: View | None = None  # of the last frame, where that was at rest
@@ -136,14 +133,8 @@ class Worker:
             return channels
         self.base.repaired = self.base.masked = 0
         number = 0 if self.history is None else self.history.number
-        if samples is None or samples >= self.base.renderer.samples or self.kind != "baked":
-            channels = self.base.channels(view, number=number)
-        else:
-            if samples not in self.renderers:
-                light = read_light(Path(self.common["base"]["light"]))
-                scene = self.engine.scenes[str(self.bundle)]
-                self.renderers[samples] = BaseRenderer(self.engine.mi, scene, light, samples)
-            channels = self.base.channels(view, self.renderers[samples], number)
+        fewer = samples if self.kind == "baked" and samples is not None else self.base.common.samples
+        channels = self.base.channels(view, min(fewer, self.base.common.samples), number)
         self.repaired += self.base.repaired + self.base.masked
         return channels
 

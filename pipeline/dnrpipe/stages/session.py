@@ -138,6 +138,7 @@ class Session:
         manifest = self.workspace.manifest
         manifest.overrides = merge(manifest.overrides, overrides)
         self.settings = resolve_settings(self.workspace, {}, manifest.preset)
+        self.workspace.save()
 
     def _take_back(self) -> None:
         """A refused scene or camera file leaves the workspace as it was; a folder made for it is removed."""

@@ -1,9 +1,21 @@
-"""Held-out frames of a finished shot against references that are traced for it."""
+"""Held-out frames of a finished shot against references that are traced for it.
+
+Notation
+    A_i     pictures of a frame that are path-traced and denoised, each with random numbers of its own; k of them
+    truth   their mean
+    noise   mean square error of the truth by how far the A_i differ: their variance / k
+    error   mean square difference between the shot's frame and the truth
+
+k is doubled until the noise is at most NOISE of the error. What the A_i have in common, the denoiser's bias, does not
+show in it. Measured on `interior`: two pictures of 32 samples tell PSNR within 0.05 dB and LPIPS within 0.003 of what
+one of 256 does.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +31,11 @@ from .records import Check, ShotFrame
 from .render_frames import frame_path, render_frames
 from .renderers import Renderer
 
-SPP = 256
+LEAST, MOST = 32, 256
+"""Samples of a picture A_i; for path-traced frames, four times their own: the bias of their denoiser is to show."""
+FEWEST, PICTURES = 2, 8
+"""k."""
+NOISE = 0.1
 
 
 def held_out(frames: Sequence[ShotFrame], count: int) -> list[int]:
@@ -31,58 +47,74 @@ def held_out(frames: Sequence[ShotFrame], count: int) -> list[int]:
     return sorted([*spread(still, max(1, count - 1)), *spread(moving, 1)])
 
 
-def check(
-    run: Run,
-    tracers: Sequence[tuple[Renderer, list[int]]],
-    frames: Sequence[ShotFrame],
-    folder: Path,
-    inputs: Any,
-    lpips: Any,
-) -> Check:
-    """Trace the frames and compare; pictures of both and of the error lie in ``check/``.
+@dataclass(frozen=True)
+class Held:
+    """A frame to check. tracer: path traces it. way: how it was rendered."""
 
-    tracers: (path tracer, places of the frames to check by it).
-    """
+    frame: ShotFrame
+    tracer: Renderer
+    way: Way
+
+    @property
+    def spp(self) -> int:
+        """Samples per pixel of a picture A_i."""
+        return min(MOST, max(LEAST, 4 * self.way.spp)) if self.way.name == "path" else LEAST
+
+    def task(self, folder: Path, inputs: Any, number: int) -> FrameTask:
+        """Renders A_number."""
+        stem = folder / "check" / "traced" / f"{self.frame.number:05d}-{number}"
+        way = Way(name="path", spp=self.spp)
+        decides = ["check", inputs, self.frame.model_dump(mode="json"), way.model_dump(mode="json"), number]
+        return FrameTask(
+            view=self.frame.view,
+            way=way,
+            lens=self.frame.lens,
+            seed=REFERENCE_SEED + number,
+            output=stem.with_suffix(".exr"),
+            picture=stem.with_suffix(".png"),
+            fingerprint=digest(decides),
+        )
+
+
+def check(run: Run, held: Sequence[Held], folder: Path, inputs: Any, lpips: Any) -> Check:
+    """Trace the frames and compare; pictures of both and of the error lie in ``check/``."""
     started, display = time.monotonic(), display_of(run)
-    way = Way(name="path", spp=SPP)
     rows: list[dict[str, float]] = []
-    numbers: list[int] = []
-    for tracer, places in tracers:
-        tasks = []
-        for place in places:
-            frame = frames[place]
-            stem = folder / "check" / f"{frame.number:05d}"
-            tasks.append(
-                FrameTask(
-                    view=frame.view,
-                    way=way,
-                    lens=frame.lens,
-                    seed=REFERENCE_SEED,
-                    output=stem.with_suffix(".exr"),
-                    picture=stem.with_suffix(".truth.png"),
-                    fingerprint=_fingerprint(inputs, frame, way),
-                )
-            )
-        render_frames(run, tracer, tasks, label="frames to check by", purpose="evaluation")
-        for place, task in zip(places, tasks, strict=True):
-            frame = frames[place]
-            ours, truth = shown(display, frame_path(folder, frame)), shown(display, task.output)
-            flip, heat = flip_error(picture_of(truth[0]), picture_of(ours[0]))
-            write_png(task.output.with_suffix(".error.png"), heat)
-            write_png(task.output.with_suffix(".ours.png"), picture_of(ours[0]))
-            rows.append({**compared(ours, truth, lpips), "flip": flip})
-            numbers.append(frame.number)
+    groups: dict[int, list[Held]] = {}
+    for one in held:
+        groups.setdefault(id(one.tracer), []).append(one)
+    for due in groups.values():
+        count, tracer = FEWEST, due[0].tracer
+        while due:
+            tasks = [[one.task(folder, inputs, number) for number in range(count)] for one in due]
+            flat = [task for own in tasks for task in own]
+            render_frames(run, tracer, flat, label="frames to check by", purpose="evaluation")
+            noisy = []
+            for one, own in zip(due, tasks, strict=True):
+                pictures: list[Any] = [shown(display, task.output) for task in own]
+                ours: Any = shown(display, frame_path(folder, one.frame))
+                truth: Any = sum(pictures) / count
+                noise = float(np.mean([((picture - truth) ** 2).mean() for picture in pictures])) / (count - 1)
+                error = float(((ours - truth) ** 2).mean())
+                if noise > NOISE * error and count < PICTURES:
+                    noisy.append(one)
+                    continue
+                stem = folder / "check" / f"{one.frame.number:05d}"
+                flip, heat = flip_error(picture_of(truth[0]), picture_of(ours[0]))
+                write_png(stem.with_suffix(".truth.png"), picture_of(truth[0]))
+                write_png(stem.with_suffix(".ours.png"), picture_of(ours[0]))
+                write_png(stem.with_suffix(".error.png"), heat)
+                found = {**compared(ours, truth, lpips), "flip": flip, "noise": noise / max(error, 1e-12)}
+                rows.append({"number": one.frame.number, "spp": count * one.spp, **found})
+            due, count = noisy, 2 * count
     mean = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     return Check(
-        frames=tuple(numbers),
-        spp=SPP,
+        frames=tuple(sorted(int(row["number"]) for row in rows)),
+        spp=round(mean["spp"]),
+        noise=mean["noise"],
         psnr=mean["psnr"],
         ssim=mean["ssim"],
         lpips=mean.get("lpips"),
         flip=mean["flip"],
         seconds=time.monotonic() - started,
     )
-
-
-def _fingerprint(inputs: Any, frame: ShotFrame, way: Way) -> str:
-    return digest(["check", inputs, frame.model_dump(mode="json"), way.model_dump(mode="json")])

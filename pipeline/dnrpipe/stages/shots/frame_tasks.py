@@ -25,19 +25,19 @@ WayName = Literal["path", "base", "neural"]
 
 
 class Way(BaseModel):
-    """How a frame is rendered. spp: samples per pixel, of ``path``."""
+    """How a frame is rendered. spp: samples per pixel of ``path``, rays per pixel of a base image."""
 
     model_config = ConfigDict(frozen=True)
 
     name: WayName
-    spp: int = 0
+    spp: int
 
     @property
     def told(self) -> str:
         """In words, for tables."""
         if self.name == "path":
             return f"path tracing, {self.spp} samples, denoised"
-        return "base images alone" if self.name == "base" else "neural renderer"
+        return f"{'base images alone' if self.name == 'base' else 'neural renderer'}, {self.spp} rays"
 
 
 class FrameCommon(Task):

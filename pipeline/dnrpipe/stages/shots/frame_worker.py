@@ -74,9 +74,9 @@ class Worker:
 
     def __call__(self, asked: dict[str, Any]) -> FrameAnswer:
         task = FrameTask.model_validate(asked)
-        kernel = (task.way.name, _at_once(task), task.view.width, task.view.height)
+        way = task.way if task.way.name != "path" else task.way.model_copy(update={"spp": _at_once(task)})
+        kernel = (way.name, way.spp, task.view.width, task.view.height)
         if kernel not in self.warm:  # compiles the kernels, which is no cost of a frame
-            way = task.way.model_copy(update={"spp": _at_once(task)})
             self.render(task.model_copy(update={"way": way, "earlier": task.earlier and task.earlier[-1:]}), {})
             if self.base is not None:
                 self.base.seen = []
@@ -132,9 +132,11 @@ class Worker:
         if self.base is None:
             raise UserError(f"frame {task.view.name}: {task.way.told} need baked light")
         self.base.repaired = self.base.masked = 0
-        arguments = (task.view,) if task.earlier is None else (task.view, task.earlier, task.number)
-        function = self.base.channels if task.earlier is None else self.base.remembered
-        channels = timed("base image", function, *arguments)
+        if task.earlier is None:
+            channels = timed("base image", self.base.channels, task.view, task.way.spp)
+        else:
+            asked = (task.view, task.earlier, task.number, task.way.spp)
+            channels = timed("base image", self.base.remembered, *asked)
         lost = self.base.masked
         alpha = channels["coverage"]
         if task.way.name == "neural":

@@ -19,14 +19,14 @@ from ...core.scene_files import scene_fingerprint
 from ...core.units import duration
 from ...core.workspace import digest, file_sha256
 from ...workers.view_tasks import is_made
-from ..base_images import BASE_VERSION, base_renderer
+from ..base_images import BASE_VERSION, base_renderer, light_paths
 from ..effect_plan import resolve_plan
 from ..render import write_mp4
 from ..session import Session
 from ..shot_scene import convert_frames, scene_at
 from ..stage import Run
 from ..trainer import perceptual_weights
-from .check import check, held_out
+from .check import Held, check, held_out
 from .frame_tasks import Way
 from .options import Wanted, choose
 from .plan_shot import lines, moving_way, weigh
@@ -36,10 +36,12 @@ from .renderers import Renderer, path_tracer, shipped_renderer, trained_renderer
 
 CHECKED = 2
 """Frames of a shot that are traced to check it."""
-PLAN_VERSION = 2
+PLAN_VERSION = 3
 GATHER_FROM = 0.4
 """Share of the light that direct light alone would miss, from which on it is gathered: it pays at 0.49 (`interior`) and
 does not at 0.21 (`materials`)."""
+LIGHT_SIZES = {"traced": (512, 2048), "gathered": (1024, 2048)}
+"""Texels of the light map's side: of few frames, of many."""
 BATCH = 8
 """Bundles of single frames that are on disk at once."""
 
@@ -64,7 +66,7 @@ class Shot:
 def plan_shot(session: Session, shot: Shot) -> ShotPlan:
     """Measure ways to make the shot on small frames, choose, and say so. A plan of the same shot is kept."""
     started = time.monotonic()
-    _choose_light(session)
+    choose_light(session, shot.frames)
     run = session.run.for_stage("render")
     tracer, path = path_tracer(run, shot.background), folder_of(run, shot) / PLAN
     inputs = [tracer.common.model_dump(mode="json"), run.scene_fingerprint, shot.wanted.model_dump(mode="json")]
@@ -88,14 +90,20 @@ def plan_shot(session: Session, shot: Shot) -> ShotPlan:
     return plan
 
 
-def _choose_light(session: Session) -> None:
-    """Gather light where much of it has bounced, unless the user said how it is baked (figures: docs/base.md)."""
-    if "light" in session.workspace.manifest.overrides.get("base", {}):
-        return
+def choose_light(session: Session, frames: Sequence[ShotFrame]) -> None:
+    """Set how light is baked where the user has not: gathered where much of it has bounced; finer where the shot has
+    more pixels than its paths, so that they take a small part of the time (figures: docs/experiments.md)."""
+    own = session.workspace.manifest.overrides.get("base", {})
     pilot = resolve_plan(session.run.for_stage("render")).pilot
     bounced = next((step.mean for step in pilot.steps if step.depth == 2), 0.0) if pilot else 0.0
-    if bounced >= GATHER_FROM:
-        session.adopt({"base": {"light": "gathered"}})
+    light = own.get("light", "gathered" if bounced >= GATHER_FROM else "traced")
+    if "light_size" in own:
+        return session.adopt({"base": {"light": light}})
+    pixels = sum(frame.view.width * frame.view.height for frame in frames if not frame.moving)
+    few, many = LIGHT_SIZES[light]
+    session.adopt({"base": {"light": light, "light_size": many}})
+    if light_paths(session.settings) > pixels:
+        session.adopt({"base": {"light_size": few}})
 
 
 def make_shot(session: Session, shot: Shot, plan: ShotPlan) -> ShotRecord:
@@ -125,11 +133,8 @@ def make_shot(session: Session, shot: Shot, plan: ShotPlan) -> ShotRecord:
     movie = folder / f"{shot.name}.mp4"
     write_mp4(movie, pictures(folder, shot.frames), shot.fps, edge=True)
     spent = time.monotonic() - started
-    tracers = [(tracer, [place for place in places if not shot.frames[place].moving])]
-    tracers += [
-        (tracer.at_frame(run, shot.frames[place].number), [place]) for place in places if shot.frames[place].moving
-    ]
-    found = check(run, tracers, shot.frames, folder, inputs, lpips_of(run))
+    held = [_held(run, shot.frames[place], tracer, chosen.way, way_of_moving) for place in places]
+    found = check(run, held, folder, inputs, lpips_of(run))
     shutil.rmtree(scene_at(run.workspace, 0).parent, ignore_errors=True)  # bundles of single frames
     record = ShotRecord(
         name=shot.name,
@@ -175,6 +180,12 @@ def render_moving(
             if place not in checked:
                 shutil.rmtree(scene_at(run.workspace, number))
     return way
+
+
+def _held(run: Run, frame: ShotFrame, tracer: Renderer, way: Way, way_of_moving: Way | None) -> Held:
+    if not frame.moving:
+        return Held(frame, tracer, way)
+    return Held(frame, tracer.at_frame(run, frame.number), way_of_moving or way)
 
 
 def folder_of(run: Run, shot: Shot) -> Path:

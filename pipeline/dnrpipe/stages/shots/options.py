@@ -11,6 +11,9 @@ from dnrtrain.records import Record
 
 from .frame_tasks import Way
 
+NEAR = 0.3, 1.1
+"""Decibels below, and times the LPIPS of, the most rays that fewer of them may have."""
+
 
 class Wanted(BaseModel):
     """What the user asked for. seconds: for all of the shot, from here on. psnr in dB, lpips (AlexNet)."""
@@ -54,8 +57,8 @@ def choose(options: Sequence[Option], wanted: Wanted) -> tuple[Option, str]:
     """The option to carry out, and why.
 
     With a time: the best PSNR that fits in; the quickest where none does. With a quality: the cheapest that reaches it;
-    the best where none does. With neither, the wanted quality is that of the neural renderer: the cheapest option that
-    has both its PSNR and its LPIPS.
+    the best where none does. With neither, the wanted quality is that of the neural renderer, with as few rays as cost
+    it next to nothing (`NEAR`): the cheapest option that has both its PSNR and its LPIPS.
 
     Raises ValueError: no options.
     """
@@ -80,7 +83,9 @@ def choose(options: Sequence[Option], wanted: Wanted) -> tuple[Option, str]:
     neural = [option for option in options if option.way.name == "neural"]
     if not neural:
         return max(options, key=quality), "the best of its kind"
-    aim = max(neural, key=quality)
+    best = max(neural, key=quality)
+    lpips = None if best.lpips is None else best.lpips * NEAR[1]
+    aim = min((own for own in neural if own.reaches(quality(best) - NEAR[0], lpips)), key=lambda own: own.seconds)
     enough = [option for option in options if option.reaches(aim.psnr, aim.lpips)]
     found = min(enough, key=lambda option: option.seconds)
     if found is aim:

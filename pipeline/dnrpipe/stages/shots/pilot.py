@@ -90,7 +90,7 @@ class Pilot:
                 self.run.book(
                     "training",
                     "view",
-                    f"pilot/path {way.spp}" if way.name == "path" else f"pilot/{way.name}",
+                    f"pilot/{way.name} {way.spp}",
                     outcome.result["seconds"],
                     cpu_seconds=outcome.result["cpu_seconds"],
                     width=task.view.width,

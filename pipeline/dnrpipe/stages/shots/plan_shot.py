@@ -21,7 +21,8 @@ from .pilot import LADDER, Measured, Pilot, between
 from .records import ShotFrame
 from .renderers import Renderer, shipped_renderer, trusted_share
 
-OURS = (Way(name="base"), Way(name="neural"))
+FEWER = (2, 4)
+"""Rays per pixel of base images that are tried beside the settings'."""
 LIGHT_PATH = 2.5
 """Seconds of a path of baked light over those of a camera path: it sets out from everywhere, in all directions."""
 
@@ -54,11 +55,13 @@ def weigh(
         run.console.say(f"baked light is not weighed: {why}")
         return options, None
     trust = trusted_share(run)
-    measured = pilot.measure(shipped_renderer(run, tracer.common.background, trust), OURS)
+    rays = run.settings.base.samples
+    ours = [Way(name="base", spp=rays), *(Way(name="neural", spp=n) for n in (*FEWER, rays) if n <= rays)]
+    measured = pilot.measure(shipped_renderer(run, tracer.common.background, trust), list(dict.fromkeys(ours)))
     options += [baked_option(found, options, shape) for found in measured]
     if _wants_more(options, wanted) and wanted.way in (None, "neural"):
         found = worth(run, shape.still)
-        neural = next(option for option in options if option.way.name == "neural")
+        neural = options[-1]  # of as many rays as a training's base images
         if found.views and neural.psnr is not None:
             before = neural.before + found.views * found.seconds
             options.append(

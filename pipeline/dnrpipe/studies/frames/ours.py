@@ -39,8 +39,8 @@ class Ours:
     """The workspace's fine-tuned model on the CPU, and its base image.
 
     model is None, and frames have nothing neural, where the workspace has none: the base image alone is measured then.
-    samples: rays per pixel of base images, each a renderer of its own with the same model, whatever it was trained
-    with; none: the workspace's. folder, light: another model and baked light than the workspace's.
+    samples: rays per pixel of base images, each with the same model, whatever it was trained with; none: the
+    workspace's. folder, light: another model and baked light than the workspace's.
     Raises UserError: the model has a base image that is not timed here, or its light is not baked.
     """
 
@@ -59,16 +59,16 @@ class Ours:
         )
         if self.base not in TIMED:
             raise UserError(f"{folder}: base image '{self.base}' cannot be timed here, only {', '.join(TIMED)}")
-        self.renderers: dict[int, BaseRenderer] = {}
+        self.renderer: BaseRenderer | None = None
+        counts: tuple[int | None, ...] = (None,)
         if self.base == "baked":
             light = light or light_path(scene.workspace)
             if not light.exists():
                 raise UserError(f"{light}: the light is not baked; run `dnrpipe finetune` with model.base=baked first")
             mitsuba_scene = scene.engine.scenes[str(scene.bundle)]
-            baked = read_light(light)
-            for count in samples or (scene.settings.base.samples,):
-                self.renderers[count] = BaseRenderer(scene.engine.mi, mitsuba_scene, baked, count)
-        self.histories = {count: History(scene.engine.mi) for count in self.renderers}
+            self.renderer = BaseRenderer(scene.engine.mi, mitsuba_scene, read_light(light))
+            counts = samples or (scene.settings.base.samples,)
+        self.histories = {count: History(scene.engine.mi) for count in counts}
 
     def begin(self) -> None:
         """Forget the frames so far."""
@@ -77,8 +77,8 @@ class Ours:
 
     def remember(self, view: View, clock: Clock) -> None:
         """Take in what a frame of a moving camera sees."""
-        for renderer in self.renderers.values():
-            self._inputs(renderer, view, clock, self.histories[renderer.samples])
+        for samples, history in self.histories.items():
+            self._inputs(samples, view, clock, history)
 
     def frame(self, view: View, clock: Clock, *, remember: bool = False) -> dict[str, dict[str, Any]]:
         """By NEURAL and BASE, and the rays per pixel: {"picture": display RGB over white [1, 3, H, W], "parts":
@@ -87,12 +87,11 @@ class Ours:
         remember: with what earlier such frames saw, since `begin`; only of baked light that is not denoised.
         """
         result: dict[str, dict[str, Any]] = {}
-        for renderer in self.renderers.values() or (None,):
-            history = self.histories[renderer.samples] if remember and renderer is not None else None
-            channels, parts = self._inputs(renderer, view, clock, history)
-            rays = "" if renderer is None else f", {renderer.samples} rays"
+        for samples, history in self.histories.items():
+            channels, parts = self._inputs(samples, view, clock, history if remember else None)
+            rays = "" if samples is None else f", {samples} rays"
             rays += REMEMBERS if remember else ""
-            if renderer is not None:
+            if samples is not None:
                 alpha = channels["coverage"][..., None]
                 base = np.stack([channels[f"base.{c}"] for c in "RGB"], axis=-1)
                 straight = base / np.maximum(channels["base.A"], 1e-6)[..., None]
@@ -105,15 +104,15 @@ class Ours:
         return result
 
     def _inputs(
-        self, renderer: BaseRenderer | None, view: View, clock: Clock, history: History | None
+        self, samples: int | None, view: View, clock: Clock, history: History | None
     ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
         """(channels that the network sees, ms by part). The base image's kernel gives the G-buffer, too."""
-        if renderer is None:
+        if self.renderer is None or samples is None:
             channels, ms = clock.time(partial(self.scene.frames.gbuffer, view))
             return channels, {"G-buffer": ms}
         scale = self.scene.engine.unit_scale
         number = 0 if history is None else history.number
-        channels, ms = clock.time(partial(renderer.frame, scaled_view(view, scale), number))
+        channels, ms = clock.time(partial(self.renderer.frame, scaled_view(view, scale), samples, number))
         mask = channels["mask"] > 0.5
         coverage, finer = clock.time(partial(self.scene.frames.coverage, view, mask))
         channels |= {name: channels[name] / scale for name in ("depth.Z", *CHAIN)}
@@ -138,5 +137,5 @@ class Ours:
                 folder=self.scene.workspace.scene,
                 target=False,
                 base=self.base,
-                base_files=[path] if self.renderers else None,
+                base_files=[path] if self.renderer is not None else None,
             )
