@@ -55,6 +55,19 @@ def test_a_ball_rolls_and_the_frames_are_right(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_exr(shot / "frames" / "00001.exr")[0]["R"], pixels)
 
 
+@pytest.mark.robustness
+@pytest.mark.parametrize(("size", "gib"), [("1920x1080", 4), ("3840x2160", 8)])
+def test_large_frames_fit_in_memory(tmp_path: Path, size: str, gib: int) -> None:
+    """Base image, network and files of a frame, and the path-traced one that it is checked by."""
+    scene = shot_scenes.rolling(tmp_path)
+    words = ("shot", str(scene), "--frames", "1", "--size", size, "--way", "neural", "--set", "base.light_size=2048")
+    answer = json.loads(run(*words, "--json", folder=tmp_path).stdout)
+    assert answer["check"]["psnr"] > 30
+    rows = [json.loads(line) for line in (tmp_path / "rolling.shot.dnr" / "costs.jsonl").read_text().splitlines()]
+    peaks = {row["name"]: row["peak_mb"] for row in rows if row.get("width") == int(size.split("x")[0])}
+    assert {"frames/00001"} <= set(peaks) and max(peaks.values()) < 1024 * gib, peaks
+
+
 @pytest.mark.parametrize(
     ("words", "told"),
     [

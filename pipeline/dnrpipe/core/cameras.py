@@ -227,6 +227,16 @@ def scaled_to(view: View, side: int) -> View:
     )
 
 
+def window(view: View, width: int, height: int, place: tuple[float, float]) -> View:
+    """A part of the picture, pixel for pixel; pictures that are smaller stay as they are.
+
+    place: where it lies, in [0, 1] from left to right and from top to bottom.
+    """
+    width, height = min(width, view.width), min(height, view.height)
+    left, top = round((view.width - width) * place[0]), round((view.height - height) * place[1])
+    return view.model_copy(update={"width": width, "height": height, "cx": view.cx - left, "cy": view.cy - top})
+
+
 def depth_range(views: Sequence[View], summary: SceneSummary) -> tuple[float, float]:
     """(near, far) planar depth, scene units, that holds the bounding sphere for every view."""
     center = np.asarray(summary.bounds.center)

@@ -3,8 +3,8 @@
 Ways of rendering a frame (`Way`):
 
     path     path tracing and Open Image Denoise, with albedo and normals of clean primary rays
-    base     the base image alone: baked light and mirror-like paths
-    neural   the base image, corrected by the network
+    base     the base image, baked light and mirror-like paths, denoised
+    neural   the same, corrected by the network; one that was trained on the scene corrects base images as they are
 
 Seconds are wall-clock, ``cpu_seconds`` of the process.
 """
@@ -37,7 +37,7 @@ class Way(BaseModel):
         """In words, for tables."""
         if self.name == "path":
             return f"path tracing, {self.spp} samples, denoised"
-        return f"{'base images alone' if self.name == 'base' else 'neural renderer'}, {self.spp} rays"
+        return f"{'base images, denoised' if self.name == 'base' else 'neural renderer'}, {self.spp} rays"
 
 
 class FrameCommon(Task):

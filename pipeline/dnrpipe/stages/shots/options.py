@@ -57,8 +57,8 @@ def choose(options: Sequence[Option], wanted: Wanted) -> tuple[Option, str]:
     """The option to carry out, and why.
 
     With a time: the best PSNR that fits in; the quickest where none does. With a quality: the cheapest that reaches it;
-    the best where none does. With neither, the wanted quality is that of the neural renderer, with as few rays as cost
-    it next to nothing (`NEAR`): the cheapest option that has both its PSNR and its LPIPS.
+    the best where none does. With neither, the wanted quality is the best of baked light's, with as few rays as cost it
+    next to nothing (`NEAR`): the cheapest option that has both its PSNR and its LPIPS.
 
     Raises ValueError: no options.
     """
@@ -80,14 +80,14 @@ def choose(options: Sequence[Option], wanted: Wanted) -> tuple[Option, str]:
         if not enough:
             return max(options, key=quality), "the best; none is expected to reach what is wanted"
         return min(enough, key=lambda option: option.seconds), "the cheapest that is good enough"
-    neural = [option for option in options if option.way.name == "neural"]
-    if not neural:
+    baked = [option for option in options if option.way.name != "path"]
+    if not baked:
         return max(options, key=quality), "the best of its kind"
-    best = max(neural, key=quality)
+    best = max(baked, key=quality)
     lpips = None if best.lpips is None else best.lpips * NEAR[1]
-    aim = min((own for own in neural if own.reaches(quality(best) - NEAR[0], lpips)), key=lambda own: own.seconds)
+    aim = min((own for own in baked if own.reaches(quality(best) - NEAR[0], lpips)), key=lambda own: own.seconds)
     enough = [option for option in options if option.reaches(aim.psnr, aim.lpips)]
     found = min(enough, key=lambda option: option.seconds)
     if found is aim:
         return aim, "nothing cheaper has its quality"
-    return found, "it has the quality of the neural renderer, and is cheaper here"
+    return found, f"it has the quality of the {aim.told}, and is cheaper here"

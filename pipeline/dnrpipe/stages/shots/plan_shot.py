@@ -56,8 +56,9 @@ def weigh(
         return options, None
     trust = trusted_share(run)
     rays = run.settings.base.samples
-    ours = [Way(name="base", spp=rays), *(Way(name="neural", spp=n) for n in (*FEWER, rays) if n <= rays)]
-    measured = pilot.measure(shipped_renderer(run, tracer.common.background, trust), list(dict.fromkeys(ours)))
+    counts = [*(n for n in FEWER if n < rays), rays]
+    ours = [Way(name=name, spp=n) for name in ("base", "neural") for n in counts]
+    measured = pilot.measure(shipped_renderer(run, tracer.common.background, trust), ours)
     options += [baked_option(found, options, shape) for found in measured]
     if _wants_more(options, wanted) and wanted.way in (None, "neural"):
         found = worth(run, shape.still)
