@@ -58,18 +58,19 @@ class BaseRenderer:
     Args:
         mi: the mitsuba module, a jit variant set.
         light: E and S of the front and of the back, float32 [2, 2, size, size, 3], row 0 at V = 0.
+        gloss: see `SpecularPaths`.
 
     Of the last frame: ``repaired`` pixels had samples with parts that were not finite and are left out; ``masked``
     pixels were not finite all the same, and are 0.
     """
 
-    def __init__(self, mi: Any, scene: Any, light: np.ndarray) -> None:
+    def __init__(self, mi: Any, scene: Any, light: np.ndarray, *, gloss: bool = True) -> None:
         from .specular_paths import SpecularPaths  # imports Mitsuba
 
         self.mi, self.scene = mi, scene
         self.repaired = self.masked = 0
         self.light = light_textures(mi, light)
-        self.paths = SpecularPaths(scene)
+        self.paths = SpecularPaths(scene, gloss=gloss)
         self.tables = mi.UInt32(ORDER.ravel()), self.paths.steps
         prepare_emitters(mi, scene)
         # Recorded at the first call: tracing the plugins anew would take longer than the frame itself.

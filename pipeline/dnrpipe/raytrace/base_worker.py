@@ -21,6 +21,8 @@ from .sensors import scaled_view
 from .tasks import BakedCommon, BaseAnswer, BaseTask, SampledCommon, costs_since
 
 COLOUR = ("base.R", "base.G", "base.B", "base.A")
+PREMULTIPLIED = ("base.R", "base.G", "base.B", *(f"{kind}.{c}" for kind in ("diffuse", "albedo") for c in "RGB"))
+LEAST_ALPHA = 1e-6
 MIRROR = 0.02
 """Diffuse reflectance below which a surface counts as mirror or glass."""
 
@@ -37,7 +39,8 @@ class Worker(BundleWorker):
         dark = np.zeros((2, 2, 2, 2, 3), np.float32)
         light = read_light(self.common.light) if isinstance(self.common, BakedCommon) else dark
         scene = self.engine.scenes[str(self.bundle)]
-        self.renderer = BaseRenderer(self.engine.mi, scene, light)
+        self.denoise = isinstance(self.common, BakedCommon) and self.common.denoise
+        self.renderer = BaseRenderer(self.engine.mi, scene, light, gloss=not self.denoise)
         self.silhouettes: dict[tuple[int, int], Frames] = {}
         self.history, self.seen = History(self.engine.mi), list[tuple[View, int | None]]()
         """Of the frames ``seen``, and their rays per pixel."""
@@ -70,15 +73,20 @@ class Worker(BundleWorker):
 
         samples: rays per pixel, if not the workspace's. number: see `BaseRenderer.frame`.
         """
+        channels = self._channels(view, samples, number)
+        if isinstance(self.common, SampledCommon):
+            return channels | self._traced(self.common, view, channels)
+        return without_grain(channels) if self.denoise else channels
+
+    def _channels(self, view: View, samples: int | None, number: int) -> dict[str, np.ndarray]:
+        """By the kernel: not denoised."""
         renderer, scaled = self.renderer, scaled_view(view, self.engine.unit_scale)
         channels = renderer.frame(scaled, samples or self.common.samples, number)
         self.repaired, self.masked = self.repaired + renderer.repaired, self.masked + renderer.masked
         for name in ("depth.Z", *CHAIN):
             channels[name] = channels[name] / self.engine.unit_scale
         channels["coverage"] = self._frames(view).coverage(view, channels["mask"] > 0.5)
-        if isinstance(self.common, SampledCommon):
-            return channels | self._traced(self.common, view, channels)
-        return channels | denoised(channels) if self.common.denoise else channels
+        return channels
 
     def remembered(
         self, view: View, earlier: Sequence[View], number: int = 0, samples: int | None = None
@@ -95,10 +103,11 @@ class Worker(BundleWorker):
         self.seen = way
         for frame, _ in way[known:-1]:
             self._taken(frame, samples)
-        return self._taken(view, samples)
+        channels = self._taken(view, samples)
+        return without_grain(channels) if self.denoise else channels
 
     def _taken(self, view: View, samples: int | None) -> dict[str, np.ndarray]:
-        return self.history.take(view, self.channels(view, samples, self.history.number))
+        return self.history.take(view, self._channels(view, samples, self.history.number))
 
     def _frames(self, view: View) -> Frames:
         """Finer silhouettes than the base image's few rays give, for views of one size."""
@@ -118,8 +127,16 @@ class Worker(BundleWorker):
         return clean | {"base.A": found["base.A"]} | {f"diffuse.{c}": clean[f"base.{c}"] for c in "RGB"}
 
 
-def denoised(channels: dict[str, np.ndarray], threads: int = 1) -> dict[str, np.ndarray]:
-    """base.R/G/B without grain. One thread: bits repeat.
+def without_grain(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The channels with a denoised base image whose alpha is the coverage, which has no grain at silhouettes."""
+    alpha = channels["coverage"]
+    share = alpha / np.maximum(channels["base.A"], LEAST_ALPHA)
+    image = channels | {name: channels[name] * share for name in PREMULTIPLIED} | {"base.A": alpha}
+    return image | denoised(image)
+
+
+def denoised(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """base.R/G/B without grain.
 
     The auxiliary images are not called clean: measured, that is better by half a decibel and more.
     """
@@ -129,5 +146,5 @@ def denoised(channels: dict[str, np.ndarray], threads: int = 1) -> dict[str, np.
     mirror = (albedo.mean(axis=-1, keepdims=True) < MIRROR) & (channels["mask"][..., None] > 0.5)
     albedo = np.where(mirror, np.float32(1), albedo).clip(0, 1)
     normal = np.stack([channels[f"normal.{c}"] for c in "XYZ"], axis=-1)
-    clean = denoise(image, albedo, normal, clean=False, quality="fast", threads=threads)
+    clean = denoise(image, albedo, normal, clean=False, quality="fast")
     return {name: clean[..., i] for i, name in enumerate(COLOUR[:3])}

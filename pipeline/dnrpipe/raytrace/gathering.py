@@ -48,14 +48,21 @@ class GatheringBaker(LightBaker):
     """Bakes E and S of one scene by final gathering.
 
     Args:
-        integrator: of the coarse map, as `LightBaker`'s, but one bounce less: gathering adds it.
+        integrator, gloss: of the coarse map, as `LightBaker`'s, but one bounce less: gathering adds it.
         caustics: False: light that comes from mirror-like lobes is left out.
     """
 
     def __init__(
-        self, mi: Any, scene: Any, integrator: Any, groups: Sequence[tuple[Path, np.ndarray]] = (), *, caustics: bool
+        self,
+        mi: Any,
+        scene: Any,
+        integrator: Any,
+        groups: Sequence[tuple[Path, np.ndarray]] = (),
+        *,
+        gloss: bool = True,
+        caustics: bool,
     ) -> None:
-        super().__init__(mi, scene, integrator, groups)
+        super().__init__(mi, scene, integrator, groups, gloss=gloss)
         self.caustics, self.gathers = caustics, False
 
     def bake(self, size: int, spp: int, seed: int) -> np.ndarray:
@@ -63,7 +70,7 @@ class GatheringBaker(LightBaker):
         side = min(size, max(COARSE, size // FINER))
         coarse = super().bake(side, max(1, COARSE_PATHS // side**2), 2 * seed)
         traced, lost = self.integrator, self.lost
-        self.integrator, self.gathers = Gathered(self.mi, self.scene, coarse, caustics=self.caustics), True
+        self.integrator, self.gathers = self._gathered(coarse), True
         try:
             emitters = functools.partial(self._light, indirect=False)
             surfaces = functools.partial(self._light, direct=False)
@@ -74,6 +81,9 @@ class GatheringBaker(LightBaker):
         self.lost += lost
         return np.stack([light, [enlarged(image, size) for image in coarse[1]]])
 
+    def _gathered(self, coarse: np.ndarray) -> Gathered:
+        return Gathered(self.mi, self.scene, coarse, gloss=self.glossy, caustics=self.caustics)
+
     def _numbers(self, sampler: Any, texel: Any, index: Any, count: int, seed: Any) -> Any:
         return SpreadNumbers(self.mi, sampler, texel, index, count, seed) if self.gathers else sampler
 
@@ -83,14 +93,14 @@ class Gathered:
 
     Args:
         light: E and S of the front and of the back, float32 [2, 2, size, size, 3], row 0 at V = 0.
-        caustics: False: rays end at mirror-like lobes.
+        gloss: rays end at rough lobes, where S says what these see. caustics: False: rays end at mirror-like lobes.
     """
 
-    def __init__(self, mi: Any, scene: Any, light: np.ndarray, *, caustics: bool) -> None:
+    def __init__(self, mi: Any, scene: Any, light: np.ndarray, *, gloss: bool, caustics: bool) -> None:
         from .specular_paths import SpecularPaths  # imports Mitsuba
 
         self.mi, self.light = mi, light_textures(mi, light)
-        self.paths = SpecularPaths(scene, camera=False, caustics=caustics)
+        self.paths = SpecularPaths(scene, camera=False, gloss=gloss, caustics=caustics)
 
     def sample(self, scene: Any, numbers: Any, ray: Any, medium: Any, active: Any) -> tuple[Any, Any, list[Any]]:
         """As `mi.SamplingIntegrator.sample` with emitters hidden. medium: None."""

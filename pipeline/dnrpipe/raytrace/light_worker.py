@@ -51,9 +51,10 @@ def light_baker(mi: Any, scene: Any, groups: Sequence[tuple[Path, np.ndarray]], 
     """What bakes the light as the task wants it. Paths are traced where rays are wanted but the scene has media."""
     indirect = indirect_integrator(mi, scene, task.integrator, task.max_depth)
     if not task.gather or indirect is None or not can_gather(scene):
-        return LightBaker(mi, scene, indirect, groups)
+        return LightBaker(mi, scene, indirect, groups, gloss=task.gloss)
     coarse = indirect_integrator(mi, scene, task.integrator, task.max_depth - 1)
-    return GatheringBaker(mi, scene, coarse, groups, caustics=task.integrator != "path-without-caustics")
+    caustics = task.integrator != "path-without-caustics"
+    return GatheringBaker(mi, scene, coarse, groups, gloss=task.gloss, caustics=caustics)
 
 
 def indirect_integrator(mi: Any, scene: Any, kind: str, max_depth: int) -> Any:

@@ -59,18 +59,27 @@ class LightBaker:
         integrator: continues paths from their first bounce on; emitters that it meets first must be hidden. None:
             direct light alone.
         groups: see `texels.AtlasSurface`.
+        gloss: S is wanted; otherwise it is 0.
 
     ``lost`` counts the samples of the last bake that were not finite; each is left out of its texel's mean.
     """
 
-    def __init__(self, mi: Any, scene: Any, integrator: Any, groups: Sequence[tuple[Path, np.ndarray]] = ()) -> None:
+    def __init__(
+        self,
+        mi: Any,
+        scene: Any,
+        integrator: Any,
+        groups: Sequence[tuple[Path, np.ndarray]] = (),
+        *,
+        gloss: bool = True,
+    ) -> None:
         self.mi, self.scene, self.integrator = mi, scene, integrator
         self.surface = AtlasSurface(mi, scene, groups)
         self.lift = float(LIFT * scene.bbox().bounding_sphere().radius)
         self.passing = lets_through(mi, scene)
         bsdfs = bsdfs_of(scene)
         self.unsplit = [b for b in bsdfs if ignores_context(b)]
-        self.glossy = any(mi.has_flag(b.flags(), mi.BSDFFlags.Glossy) for b in bsdfs)
+        self.glossy = gloss and any(mi.has_flag(b.flags(), mi.BSDFFlags.Glossy) for b in bsdfs)
         self.media = media_of(scene)
         self.lost = 0
         self._known: dict[int, Any] = {}

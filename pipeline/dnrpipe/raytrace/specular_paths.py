@@ -51,10 +51,11 @@ class SpecularPaths:
         scene: a scene of the current variant (jit variants only).
         camera: the rays are a camera's: they pass lamps and unseen shapes, and what glows is seen. False: a surface's,
             where emitters were sampled: rays end at them, before the first mirror, glass or glossy lobe.
+        gloss: paths end at rough lobes, where S says what these see. False: they are followed like the others.
         caustics: False: rays end at sharp lobes (`paths.is_sharp`).
     """
 
-    def __init__(self, scene: Any, *, camera: bool = True, caustics: bool = True) -> None:
+    def __init__(self, scene: Any, *, camera: bool = True, gloss: bool = True, caustics: bool = True) -> None:
         self.camera, self.caustics = camera, caustics
         self.steps = mi.Float(steps(NUMBERS * (MAX_VERTICES + 1)))
         unseen = (LAMP_PREFIX, UNSEEN_PREFIX)
@@ -67,7 +68,7 @@ class SpecularPaths:
         self.unsplit = [bsdf for bsdf in bsdfs if ignores_context(bsdf)]
         self.has_unsplit_holes = any(mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null) for bsdf in self.unsplit)
         self.translucent = bool(self.unsplit) or any(mi.has_flag(f, mi.BSDFFlags.DiffuseTransmission) for f in flags)
-        self.has_glossy = any(mi.has_flag(f, mi.BSDFFlags.GlossyReflection) for f in flags)
+        self.ends_at_rough = gloss and any(mi.has_flag(f, mi.BSDFFlags.GlossyReflection) for f in flags)
         self.has_glass = camera and any(mirrors_and_refracts(mi, f) for f in flags)
 
         kinds = mi.BSDFFlags
@@ -280,7 +281,7 @@ class SpecularPaths:
 
     def _is_rough(self, bsdf: Any, si: Any, active: Any) -> Any:
         """Whether the lobe is so wide that S says what it sees."""
-        return is_rough(mi, bsdf, self.specular, si, active) if self.has_glossy else mi.Bool(False)
+        return is_rough(mi, bsdf, self.specular, si, active) if self.ends_at_rough else mi.Bool(False)
 
     def _direct(self, scene: Any, bsdf: Any, si: Any, throughput: Any, u: list[Any], active: Any) -> Any:
         """Light of one emitter that the glossy lobes send back."""

@@ -182,13 +182,14 @@ class PassAnswer(TypedDict):
 class LightTask(Task):
     """Bake a light map of size² texels with ``spp`` paths each into ``output``, an ``npz``: see `light_worker`.
 
-    gather: rays instead of paths, as far as the scene allows (`gathering`).
+    gather: rays instead of paths, as far as the scene allows (`gathering`). gloss: what rough lobes see is baked, too.
     """
 
     output: Path
     size: int
     spp: int
     gather: bool
+    gloss: bool = True
     integrator: str
     max_depth: int
     seed: int
@@ -205,7 +206,10 @@ class LightAnswer(Costs):
 
 
 class BakedCommon(BundleCommon):
-    """Base images by baked light. samples: rays per pixel. light: file of the light map. denoise: they are denoised."""
+    """Base images by baked light. samples: rays per pixel. light: file of the light map.
+
+    denoise: rough lobes are followed instead of looked up, and Open Image Denoise takes the grain.
+    """
 
     kind: Literal["baked"]
     samples: int

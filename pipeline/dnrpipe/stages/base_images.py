@@ -29,7 +29,7 @@ from ..workers.view_tasks import only_answer, warn_of_repairs
 from .effect_plan import resolve_plan
 from .stage import Run
 
-LIGHT_VERSION, BASE_VERSION = 9, 15
+LIGHT_VERSION, BASE_VERSION, DENOISE_VERSION = 9, 15, 2
 RENDERED = ("baked", "direct", "path")
 """Kinds of base images that are rendered into files of their own."""
 AUTOMATIC_TEXELS = {"traced": 4, "gathered": 2}
@@ -131,7 +131,7 @@ def base_views(
         bake_light(run, renderer)
     paths = paths or [base_path(run.workspace, split, view.name) for view in views]
     chosen, tasks = run.settings, []
-    remembers = sequence and chosen.model.base == "baked" and not chosen.base.denoise
+    remembers = sequence and chosen.model.base == "baked"
     cameras = [view.model_dump(mode="json") for view in views]
     for number, (data, path) in enumerate(zip(cameras, paths, strict=True)):
         begin = max(0, number - number % CHUNK - WARM_UP)
@@ -194,14 +194,16 @@ def base_renderer(workspace: Workspace, settings: Settings, plan: EffectPlan) ->
             "size": light_size(settings),
             "spp": light_spp(settings),
             "gather": chosen.light == "gathered",
+            "gloss": not chosen.denoise,
             "integrator": config["integrator"],
             "max_depth": config["max_depth"],
             "seed": settings.raytrace.seed,
         }
-        # Without ``gather`` where paths are traced: light that was baked before there was a choice stays.
-        decides = {k: v for k, v in light.items() if k != "output" and (k != "gather" or v)}
+        # Without what was the only choice once: light that was baked then stays.
+        usual = {"gather": False, "gloss": True}
+        decides = {k: v for k, v in light.items() if k != "output" and usual.get(k) != v}
         light["fingerprint"] = digest([LIGHT_VERSION, inputs, decides])
-        fingerprint = digest([light["fingerprint"], chosen.samples, chosen.denoise])
+        fingerprint = digest([light["fingerprint"], chosen.samples, DENOISE_VERSION if chosen.denoise else False])
         return BaseRenderer(common, choice.environment, light, fingerprint)
     direct = kind == "direct"
     common |= {

@@ -4,7 +4,7 @@ Ways of rendering a frame (`Way`):
 
     path     path tracing and Open Image Denoise, with albedo and normals of clean primary rays
     base     the base image, baked light and mirror-like paths, denoised
-    neural   the same, corrected by the network; one that was trained on the scene corrects base images as they are
+    neural   the same, corrected by the network
 
 Seconds are wall-clock, ``cpu_seconds`` of the process.
 """

@@ -18,7 +18,6 @@ from dnrpipe.core.images import over_white, write_png
 from dnrpipe.core.settings import Settings
 from dnrpipe.raytrace.background import Background
 from dnrpipe.raytrace.base_worker import Worker as BaseWorker
-from dnrpipe.raytrace.base_worker import denoised
 from dnrpipe.raytrace.denoise import denoise
 from dnrpipe.raytrace.engine import Engine, masked, masked_channels
 from dnrpipe.raytrace.frames import Frames
@@ -38,7 +37,6 @@ LAYERS = (*COLOUR, "depth.Z", "normal.X", "normal.Y", "normal.Z", "albedo.R", "a
 centre; albedo is the diffuse reflectance."""
 HALF = ("R", "G", "B", "A", "normal.X", "normal.Y", "normal.Z", "albedo.R", "albedo.G", "albedo.B")
 """Of them, those that are written in 16 bits."""
-PREMULTIPLIED = ("base.R", "base.G", "base.B", "albedo.R", "albedo.G", "albedo.B")
 LEAST_ALPHA = 1e-6
 GUIDE_RAYS = 16
 """Primary rays per pixel of the denoiser's auxiliary images: clean."""
@@ -141,8 +139,6 @@ class Worker:
             asked = (task.view, task.earlier, task.number, task.way.spp)
             channels = timed("base image", self.base.remembered, *asked)
         lost = self.base.masked
-        if self.common.checkpoint is None:  # a trained renderer has learned from base images as they are
-            channels |= timed("denoiser", _denoised, channels)
         alpha = channels["coverage"]
         if task.way.name == "neural":
             colour = timed("network", self._corrected, task.view, channels)
@@ -185,14 +181,6 @@ class Worker:
         launches = -(-spp // each)
         total = sum(frames.path(view, each, task.seed * 4096 + launch) for launch in range(launches))
         return np.asarray(total, np.float32) / launches
-
-
-def _denoised(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The base image without grain, its alpha the coverage: that has no grain at silhouettes."""
-    alpha = channels["coverage"]
-    share = alpha / np.maximum(channels["base.A"], LEAST_ALPHA)
-    image = {name: channels[name] * share for name in PREMULTIPLIED} | {"base.A": alpha}
-    return image | denoised(channels | image, threads=0)
 
 
 def _at_once(task: FrameTask) -> int:

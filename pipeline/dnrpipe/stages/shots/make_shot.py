@@ -91,17 +91,21 @@ def plan_shot(session: Session, shot: Shot) -> ShotPlan:
 
 
 def choose_light(session: Session, frames: Sequence[ShotFrame]) -> None:
-    """Set how light is baked where the user has not: gathered where much of it has bounced; finer where the shot has
-    more pixels than its paths, so that they take a small part of the time (figures: docs/experiments.md)."""
+    """Set how light is baked where the user has not (figures: docs/experiments.md): gathered where much of it has
+    bounced; finer where the shot has more pixels than its paths, so that they take a small part of the time.
+
+    Base images are denoised.
+    """
     own = session.workspace.manifest.overrides.get("base", {})
     pilot = resolve_plan(session.run.for_stage("render")).pilot
     bounced = next((step.mean for step in pilot.steps if step.depth == 2), 0.0) if pilot else 0.0
     light = own.get("light", "gathered" if bounced >= GATHER_FROM else "traced")
+    session.adopt({"base": {"light": light, "denoise": own.get("denoise", True)}})
     if "light_size" in own:
-        return session.adopt({"base": {"light": light}})
+        return
     pixels = sum(frame.view.width * frame.view.height for frame in frames if not frame.moving)
     few, many = LIGHT_SIZES[light]
-    session.adopt({"base": {"light": light, "light_size": many}})
+    session.adopt({"base": {"light_size": many}})
     if light_paths(session.settings) > pixels:
         session.adopt({"base": {"light_size": few}})
 

@@ -21,7 +21,7 @@ from dnrtrain.model import render_views
 
 from ...core.errors import UserError
 from ...raytrace.base_renderer import CHAIN, BaseRenderer
-from ...raytrace.base_worker import denoised
+from ...raytrace.base_worker import without_grain
 from ...raytrace.history import History
 from ...raytrace.light_worker import read_light
 from ...raytrace.sensors import scaled_view
@@ -66,7 +66,8 @@ class Ours:
             if not light.exists():
                 raise UserError(f"{light}: the light is not baked; run `dnrpipe finetune` with model.base=baked first")
             mitsuba_scene = scene.engine.scenes[str(scene.bundle)]
-            self.renderer = BaseRenderer(scene.engine.mi, mitsuba_scene, read_light(light))
+            gloss = not scene.settings.base.denoise
+            self.renderer = BaseRenderer(scene.engine.mi, mitsuba_scene, read_light(light), gloss=gloss)
             counts = samples or (scene.settings.base.samples,)
         self.histories = {count: History(scene.engine.mi) for count in counts}
 
@@ -84,7 +85,7 @@ class Ours:
         """By NEURAL and BASE, and the rays per pixel: {"picture": display RGB over white [1, 3, H, W], "parts":
         {name: ms}}.
 
-        remember: with what earlier such frames saw, since `begin`; only of baked light that is not denoised.
+        remember: with what earlier such frames saw, since `begin`; only of baked light.
         """
         result: dict[str, dict[str, Any]] = {}
         for samples, history in self.histories.items():
@@ -120,10 +121,10 @@ class Ours:
         parts = {"base image and G-buffer": ms, "silhouettes": finer}
         if history is not None:
             channels, parts["history"] = clock.time(partial(history.take, view, channels))
+        channels = {**channels, **changed}
         if self.scene.settings.base.denoise:
-            clean, parts["denoiser"] = clock.time(partial(denoised, channels, 0))
-            changed |= clean
-        return {**channels, **changed}, parts
+            channels, parts["denoiser"] = clock.time(partial(without_grain, channels))
+        return channels, parts
 
     def _data(self, view: View, channels: dict[str, np.ndarray]) -> Any:
         with tempfile.TemporaryDirectory() as folder:
