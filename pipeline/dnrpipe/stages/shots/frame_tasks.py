@@ -25,18 +25,21 @@ WayName = Literal["path", "base", "neural"]
 
 
 class Way(BaseModel):
-    """How a frame is rendered. spp: samples per pixel of ``path``, rays per pixel of a base image."""
+    """How a frame is rendered. spp: samples per pixel of ``path``, rays per pixel of a base image. quality: of the
+    denoiser, of ``path``."""
 
     model_config = ConfigDict(frozen=True)
 
     name: WayName
     spp: int
+    quality: Literal["balanced", "high"] = "high"
 
     @property
     def told(self) -> str:
         """In words, for tables."""
         if self.name == "path":
-            return f"path tracing, {self.spp} samples, denoised"
+            quickly = " quickly" if self.quality == "balanced" else ""
+            return f"path tracing, {self.spp} samples, denoised{quickly}"
         return f"{'base images, denoised' if self.name == 'base' else 'neural renderer'}, {self.spp} rays"
 
 

@@ -106,9 +106,9 @@ class Worker:
     def render(self, task: FrameTask, ms: dict[str, float]) -> tuple[dict[str, np.ndarray], int]:
         """(channels of LAYERS, float32 [H, W] each; pixels that were not finite). ms: milliseconds of the parts."""
 
-        def timed(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+        def timed(name: str, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
             began = time.perf_counter()
-            found = function(*arguments)
+            found = function(*arguments, **options)
             ms[name] = 1000 * (time.perf_counter() - began)
             return found
 
@@ -162,7 +162,7 @@ class Worker:
         frames = self.frames((view.width, view.height))
         image, lost = masked(timed("path tracing", self._traced, task, frames))
         guide = timed("primary rays", frames.auxiliary, view, GUIDE_RAYS, task.seed)
-        clean = timed("denoiser", denoise, image, guide.albedo, guide.normal)
+        clean = timed("denoiser", denoise, image, guide.albedo, guide.normal, quality=task.way.quality)
         gbuffer, more = masked_channels(timed("G-buffer", frames.gbuffer, view))
         alpha = guide.coverage if task.lens is None else image[..., 3]
         layers = {name: clean[..., i] for i, name in enumerate("RGB")} | {"A": alpha}

@@ -37,8 +37,8 @@ FRAMES, SIZE = 2, (192, 108)
 """Frames of the pilot, and pixels of a window."""
 PLACES = ((0.2, 0.7), (0.75, 0.4))
 """Of the windows in a frame."""
-LADDER = (1, 4, 16, 64)
-"""Samples per pixel of the path-traced pictures; those between are interpolated."""
+LADDER, QUICK = (1, 4, 16, 64), (1, 4, 16)
+"""Samples per pixel of path-traced pictures, and of those that are denoised quickly; those between are interpolated."""
 REFERENCE = Way(name="path", spp=256)
 REFERENCE_SEED = 7
 LEAD = 4

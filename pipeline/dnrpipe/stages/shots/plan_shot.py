@@ -17,7 +17,7 @@ from ..stage import Run
 from ..worth import worth
 from .frame_tasks import Way
 from .options import Option, Wanted
-from .pilot import LADDER, Measured, Pilot, between
+from .pilot import LADDER, QUICK, Measured, Pilot, between
 from .records import ShotFrame
 from .renderers import Renderer, shipped_renderer, trusted_share
 
@@ -48,8 +48,9 @@ def weigh(
     moving = sum(bool(frame.moving) for frame in frames)
     shape = Shape(len(frames) - moving, moving, view.width * view.height, _conversion_seconds(run))
     pilot = Pilot(run, frames, folder, lpips)
-    rungs = [Way(name="path", spp=spp) for spp in LADDER]
-    ladder = between(pilot.measure(tracer, rungs))
+    quick = [Way(name="path", spp=spp, quality="balanced") for spp in QUICK]
+    measured = pilot.measure(tracer, [*quick, *(Way(name="path", spp=spp) for spp in LADDER)])
+    ladder = [*between(measured[: len(quick)]), *between(measured[len(quick) :])]
     options = [path_option(found, shape) for found in ladder]
     if why := _no_baked_light(run, frames, shape, ladder, wanted):
         run.console.say(f"baked light is not weighed: {why}")
