@@ -39,7 +39,7 @@ PLACES = ((0.2, 0.7), (0.75, 0.4))
 """Of the windows in a frame."""
 LADDER, QUICK = (1, 4, 16, 64), (1, 4, 16)
 """Samples per pixel of path-traced pictures, and of those that are denoised quickly; those between are interpolated."""
-REFERENCE = Way(name="path", spp=256)
+REFERENCE = Way(name="path", spp=128)
 REFERENCE_SEED = 7
 LEAD = 4
 """Frames before a frame of the pilot that it remembers."""

@@ -15,7 +15,7 @@ from ...core.units import duration
 from ..base_images import base_renderer, light_paths
 from ..stage import Run
 from ..worth import worth
-from .frame_tasks import Way
+from .frame_tasks import Way, WayName
 from .options import Option, Wanted
 from .pilot import LADDER, QUICK, Measured, Pilot, between
 from .records import ShotFrame
@@ -58,7 +58,8 @@ def weigh(
     trust = trusted_share(run)
     rays = run.settings.base.samples
     counts = [*(n for n in FEWER if n < rays), rays]
-    ours = [Way(name=name, spp=n) for name in ("base", "neural") for n in counts]
+    kinds: tuple[WayName, ...] = ("base", "neural") if trust or wanted.way == "neural" else ("base",)
+    ours = [Way(name=kind, spp=n) for kind in kinds for n in counts]
     measured = pilot.measure(shipped_renderer(run, tracer.common.background, trust), ours)
     options += [baked_option(found, options, shape) for found in measured]
     if _wants_more(options, wanted) and wanted.way in (None, "neural"):
@@ -69,6 +70,7 @@ def weigh(
             options.append(
                 neural.model_copy(
                     update={
+                        "way": Way(name="neural", spp=neural.way.spp),
                         "views": found.views,
                         "before": before,
                         "seconds": neural.seconds + found.views * found.seconds,
@@ -155,7 +157,7 @@ def _no_baked_light(
 
 
 def _wants_more(options: Sequence[Option], wanted: Wanted) -> bool:
-    """Whether a quality is wanted that the shipped renderer is not expected to reach."""
-    neural = [option for option in options if option.way.name == "neural"]
+    """Whether a quality is wanted that baked light is not expected to reach without training."""
+    baked = [option for option in options if option.way.name != "path"]
     asked = wanted.psnr is not None or wanted.lpips is not None
-    return asked and not any(option.reaches(wanted.psnr, wanted.lpips) for option in neural)
+    return asked and not any(option.reaches(wanted.psnr, wanted.lpips) for option in baked)

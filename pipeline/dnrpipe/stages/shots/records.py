@@ -56,8 +56,8 @@ class ShotPlan(Record):
 class Check(Record):
     """Held-out frames against references that were traced for it, over white; means over the frames.
 
-    spp: samples per pixel of the references, in all. noise: mean square error of these, as a share of the frames'.
-    flip: LDR-FLIP. seconds: what it took.
+    spp: samples per pixel of the references, in all. noise: mean square error of these, as a share of the frames'; psnr
+    (dB) does not count it. flip: LDR-FLIP. seconds: what it took.
     """
 
     frames: tuple[int, ...]
