@@ -56,7 +56,7 @@ def test_a_ball_rolls_and_the_frames_are_right(tmp_path: Path) -> None:
 
 
 @pytest.mark.robustness
-@pytest.mark.parametrize(("size", "gib"), [("1920x1080", 4), ("3840x2160", 8)])
+@pytest.mark.parametrize(("size", "gib"), [("1920x1080", 4), ("3840x2160", 8)], ids=["1920x1080", "3840x2160"])
 def test_large_frames_fit_in_memory(tmp_path: Path, size: str, gib: int) -> None:
     """Base image, network and files of a frame, and the path-traced one that it is checked by."""
     scene = shot_scenes.rolling(tmp_path)
