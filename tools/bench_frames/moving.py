@@ -154,14 +154,14 @@ class Rivals:
         self.scene, self.baselines = scene, baselines
         mi = scene.engine.mi
         dark = np.zeros((2, 2, 2, 2, 3), np.float32)
-        self.guide = BaseRenderer(mi, scene.engine.scenes[str(scene.bundle)], dark, 1)
+        self.guide = BaseRenderer(mi, scene.engine.scenes[str(scene.bundle)], dark)
         samples = {spp for spp, _ in baselines}
         self.histories = {(spp, patience): History(mi) for spp in samples for patience in PATIENCE}
 
     def frame(self, view: View, number: int, clock: Clock, judged: bool) -> dict[str, tuple[Any, float]]:
         """By name: (display picture, ms); of a frame that is not judged nothing but what is gathered."""
         scene, seed = self.scene, 1_000_003 * (number + 1)
-        channels = self.guide.frame(scaled_view(view, scene.engine.unit_scale))
+        channels = self.guide.frame(scaled_view(view, scene.engine.unit_scale), 1)
         for name in ("depth.Z", *CHAIN):
             channels[name] = channels[name] / scene.engine.unit_scale
         paths, gathered, guides = {}, {}, {0: (None, 0.0)}

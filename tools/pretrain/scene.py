@@ -168,13 +168,13 @@ def _look(
     light = LightBaker(engine.mi, scene, indirect, grouped_meshes(bundle)).bake(size, spp, seed)
     took("light")
     scaled = [[scaled_view(view, engine.unit_scale) for view in way] for way in ways]
-    renderers, history = [BaseRenderer(engine.mi, scene, light, k) for k in rays], History(engine.mi)
-    bases = [[renderer.frame(way[-1]) for way in scaled] for renderer in renderers[:-1]]
+    renderer, history = BaseRenderer(engine.mi, scene, light), History(engine.mi)
+    bases = [[renderer.frame(way[-1], count) for way in scaled] for count in rays[:-1]]
     took("base images")
     bases.append([])
     for way in scaled:
         history.begin()
-        frames = [history.take(view, renderers[-1].frame(view, history.number)) for view in way]
+        frames = [history.take(view, renderer.frame(view, rays[-1], history.number)) for view in way]
         bases[-1].append(frames[-1])
     took("memory")
     views = [way[-1] for way in ways]
