@@ -65,7 +65,7 @@ def test_large_frames_fit_in_memory(tmp_path: Path, size: str, gib: int) -> None
     assert answer["check"]["psnr"] > 30
     rows = [json.loads(line) for line in (tmp_path / "rolling.shot.dnr" / "costs.jsonl").read_text().splitlines()]
     peaks = {row["name"]: row["peak_mb"] for row in rows if row.get("width") == int(size.split("x")[0])}
-    assert {"frames/00001"} <= set(peaks) and max(peaks.values()) < 1024 * gib, peaks
+    assert {"frames/frame00001"} <= set(peaks) and max(peaks.values()) < 1024 * gib, peaks
 
 
 @pytest.mark.parametrize(
