@@ -17,6 +17,7 @@ from dnrpipe.core.errors import UserError
 from dnrpipe.core.images import over_white, write_png
 from dnrpipe.core.settings import Settings
 from dnrpipe.raytrace.background import Background
+from dnrpipe.raytrace.base_worker import LEAST_ALPHA
 from dnrpipe.raytrace.base_worker import Worker as BaseWorker
 from dnrpipe.raytrace.denoise import denoise
 from dnrpipe.raytrace.engine import Engine, masked, masked_channels
@@ -37,7 +38,6 @@ LAYERS = (*COLOUR, "depth.Z", "normal.X", "normal.Y", "normal.Z", "albedo.R", "a
 centre; albedo is the diffuse reflectance."""
 HALF = ("R", "G", "B", "A", "normal.X", "normal.Y", "normal.Z", "albedo.R", "albedo.G", "albedo.B")
 """Of them, those that are written in 16 bits."""
-LEAST_ALPHA = 1e-6
 GUIDE_RAYS = 16
 """Primary rays per pixel of the denoiser's auxiliary images: clean."""
 MAX_RAYS = 1 << 22

@@ -117,11 +117,10 @@ class Ours:
         mask = channels["mask"] > 0.5
         coverage, finer = clock.time(partial(self.scene.frames.coverage, view, mask))
         channels |= {name: channels[name] / scale for name in ("depth.Z", *CHAIN)}
-        changed: dict[str, np.ndarray] = {"coverage": coverage}
         parts = {"base image and G-buffer": ms, "silhouettes": finer}
         if history is not None:
             channels, parts["history"] = clock.time(partial(history.take, view, channels))
-        channels = {**channels, **changed}
+        channels = {**channels, "coverage": coverage}
         if self.scene.settings.base.denoise:
             channels, parts["denoiser"] = clock.time(partial(without_grain, channels))
         return channels, parts
