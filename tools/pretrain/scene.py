@@ -35,14 +35,14 @@ from dnrpipe.stages.prepare import scene_and_views
 from dnrpipe.stages.stage import Run
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import View
-from dnrtrain.pretraining_data import BRIGHT, RAY_COUNTS, REMEMBERED, Scene, channel_names
+from dnrtrain.pretraining_data import BRIGHT, RAY_COUNTS, Scene, channel_names
 
 FACTORY = Path(__file__).resolve().parents[2] / "blender_scenes" / "factory" / "build.py"
 LEFT_OUT = ("remix",)
 """Families that are made of the example scenes: what is measured on those must come from weights that saw none."""
 DEPTH = 24
 """Of the references; base images follow 16 vertices."""
-SIZES = ((96, 6), (128, 4), (192, 2))
+SIZES = ((96, 6), (128, 6), (192, 4), (288, 2))
 """(pixels a side, views), one of them drawn for a scene."""
 LIGHT_MAPS = ((256, 24), (384, 16))
 """(texels a side, paths per texel), one of them drawn for a scene."""
@@ -81,7 +81,10 @@ def make(seed: int, folder: Path, scratch: Path) -> None:
     took("build")
     workspace = Workspace.create(scratch / "scene.dnr", Source(path=str(blend), sha256=file_sha256(blend)))
     random = np.random.default_rng([seed, 7])
-    rays = [int(random.choice(RAY_COUNTS[:-1])), RAY_COUNTS[-1]]  # the last is what workspaces have
+    draw = lambda: int(random.choice(RAY_COUNTS))  # noqa: E731
+    inputs = [f"{draw()}", f"{RAY_COUNTS[-1]} denoised", f"{draw()} remembered"]
+    if (fewer := draw()) != RAY_COUNTS[-1]:  # which is what workspaces have
+        inputs.append(f"{fewer} denoised")
     side, views = SIZES[int(random.integers(len(SIZES)))]
     cameras = {"source": "animation", "train": views, "val": 0, "test": 0, "width": side, "height": side}
     changes = {"cameras": cameras, "passes": {"workers": 1}, "raytrace": {"max_depth": DEPTH}}
@@ -89,11 +92,9 @@ def make(seed: int, folder: Path, scratch: Path) -> None:
     _, by_split = scene_and_views(Run(workspace, settings, Console(quiet=True)))
     path = by_split["train"]  # all frames of the animation
     chosen = spread(path, views)
-    inputs = [*map(str, rays), REMEMBERED]
     took("convert")
     ways = [way(path, path.index(view), random) for view in chosen]
-    remembered = int(random.choice(RAY_COUNTS))
-    maps, noise = _look(workspace, plan_of(workspace, settings), ways, [*rays, remembered], seed, took)
+    maps, noise = _look(workspace, plan_of(workspace, settings), ways, inputs, seed, took)
     frame = read_frame(workspace)
     bright = [name.partition("@")[0] in BRIGHT for name in channel_names(inputs)]
     maps[:, bright] *= 2.0**frame.exposure
@@ -137,18 +138,18 @@ def _look(
     workspace: Workspace,
     plan: EffectPlan,
     ways: list[list[View]],
-    rays: list[int],
+    inputs: list[str],
     seed: int,
     took: Took,
 ) -> tuple[np.ndarray, float]:
     """(float32 [views, channels, side, side], relative RMSE of the references), by this process, on one core.
 
-    ways: of the cameras; their last frames are the views. rays: of base images that stand alone, and of one that
-    remembers the frames before.
+    ways: of the cameras; their last frames are the views. inputs: as in `Scene`.
     """
     choice = choose_variant("auto")
     os.environ.update(choice.environment)
     from dnrpipe.raytrace.base_renderer import BaseRenderer
+    from dnrpipe.raytrace.base_worker import without_grain
     from dnrpipe.raytrace.engine import Engine
     from dnrpipe.raytrace.frames import Frames
     from dnrpipe.raytrace.history import History
@@ -168,17 +169,28 @@ def _look(
     light = LightBaker(engine.mi, scene, indirect, grouped_meshes(bundle)).bake(size, spp, seed)
     took("light")
     scaled = [[scaled_view(view, engine.unit_scale) for view in way] for way in ways]
-    renderer, history = BaseRenderer(engine.mi, scene, light), History(engine.mi)
-    bases = [[renderer.frame(way[-1], count) for way in scaled] for count in rays[:-1]]
-    took("base images")
-    bases.append([])
-    for way in scaled:
-        history.begin()
-        frames = [history.take(view, renderer.frame(view, rays[-1], history.number)) for view in way]
-        bases[-1].append(frames[-1])
-    took("memory")
     views = [way[-1] for way in ways]
     silhouettes = Frames(engine, bundle, "path", 2, (views[0].width, views[0].height))
+    grainy, smooth = (BaseRenderer(engine.mi, scene, light, gloss=gloss) for gloss in (True, False))
+    history = History(engine.mi)
+
+    def base(way: list[View], view: View, chosen: str) -> dict[str, np.ndarray]:
+        """The base image called so, with its G-buffer."""
+        samples, _, kind = chosen.partition(" ")
+        renderer = smooth if kind else grainy
+        if kind == "remembered":
+            history.begin()
+            for frame in way[:-1]:
+                history.take(frame, renderer.frame(frame, int(samples), history.number))
+            channels = history.take(way[-1], renderer.frame(way[-1], int(samples), history.number))
+        else:
+            channels = renderer.frame(way[-1], int(samples))
+        channels = {**channels, "depth.Z": channels["depth.Z"] / engine.unit_scale}
+        channels["coverage"] = silhouettes.coverage(view, channels["mask"] > 0.5)
+        return without_grain(channels) if kind else channels
+
+    bases = {chosen: [base(way, view, chosen) for way, view in zip(scaled, views, strict=True)] for chosen in inputs}
+    took("base images")
     integrator, _ = engine.integrator(bundle, plan.integrator, DEPTH)
     pictures, noises = [], []
     for number, view in enumerate(views):
@@ -194,13 +206,9 @@ def _look(
         raw = half_noise(*halves)
         target, figures = finished(engine, bundle, view, image, (halves[0], halves[1]), raw, smooth=False)
         noises.append(figures["noise"] or 0.0)
-        first = bases[0][number]
-        channels = {**first, "depth.Z": first["depth.Z"] / engine.unit_scale}
-        channels["coverage"] = silhouettes.coverage(view, first["mask"] > 0.5)
-        channels |= {f"target.{c}": target[c] for c in "RGBA"}
-        inputs = [*map(str, rays[:-1]), REMEMBERED]
-        for name, base in zip(inputs, bases, strict=True):
-            channels |= {f"{channel}@{name}": values for channel, values in base[number].items()}
+        channels = bases[inputs[0]][number] | {f"target.{c}": target[c] for c in "RGBA"}
+        for chosen, found in bases.items():
+            channels |= {f"{channel}@{chosen}": values for channel, values in found[number].items()}
         pictures.append(np.stack([channels[name] for name in channel_names(inputs)]).astype(np.float32))
     took("references")
     return np.stack(pictures), float(np.mean(noises))

@@ -32,8 +32,8 @@ Channels of a base file (``base/<split>/<view>.exr``): a cheap image of the same
                           refraction path through the pixel centre meets; 0 where there is none
     chain.mask            1 where there is one, else 0
     chain.weight          throughput of that path, mean over colours, in [0, 1]; 0 where there is none
-    fresh.R/G/B, fresh.rays   only where base remembers earlier frames: base, premultiplied by the same base.A, and rays
-                          of this frame by itself
+    fresh.R/G/B, fresh.rays   only where base is denoised or remembers earlier frames: base, premultiplied by the same
+                          base.A, and rays of this frame by itself, with its grain
 """
 
 from __future__ import annotations

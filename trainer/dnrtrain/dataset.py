@@ -53,7 +53,7 @@ class Batch:
     chain_uv      [N, 2, H, W] atlas coordinates at the end of the specular path, as ``uv``
     chain_mask    [N, 1, H, W] 1 where the specular path ends on a surface
     chain_weight  [N, 1, H, W] its throughput in [0, 1]
-    fresh         [N, 3, H, W] where ``base`` remembers earlier frames: that of the frame by itself
+    fresh         [N, 3, H, W] where ``base`` is denoised or remembers earlier frames: as the frame saw it
     fresh_rays    [N, 1, H, W] its rays per pixel
     display       the scene's display transform (linear -> display RGB)
     """

@@ -31,21 +31,23 @@ BRIGHT = {*TARGET[:3], *LAYERS[:3], *LAYERS[4:7], "noise", *FRESH_CHANNELS[:3]}
 RAY_COUNTS = (1, 2, 4, 8)
 
 
-REMEMBERED = "remembered"
-
-
 def channel_names(inputs: Sequence[str]) -> list[str]:
     """Channels of ``maps.npy``, in order; those of the base image called k end in @k."""
-    fresh = FRESH_CHANNELS if REMEMBERED in inputs else ()
-    layers = [f"{name}@{k}" for k in inputs for name in LAYERS]
-    return [*SHARED, *TARGET, *layers, *(f"{name}@{REMEMBERED}" for name in fresh)]
+    layers = [f"{name}@{k}" for k in inputs for name in (*LAYERS, *(FRESH_CHANNELS if has_own(k) else ()))]
+    return [*SHARED, *TARGET, *layers]
+
+
+def has_own(chosen: str) -> bool:
+    """Whether a base image is denoised, so that the frame's own, with its grain, stands beside it."""
+    return not chosen.isdecimal()
 
 
 class Scene(BaseModel, extra="forbid", frozen=True):
     """``scene.json``.
 
     frame: its exposure is 0: radiance in the maps is in units of display white.
-    inputs: the base images of each view, by their rays per pixel; REMEMBERED is one that earlier frames went into.
+    inputs: the base images of each view: "8" of eight rays per pixel, "8 denoised", and "8 remembered", into which
+        earlier frames went before it was denoised.
     noise: of the references, relative RMSE in display space, as `dnrpipe raytrace-selected` measures it. They are not
         denoised.
     """
@@ -132,8 +134,8 @@ class SceneMaps:
             camera_normal=in_camera_space(normal[0], self.scene.views[view])[None],
             target=of(*TARGET),
             base=layer("base"),
-            fresh=layer("fresh" if chosen == REMEMBERED else "base"),
-            fresh_rays=of(f"{'fresh.' if chosen == REMEMBERED else ''}rays@{chosen}").clamp_min(1.0),
+            fresh=layer("fresh" if has_own(chosen) else "base"),
+            fresh_rays=of(f"{'fresh.' if has_own(chosen) else ''}rays@{chosen}").clamp_min(1.0),
             diffuse=layer("diffuse"),
             albedo=layer("albedo"),
             noise=of(f"noise@{chosen}") / alpha,

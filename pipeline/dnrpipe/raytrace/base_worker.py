@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dnrtrain.contract import View
+from dnrtrain.contract import FRESH_CHANNELS, View
 from dnrtrain.exr import write_exr
 
 from .base_renderer import CHAIN, BaseRenderer
@@ -21,7 +21,7 @@ from .sensors import scaled_view
 from .tasks import BakedCommon, BaseAnswer, BaseTask, SampledCommon, costs_since
 
 COLOUR = ("base.R", "base.G", "base.B", "base.A")
-PREMULTIPLIED = ("base.R", "base.G", "base.B", *(f"{kind}.{c}" for kind in ("diffuse", "albedo") for c in "RGB"))
+PREMULTIPLIED = tuple(f"{kind}.{c}" for kind in ("base", "diffuse", "albedo", "fresh") for c in "RGB")
 LEAST_ALPHA = 1e-6
 MIRROR = 0.02
 """Diffuse reflectance below which a surface counts as mirror or glass."""
@@ -128,10 +128,15 @@ class Worker(BundleWorker):
 
 
 def without_grain(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The channels with a denoised base image whose alpha is the coverage, which has no grain at silhouettes."""
+    """The channels with a denoised base image whose alpha is the coverage, which has no grain at silhouettes.
+
+    FRESH_CHANNELS hold the frame's own with its grain: the network may take of it what a denoiser smooths away.
+    """
     alpha = channels["coverage"]
     share = alpha / np.maximum(channels["base.A"], LEAST_ALPHA)
-    image = channels | {name: channels[name] * share for name in PREMULTIPLIED} | {"base.A": alpha}
+    own = dict(zip(FRESH_CHANNELS, (channels[name] for name in (*COLOUR[:3], "rays")), strict=True))
+    image = own | channels
+    image |= {name: image[name] * share for name in PREMULTIPLIED} | {"base.A": alpha}
     return image | denoised(image)
 
 
