@@ -15,7 +15,7 @@ from tests.corner_room import corner_room, onwards, quad, rgb
 
 from dnrpipe.blender.bundle.ply import weld, write_ply
 from dnrpipe.raytrace.base_renderer import CENTRES, MEANS, NOISE, BaseRenderer
-from dnrpipe.raytrace.base_worker import Worker
+from dnrpipe.raytrace.base_worker import Worker, without_grain
 from dnrpipe.raytrace.engine import Engine
 from dnrpipe.raytrace.history import History
 from dnrpipe.raytrace.lightmap import LightBaker
@@ -25,8 +25,8 @@ from dnrpipe.raytrace.sensors import sensor_dict
 from dnrpipe.raytrace.surface_maps import SurfaceMapper
 from dnrpipe.raytrace.texels import grouped_meshes, seen_sides
 from dnrpipe.stages.base_images import WARM_UP
-from dnrtrain.contract import BASE_CHANNELS, View
-from dnrtrain.exr import read_exr
+from dnrtrain.contract import BASE_CHANNELS, FRESH_CHANNELS, View
+from dnrtrain.exr import read_exr, write_exr
 
 mi = pytest.importorskip("mitsuba")
 SIZE = 48
@@ -428,6 +428,28 @@ def test_base_images_of_few_samples_are_path_traced_and_denoised(
     assert channels["base.G"][inside].std() < 0.04
     with pytest.raises(ValueError, match="fingerprint"):
         worker({name: task[name] for name in ("view", "output")})
+
+
+def test_a_denoised_base_image_has_less_error_and_keeps_its_own_beside_it(tmp_path: Path) -> None:
+    metal = {"type": "twosided", "b": {"type": "roughconductor", "alpha": 0.5}}
+    wall = {"type": "twosided", "b": {"type": "diffuse", "reflectance": rgb(0.1, 0.8, 0.2)}}
+    light = {"type": "point", "position": [0.0, 0.0, 1.5], "intensity": rgb(6, 6, 6)}
+    scene = corner_room(tmp_path, metal, wall, light)
+    baked = LightBaker(mi, scene, onwards(), gloss=False).bake(64, 256, 0)
+    renderer = BaseRenderer(mi, scene, baked, gloss=False)
+    few, many = (renderer.frame(camera(0.0), samples) for samples in (2, 64))
+    raw, clean = dict(few), without_grain({name: plane.copy() for name, plane in few.items()})
+    full = (few["coverage"] > 0.99) & (few["base.A"] > 0.99)
+    assert full.sum() > 200
+
+    def error(planes: dict[str, np.ndarray], name: str) -> float:
+        return float(np.abs(planes[name] - many["base.G"])[full].mean())
+
+    assert error(clean, "base.G") < 0.7 * error(raw, "base.G")
+    np.testing.assert_allclose(clean["fresh.G"][full], raw["base.G"][full], rtol=0.02)
+    assert (clean["fresh.rays"] == 2).all() and (clean["base.A"] == raw["coverage"]).all()
+    write_exr(tmp_path / "base.exr", clean, {})
+    assert set(FRESH_CHANNELS) <= set(read_exr(tmp_path / "base.exr")[0])
 
 
 def test_frames_that_remember_are_the_same_when_a_sequence_is_taken_up_again(

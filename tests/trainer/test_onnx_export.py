@@ -11,7 +11,7 @@ import pytest
 import synthetic
 import torch
 
-from dnrtrain.contract import BASE_CHANNELS, GBUFFER_CHANNELS, RASTER_CHANNELS, SceneFrame
+from dnrtrain.contract import BASE_CHANNELS, FRESH_CHANNELS, GBUFFER_CHANNELS, RASTER_CHANNELS, SceneFrame
 from dnrtrain.correction import to_log
 from dnrtrain.dataset import load_views
 from dnrtrain.exr import write_exr
@@ -41,13 +41,15 @@ KINDS: dict[str, dict[str, Any]] = {
         "output": "log",
         "trust": 0.6,
     },
+    "corrector, denoised": {"base": "baked", "guides": "camera", "aggregator": "none", "filter": 3, "output": "log"},
     "chain": {"modalities": "uv", "base": "direct", "guides": True, "chain": True, "output": "log"},
 }
 
 
-def _files(folder: Path, height: int, width: int) -> tuple[dict[str, np.ndarray], Path, Path]:
+def _files(folder: Path, height: int, width: int, own: bool) -> tuple[dict[str, np.ndarray], Path, Path]:
     rng = np.random.default_rng(3)
-    draw = {name: rng.random((height, width), np.float32) for name in (*GBUFFER_CHANNELS, *BASE_CHANNELS)}
+    base = (*BASE_CHANNELS, *FRESH_CHANNELS) if own else BASE_CHANNELS
+    draw = {name: rng.random((height, width), np.float32) for name in (*GBUFFER_CHANNELS, *base)}
     for name in ("mask", "chain.mask"):
         draw[name] = (draw[name] > 0.4).astype(np.float32)
     normal = rng.normal(size=(3, height, width)).astype(np.float32)
@@ -57,7 +59,7 @@ def _files(folder: Path, height: int, width: int) -> tuple[dict[str, np.ndarray]
     draw |= {f"base.{c}": 4.0 * draw[f"base.{c}"] for c in "RGB"}
     raster = {c: draw[f"base.{c}"] for c in RASTER_CHANNELS}
     write_exr(folder / "passes.exr", {name: draw[name] for name in GBUFFER_CHANNELS} | raster, {})
-    write_exr(folder / "base.exr", {name: draw[name] for name in BASE_CHANNELS}, {})
+    write_exr(folder / "base.exr", {name: draw[name] for name in base}, {})
     return draw, folder / "passes.exr", folder / "base.exr"
 
 
@@ -88,7 +90,7 @@ def test_same_picture_as_torch(tmp_path: Path, kind: str, lut: bool) -> None:
     assert record["opset"] == OPSET and record["model"]["aggregator"] == settings.aggregator and record["note"] == 1
     assert [entry.name for entry in session.get_inputs()] == input_names(settings)
     for height, width in ((32, 32), (37, 21)):
-        channels, passes, base = _files(tmp_path, height, width)
+        channels, passes, base = _files(tmp_path, height, width, own=kind.endswith("denoised"))
         view = synthetic.look_at(np.array([2.0, 3.0, 2.0]), height, "v", width=width)
         rendered = settings.base in ("baked", "direct")
         batch = load_views(

@@ -42,7 +42,7 @@ LEFT_OUT = ("remix",)
 """Families that are made of the example scenes: what is measured on those must come from weights that saw none."""
 DEPTH = 24
 """Of the references; base images follow 16 vertices."""
-SIZES = ((96, 6), (128, 6), (192, 4), (288, 2))
+SIZES = ((96, 6), (128, 4), (192, 2), (288, 1))
 """(pixels a side, views), one of them drawn for a scene."""
 LIGHT_MAPS = ((256, 24), (384, 16))
 """(texels a side, paths per texel), one of them drawn for a scene."""

@@ -18,6 +18,7 @@ Inputs are the channels of the EXR files (see `contract`), float32 [1, C, H, W],
     albedo     [1, 3] albedo.R/G/B, premultiplied
     noise      [1, 1] noise, premultiplied
     rays       [1, 1] rays per pixel of the base image
+    fresh      [1, 4] fresh.R/G/B, premultiplied, and fresh.rays; of files without them base.R/G/B and rays
     chain      [1, 4] chain.U, chain.V, chain.mask, chain.weight
 
 Outputs: ``rgb`` [1, 3, H, W], display space over white, in [0, 1]; where the model works in log space also
@@ -41,7 +42,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .atomic import atomic_path
-from .contract import ContractError, SceneFrame, View
+from .contract import FRESH_CHANNELS, ContractError, SceneFrame, View
 from .correction import correct, guide_maps
 from .dataset import Batch, in_camera_space
 from .display import ALPHA_FLOOR, DisplayTransform
@@ -62,6 +63,7 @@ CHANNELS: dict[str, list[str]] = {
     "albedo": [f"albedo.{c}" for c in "RGB"],
     "noise": ["noise"],
     "rays": ["rays"],
+    "fresh": [*FRESH_CHANNELS],
     "chain": ["chain.U", "chain.V", "chain.mask", "chain.weight"],
 }
 """Of the EXR files, by input."""
@@ -89,7 +91,7 @@ def input_names(settings: ModelSettings) -> list[str]:
     if settings.guides and settings.base in ("baked", "direct", "path"):
         names += ["diffuse", "albedo"]
     if settings.guides == "camera":
-        names += ["camera_normal", "noise", "rays"]
+        names += ["camera_normal", "noise", "rays", "fresh"]
     return [*names, "chain"] if settings.chain else names
 
 
@@ -152,6 +154,8 @@ def graph_inputs(channels: Mapping[str, np.ndarray], view: View, names: Sequence
         elif name == "camera_normal":
             normal = torch.from_numpy(np.stack([channels[c] for c in CHANNELS["normal"]]))
             image = in_camera_space(normal, view).numpy()
+        elif name == "fresh" and FRESH_CHANNELS[0] not in channels:
+            image = np.stack([channels[c] for c in (*CHANNELS["base"][:3], *CHANNELS["rays"])])
         else:
             image = np.stack([channels[c] for c in CHANNELS[name]])
         found[name] = np.ascontiguousarray(image[None], dtype=np.float32)
@@ -201,6 +205,8 @@ class Graph(nn.Module):
             alpha = maps["base"][:, 3:].clamp(ALPHA_FLOOR, 1.0)
             parts["base"] = maps["base"][:, :3] / alpha
             parts |= {name: maps[name] / alpha for name in ("diffuse", "albedo", "noise") if name in maps}
+            if "fresh" in maps:
+                parts |= {"fresh": maps["fresh"][:, :3] / alpha, "fresh_rays": maps["fresh"][:, 3:].clamp_min(1.0)}
         if "chain" in maps:
             ends = (maps["chain"][:, 2:3] > 0.5).float()
             parts["chain_uv"] = (2.0 * maps["chain"][:, :2] - 1.0) * ends

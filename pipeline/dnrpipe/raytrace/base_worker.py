@@ -73,13 +73,13 @@ class Worker(BundleWorker):
 
         samples: rays per pixel, if not the workspace's. number: see `BaseRenderer.frame`.
         """
-        channels = self._channels(view, samples, number)
+        channels = self.grainy(view, samples, number)
         if isinstance(self.common, SampledCommon):
             return channels | self._traced(self.common, view, channels)
         return without_grain(channels) if self.denoise else channels
 
-    def _channels(self, view: View, samples: int | None, number: int) -> dict[str, np.ndarray]:
-        """By the kernel: not denoised."""
+    def grainy(self, view: View, samples: int | None = None, number: int = 0) -> dict[str, np.ndarray]:
+        """`channels` by the kernel alone: not denoised, not path-traced."""
         renderer, scaled = self.renderer, scaled_view(view, self.engine.unit_scale)
         channels = renderer.frame(scaled, samples or self.common.samples, number)
         self.repaired, self.masked = self.repaired + renderer.repaired, self.masked + renderer.masked
@@ -107,7 +107,7 @@ class Worker(BundleWorker):
         return without_grain(channels) if self.denoise else channels
 
     def _taken(self, view: View, samples: int | None) -> dict[str, np.ndarray]:
-        return self.history.take(view, self._channels(view, samples, self.history.number))
+        return self.history.take(view, self.grainy(view, samples, self.history.number))
 
     def _frames(self, view: View) -> Frames:
         """Finer silhouettes than the base image's few rays give, for views of one size."""
@@ -130,13 +130,16 @@ class Worker(BundleWorker):
 def without_grain(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The channels with a denoised base image whose alpha is the coverage, which has no grain at silhouettes.
 
-    FRESH_CHANNELS hold the frame's own with its grain: the network may take of it what a denoiser smooths away.
+    FRESH_CHANNELS hold the frame's own with its grain: the network may take of it what a denoiser smooths away. The
+    planes are changed in place: copies of them are half a gigabyte of a 4K frame.
     """
     alpha = channels["coverage"]
     share = alpha / np.maximum(channels["base.A"], LEAST_ALPHA)
+    for name in PREMULTIPLIED:
+        if name in channels:
+            channels[name] *= share
     own = dict(zip(FRESH_CHANNELS, (channels[name] for name in (*COLOUR[:3], "rays")), strict=True))
-    image = own | channels
-    image |= {name: image[name] * share for name in PREMULTIPLIED} | {"base.A": alpha}
+    image = own | channels | {"base.A": alpha}
     return image | denoised(image)
 
 
@@ -145,7 +148,7 @@ def denoised(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
     The auxiliary images are not called clean: measured, that is better by half a decibel and more.
     """
-    image = np.stack([channels[name] for name in COLOUR], axis=-1)
+    image = np.stack([channels[name] for name in COLOUR[:3]], axis=-1)
     albedo = np.stack([channels[f"albedo.{c}"] for c in "RGB"], axis=-1)
     # Open Image Denoise wants white where there is nothing but mirrors and glass.
     mirror = (albedo.mean(axis=-1, keepdims=True) < MIRROR) & (channels["mask"][..., None] > 0.5)

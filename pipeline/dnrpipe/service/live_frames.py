@@ -28,6 +28,7 @@ from dnrpipe.core.errors import UserError
 from dnrpipe.core.images import flip_error, over_white, picture_of
 from dnrpipe.core.settings import Settings
 from dnrpipe.raytrace.base_worker import Worker as BaseWorker
+from dnrpipe.raytrace.base_worker import without_grain
 from dnrpipe.raytrace.engine import Engine, masked, masked_channels
 from dnrpipe.raytrace.frames import Frames
 from dnrpipe.raytrace.history import History
@@ -71,8 +72,7 @@ class Worker:
         self.frames = functools.cache(
             functools.partial(Frames, self.engine, self.bundle, *tracing)
         )  # by (width, height)
-        remembers = self.kind == "baked" and not (common["base"] or {}).get("denoise")
-        self.history = History(self.engine.mi) if remembers else None
+        self.history = History(self.engine.mi) if self.kind == "baked" else None
         self.resting: View | None = None  # of the last frame, where that was at rest
         self.traced: tuple[str, np.ndarray, int] | None = None
         self.repaired = 0  # pixels of the current picture that were not finite
@@ -93,6 +93,8 @@ class Worker:
             if self.history is not None and mode in REMEMBERED:
                 channels = self._timed(ms, "history", self.history.take, view, channels)
                 rays = int(channels["rays"].max())
+            if self.base is not None and self.base.denoise and mode in REMEMBERED:
+                channels = self._timed(ms, "denoiser", without_grain, channels)
             if mode in ("neural", "error"):
                 picture = self._timed(ms, "network", self._neural, view, channels)
             else:
@@ -132,9 +134,10 @@ class Worker:
             self.repaired += lost
             return channels
         self.base.repaired = self.base.masked = 0
-        number = 0 if self.history is None else self.history.number
-        fewer = samples if self.kind == "baked" and samples is not None else self.base.common.samples
-        channels = self.base.channels(view, min(fewer, self.base.common.samples), number)
+        if self.history is None:
+            channels = self.base.channels(view)
+        else:
+            channels = self.base.grainy(view, samples and min(samples, self.base.common.samples), self.history.number)
         self.repaired += self.base.repaired + self.base.masked
         return channels
 
