@@ -104,7 +104,7 @@ def measured(scene: Path, root: Path, size: tuple[int, int], frames: int) -> dic
     seconds = time.monotonic() - started
     shot = json.loads(answer.stdout)
     print(f"{scene.stem}: {frames} frames in {seconds:.0f} s by {shot['chosen']['way']['name']}", flush=True)
-    pairs = [(i - 1, i) for i in (frames // 3, frames - 1)]
+    pairs = [(i - 1, i) for i in places(frames)]
     found = beside(root, views, pairs)
     after = seconds - shot["check"]["seconds"]
     frame = float(np.median(frame_seconds(root)))
@@ -150,7 +150,7 @@ def beside(root: Path, views: Sequence[View], pairs: Sequence[tuple[int, int]]) 
     """Quality of the shot's frames, and of path tracing with seconds per frame, on pairs of frames."""
     workspace = Workspace.open(root)
     run = Run(workspace, resolve_settings(workspace, {}, None), Console(quiet=True), "render", "bench")
-    lpips, display, folder = lpips_of(run), display_of(run), root / "beside"
+    lpips, display = lpips_of(run), display_of(run)
     tracer = path_tracer(run, background=True)
     numbers = sorted({number for pair in pairs for number in pair})
 
@@ -175,7 +175,7 @@ def beside(root: Path, views: Sequence[View], pairs: Sequence[tuple[int, int]]) 
         return spent
 
     def path_of(way: Way, take: int, number: int) -> Path:
-        return folder / f"{way.spp}-{way.quality}-{take}" / f"{number:05d}.exr"
+        return folder_of_rung(root, way.spp, way.quality, take) / f"{number:05d}.exr"
 
     for take in TAKES:
         traced(REFERENCE, take)
@@ -198,6 +198,16 @@ def beside(root: Path, views: Sequence[View], pairs: Sequence[tuple[int, int]]) 
             if as_good(rungs[-1], ours, ("psnr", "lpips")):
                 break
     return {"ours": ours, "rungs": rungs, "pairs": len(pairs)}
+
+
+def places(frames: int) -> tuple[int, int]:
+    """Of the frames that are compared; with each of them goes the one before."""
+    return frames // 3, frames - 1
+
+
+def folder_of_rung(root: Path, spp: int, denoiser: str, take: int) -> Path:
+    """Path-traced frames. take: of several pictures of one frame."""
+    return root / "beside" / f"{spp}-{denoiser}-{take}"
 
 
 def quality(

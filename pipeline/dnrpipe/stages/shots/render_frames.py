@@ -21,7 +21,7 @@ from .renderers import Renderer
 
 FRAMES_VERSION = 1
 FRAME_WORKER = "dnrpipe.stages.shots.frame_worker"
-FRAMES_FOLDER = "frames"
+FRAMES_FOLDER, PICTURES_FOLDER = "frames", "pictures"
 """Of a shot's folder."""
 
 
@@ -32,7 +32,7 @@ def frame_path(folder: Path, frame: ShotFrame) -> Path:
 
 def picture_path(folder: Path, frame: ShotFrame) -> Path:
     """A frame as it is displayed."""
-    return folder / "pictures" / f"{frame.number:05d}.png"
+    return folder / PICTURES_FOLDER / f"{frame.number:05d}.png"
 
 
 def frame_tasks(
