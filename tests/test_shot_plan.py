@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 from dnrpipe.core.cameras import look_at_view
 from dnrpipe.core.errors import UserError
@@ -13,7 +14,7 @@ from dnrpipe.stages.shots.check import held_out
 from dnrpipe.stages.shots.frame_tasks import Way
 from dnrpipe.stages.shots.open_shot import parse_size, resized, told_frames
 from dnrpipe.stages.shots.options import Option, Wanted, choose
-from dnrpipe.stages.shots.pilot import Measured, between
+from dnrpipe.stages.shots.pilot import Measured, best_share, between
 from dnrpipe.stages.shots.plan_shot import Shape, baked_option, moving_way, path_option
 from dnrpipe.stages.shots.records import ShotFrame
 from dnrpipe.stages.shots.render_frames import frame_tasks
@@ -141,3 +142,13 @@ def test_sizes_and_frames_as_written() -> None:
     half = resized(view, 16, 9)
     assert (half.fl_x, half.cx, half.cy) == (view.fl_x / 2, view.cx / 2, view.cy / 2)
     assert resized(view, 32, 32).cy == 16 and resized(view, 32, 32).fl_y == view.fl_y
+
+
+def test_as_much_of_the_correction_as_comes_closest() -> None:
+    plain = [torch.rand(1, 3, 4, 4, generator=torch.Generator().manual_seed(seed)) for seed in range(3)]
+    better = [picture + 0.1 for picture in plain]
+    assert best_share([(a, b, a + 0.07) for a, b in zip(plain, better, strict=True)]) == 0.7
+    assert best_share([(a, b, a - 0.07) for a, b in zip(plain, better, strict=True)]) == 0
+    # One window gains all of it, two gain nothing.
+    truth = [better[0], plain[1], plain[2]]
+    assert best_share(list(zip(plain, better, truth, strict=True))) == 0.3

@@ -36,7 +36,7 @@ from .renderers import Renderer, path_tracer, shipped_renderer, trained_renderer
 
 CHECKED = 2
 """Frames of a shot that are traced to check it."""
-PLAN_VERSION = 5
+PLAN_VERSION = 6
 GATHER_FROM = 0.4
 """Share of the light that direct light alone would miss, from which on it is gathered: it pays at 0.49 (`interior`) and
 does not at 0.21 (`materials`)."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,6 +43,8 @@ REFERENCE = Way(name="path", spp=128)
 REFERENCE_SEED = 7
 LEAD = 4
 """Frames before a frame of the pilot that it remembers."""
+SHARES = tuple(i / 10 for i in range(11))
+"""Of the shipped corrector's correction that are tried."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,16 @@ class Measured:
     lpips: float | None
 
 
+@dataclass(frozen=True)
+class _Window:
+    """key: of the window. picture: display RGB over white [1, 3, H, W]. spent, start: seconds of it, and before it."""
+
+    key: int
+    picture: Any
+    spent: float
+    start: float
+
+
 class Pilot:
     """Renders windows of a shot's frames."""
 
@@ -67,6 +79,7 @@ class Pilot:
         chosen = spread(still or range(len(frames)), FRAMES)  # where all move: as converted
         self.windows = [(index, place) for index in chosen for place in PLACES]
         self.references: dict[int, Any] = {}
+        self.rows: dict[Way, list[_Window]] = {}
 
     def measure(self, renderer: Renderer, ways: Sequence[Way]) -> list[Measured]:
         """The ways on the windows, one after the other in a process of its own.
@@ -84,7 +97,7 @@ class Pilot:
                     earlier = None if way.name == "path" else tuple(self._view(i, place) for i in lead[:number])
                     keys.append((way, key, at == index))
                     tasks.append(self._task(way, at, place, earlier, len(tasks)))
-        found: dict[Way, list[tuple[float, float, Any]]] = {}
+        found: dict[Way, list[_Window]] = {}
         label = "pilot: " + ("path tracing" if ways[-1].name == "path" else "base image and network")
         with self.run.console.bar(label, len(tasks)) as bar:
             outcomes = frame_outcomes(self.run, renderer, tasks, "pilot")
@@ -103,21 +116,36 @@ class Pilot:
                 if counts:
                     picture = shown(self.display, task.output)
                     spent = outcome.result["seconds"] + outcome.result["write_seconds"]
-                    found.setdefault(way, []).append((spent, outcome.seconds - spent, (key, picture)))
+                    found.setdefault(way, []).append(_Window(key, picture, spent, outcome.seconds - spent))
                 bar.advance(note=way.told)
         if REFERENCE in found and not self.references:
-            self.references = {key: picture for _, _, (key, picture) in found.pop(REFERENCE)}
+            self.references = {row.key: row.picture for row in found.pop(REFERENCE)}
+        self.rows |= found
         return [self._measured(way, rows) for way, rows in found.items()]
 
-    def _measured(self, way: Way, rows: list[tuple[float, float, Any]]) -> Measured:
-        figures = [compared(picture, self.references[key], self.lpips) for _, _, (key, picture) in rows]
+    def trusted(self, ways: Sequence[Way]) -> tuple[float, list[Measured]]:
+        """(the share of the shipped corrector's correction that does best on the windows; the ways with that share).
+
+        ways: neural ones, measured with all of it, as the base images of as many rays were. Pictures are mixed as they
+        are displayed, which is close to what the network does (see `dnrtrain.correction`).
+        """
+        pairs = {way: list(zip(self.rows[Way(name="base", spp=way.spp)], self.rows[way], strict=True)) for way in ways}
+        everything = [both for rows in pairs.values() for both in rows]
+        share = best_share([(a.picture, b.picture, self.references[a.key]) for a, b in everything])
+        mixed = {
+            way: [replace(b, picture=a.picture.lerp(b.picture, share)) for a, b in rows] for way, rows in pairs.items()
+        }
+        return share, [self._measured(way, rows) for way, rows in mixed.items()]
+
+    def _measured(self, way: Way, rows: Sequence[_Window]) -> Measured:
+        figures = [compared(row.picture, self.references[row.key], self.lpips) for row in rows]
         distances = [found["lpips"] for found in figures if "lpips" in found]
         view = self._view(*self.windows[0])
         errors = [10 ** (-found["psnr"] / 10) for found in figures]
         return Measured(
             way=way,
-            pixel=float(np.mean([spent for spent, _, _ in rows])) / (view.width * view.height),
-            start=max(0.0, rows[0][1]),
+            pixel=float(np.mean([row.spent for row in rows])) / (view.width * view.height),
+            start=max(0.0, rows[0].start),
             psnr=-10 * math.log10(float(np.mean(errors))),
             lpips=float(np.mean(distances)) if distances else None,
         )
@@ -146,6 +174,15 @@ class Pilot:
             picture=self.folder / f"{stem}.png",
             fingerprint="",
         )
+
+
+def best_share(pictures: Sequence[tuple[Any, Any, Any]]) -> float:
+    """The share at which mixing the first with the second of each three pictures comes closest to the third."""
+
+    def error(share: float) -> float:
+        return sum(float((plain.lerp(other, share) - truth).square().mean()) for plain, other, truth in pictures)
+
+    return min(SHARES, key=error)
 
 
 def compared(picture: Any, truth: Any, lpips: Any) -> dict[str, float]:

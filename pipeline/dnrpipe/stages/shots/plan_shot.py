@@ -15,11 +15,11 @@ from ...core.units import duration
 from ..base_images import base_renderer, light_paths
 from ..stage import Run
 from ..worth import worth
-from .frame_tasks import Way, WayName
+from .frame_tasks import Way
 from .options import Option, Wanted
 from .pilot import LADDER, QUICK, Measured, Pilot, between
 from .records import ShotFrame
-from .renderers import Renderer, shipped_renderer, trusted_share
+from .renderers import Renderer, shipped_renderer
 
 FEWER = (2, 4)
 """Rays per pixel of base images that are tried beside the settings'."""
@@ -55,26 +55,27 @@ def weigh(
     if why := _no_baked_light(run, frames, shape, ladder, wanted):
         run.console.say(f"baked light is not weighed: {why}")
         return options, None
-    trust = trusted_share(run)
     rays = run.settings.base.samples
     counts = [*(n for n in FEWER if n < rays), rays]
-    kinds: tuple[WayName, ...] = ("base", "neural") if trust or wanted.way == "neural" else ("base",)
-    ours = [Way(name=kind, spp=n) for kind in kinds for n in counts]
-    measured = pilot.measure(shipped_renderer(run, tracer.common.background, trust), ours)
-    options += [baked_option(found, options, shape) for found in measured]
+    base, neural = ([Way(name=name, spp=n) for n in counts] for name in ("base", "neural"))
+    measured = pilot.measure(shipped_renderer(run, tracer.common.background, trust=1.0), [*base, *neural])
+    trust, corrected = pilot.trusted(neural)
+    run.console.say(_trust_told(trust))
+    ours = measured[: len(base)] + (corrected if trust or wanted.way == "neural" else [])
+    options += [baked_option(found, options, shape) for found in ours]
     if _wants_more(options, wanted) and wanted.way in (None, "neural"):
         found = worth(run, shape.still)
-        neural = options[-1]  # of as many rays as a training's base images
-        if found.views and neural.psnr is not None:
-            before = neural.before + found.views * found.seconds
+        last = options[-1]  # of as many rays as a training's base images
+        if found.views and last.psnr is not None:
+            before = last.before + found.views * found.seconds
             options.append(
-                neural.model_copy(
+                last.model_copy(
                     update={
-                        "way": Way(name="neural", spp=neural.way.spp),
+                        "way": Way(name="neural", spp=last.way.spp),
                         "views": found.views,
                         "before": before,
-                        "seconds": neural.seconds + found.views * found.seconds,
-                        "psnr": neural.psnr + found.expected,
+                        "seconds": last.seconds + found.views * found.seconds,
+                        "psnr": last.psnr + found.expected,
                         "lpips": None,
                     }
                 )
@@ -154,6 +155,12 @@ def _no_baked_light(
             f" {duration(light)}"
         )
     return ""
+
+
+def _trust_told(share: float) -> str:
+    if share == 0:
+        return "the shipped corrector does no good here: base images are weighed without it"
+    return f"shipped corrector: {share:.0%} of it does best on the pilot's windows"
 
 
 def _wants_more(options: Sequence[Option], wanted: Wanted) -> bool:

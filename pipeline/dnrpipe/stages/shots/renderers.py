@@ -12,7 +12,6 @@ from ..base_images import bake_light, base_renderer
 from ..effect_plan import resolve_plan
 from ..shot_scene import scene_at
 from ..stage import Run
-from ..trust import measure_trust
 from .frame_tasks import FrameCommon
 
 
@@ -51,15 +50,6 @@ def path_tracer(run: Run, background: bool) -> Renderer:
         background=background,
     )
     return Renderer(common, choice.environment)
-
-
-def trusted_share(run: Run) -> float:
-    """The share of the shipped corrector's correction that does best on the scene; told to the user."""
-    from dnrtrain.shipped import corrector
-
-    trust = measure_trust(run, corrector())
-    run.console.say(trust.told)
-    return trust.share
 
 
 def shipped_renderer(run: Run, background: bool, trust: float) -> Renderer:
