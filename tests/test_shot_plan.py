@@ -14,7 +14,7 @@ from dnrpipe.stages.shots.check import held_out
 from dnrpipe.stages.shots.frame_tasks import Way
 from dnrpipe.stages.shots.open_shot import parse_size, resized, told_frames
 from dnrpipe.stages.shots.options import Option, Wanted, choose
-from dnrpipe.stages.shots.pilot import Measured, best_share, between
+from dnrpipe.stages.shots.pilot import Measured, best_mix, between
 from dnrpipe.stages.shots.plan_shot import Shape, baked_option, moving_way, path_option
 from dnrpipe.stages.shots.records import ShotFrame
 from dnrpipe.stages.shots.render_frames import frame_tasks
@@ -147,8 +147,8 @@ def test_sizes_and_frames_as_written() -> None:
 def test_as_much_of_the_correction_as_comes_closest() -> None:
     plain = [torch.rand(1, 3, 4, 4, generator=torch.Generator().manual_seed(seed)) for seed in range(3)]
     better = [picture + 0.1 for picture in plain]
-    assert best_share([(a, b, a + 0.07) for a, b in zip(plain, better, strict=True)]) == 0.7
-    assert best_share([(a, b, a - 0.07) for a, b in zip(plain, better, strict=True)]) == 0
+    assert best_mix([(a, b, a + 0.07) for a, b in zip(plain, better, strict=True)]) == 0.7
+    assert best_mix([(a, b, a - 0.07) for a, b in zip(plain, better, strict=True)]) == 0
     # One window gains all of it, two gain nothing.
     truth = [better[0], plain[1], plain[2]]
-    assert best_share(list(zip(plain, better, truth, strict=True))) == 0.3
+    assert best_mix(list(zip(plain, better, truth, strict=True))) == 0.3

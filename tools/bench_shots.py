@@ -74,7 +74,7 @@ def main() -> None:
             (row["scene"], row["size"], row["frames"]) == (scene.stem, options.size, options.frames) for row in rows
         ):
             continue
-        root = (options.folder / f"{scene.stem}-{options.size}.dnr").resolve()
+        root = root_of(options.folder, scene.stem, options.size).resolve()
         rows.append({"size": options.size, **measured(scene.resolve(), root, size, options.frames)})
         write_json(options.out, {"machine": processor(), "rows": sorted(rows, key=lambda row: row["scene"])})
     print(markdown({"machine": processor(), "rows": rows}))
@@ -203,6 +203,11 @@ def beside(root: Path, views: Sequence[View], pairs: Sequence[tuple[int, int]]) 
 def places(frames: int) -> tuple[int, int]:
     """Of the frames that are compared; with each of them goes the one before."""
     return frames // 3, frames - 1
+
+
+def root_of(folder: Path, scene: str, size: str) -> Path:
+    """A shot's workspace."""
+    return folder / f"{scene}-{size}.dnr"
 
 
 def folder_of_rung(root: Path, spp: int, denoiser: str, take: int) -> Path:

@@ -19,7 +19,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from dnrpipe.stages.shots.render_frames import PICTURES_FOLDER
 
-from .bench_shots import OUT, REFERENCE, TAKES, folder_of_rung, places
+from .bench_shots import OUT, REFERENCE, TAKES, folder_of_rung, places, root_of
 
 IMAGES = OUT.parents[1] / "images"
 WIDTH, GAP, HEAD = 320, 6, 24
@@ -36,8 +36,9 @@ def main() -> None:
     parser.add_argument("--size", default="640x360")
     options = parser.parse_args()
     rows = [row for row in json.loads(OUT.read_text())["rows"] if row["size"] == options.size]
-    found = {row["scene"]: options.folder / f"{row['scene']}-{options.size}.dnr" for row in rows}
-    strips = [strip(row, found[row["scene"]]) for row in rows if found[row["scene"]].exists()]
+    roots = {row["scene"]: root_of(options.folder, row["scene"], options.size) for row in rows}
+    found = {scene: root for scene, root in roots.items() if root.exists()}
+    strips = [strip(row, found[row["scene"]]) for row in rows if row["scene"] in found]
     IMAGES.mkdir(parents=True, exist_ok=True)
     stacked(strips, 2 * GAP).save(IMAGES / "shots.jpg", quality=88, optimize=True)
     if options.moving in found:

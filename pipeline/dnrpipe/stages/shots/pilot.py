@@ -24,6 +24,7 @@ from ...core.errors import UserError
 from ...core.images import over_white
 from ...core.scene_files import read_frame
 from ..stage import Run
+from ..trust import SHARES
 from .frame_tasks import FrameTask, Way
 from .frame_worker import COLOUR
 from .records import ShotFrame
@@ -43,8 +44,6 @@ REFERENCE = Way(name="path", spp=128)
 REFERENCE_SEED = 7
 LEAD = 4
 """Frames before a frame of the pilot that it remembers."""
-SHARES = tuple(i / 10 for i in range(11))
-"""Of the shipped corrector's correction that are tried."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +130,7 @@ class Pilot:
         """
         pairs = {way: list(zip(self.rows[Way(name="base", spp=way.spp)], self.rows[way], strict=True)) for way in ways}
         everything = [both for rows in pairs.values() for both in rows]
-        share = best_share([(a.picture, b.picture, self.references[a.key]) for a, b in everything])
+        share = best_mix([(a.picture, b.picture, self.references[a.key]) for a, b in everything])
         mixed = {
             way: [replace(b, picture=a.picture.lerp(b.picture, share)) for a, b in rows] for way, rows in pairs.items()
         }
@@ -176,7 +175,7 @@ class Pilot:
         )
 
 
-def best_share(pictures: Sequence[tuple[Any, Any, Any]]) -> float:
+def best_mix(pictures: Sequence[tuple[Any, Any, Any]]) -> float:
     """The share at which mixing the first with the second of each three pictures comes closest to the third."""
 
     def error(share: float) -> float:
