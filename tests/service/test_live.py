@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from PIL import Image
-from playwright.sync_api import Page
+from playwright.sync_api import Page, Route
 from tests.plan_record import write_plan
 from tests.service.harness import Server, empty_workspace
 from tests.service.test_planned import prediction
@@ -488,6 +488,26 @@ def test_no_serious_violation_of_accessibility(
         wait_for(page, "document.querySelectorAll('#times tr').length > 2")
         assert _violations(page) == []
         assert page.evaluate("document.documentElement.scrollWidth <= window.innerWidth")
+
+
+@needs_chromium
+def test_the_workspace_chosen_last_is_shown(server: Server, trained: str) -> None:
+    """Also where the server answers for another one later."""
+    empty_workspace(server.root, "slow")
+    chosen = "[...document.querySelectorAll('#workspaces button')].find(b => b.textContent === '{}')"
+    title = "document.querySelector('#detail-title').textContent"
+    held: list[Route] = []
+    with open_page(server.url, width=1280) as (page, errors):
+        page.route("**/workspaces/slow", lambda route: held.append(route))
+        wait_for(page, f"!!{chosen.format('slow')}")
+        page.evaluate(f"{chosen.format('slow')}.click()")
+        page.evaluate(f"{chosen.format(trained)}.click()")
+        wait_for(page, f"{title} === '{trained}' && document.querySelector('#truth').naturalWidth > 0")
+        with page.expect_response("**/workspaces/slow"):
+            held[0].continue_()
+        page.wait_for_timeout(300)
+        assert page.evaluate(title) == trained
+        assert errors == []
 
 
 def _violations(page: Page) -> list[str]:

@@ -3,7 +3,7 @@
 (function () {
   const $ = function (id) { return document.getElementById(id); };
   const FINAL = ["done", "failed", "cancelled"];
-  let job = null, watching = null, over = false, workspace = null, sphere = null;
+  let job = null, watching = null, over = false, workspace = null, asked = null, sphere = null;
   document.documentElement.classList.add("js");
 
   function clock(seconds) {
@@ -172,7 +172,7 @@
   $("sure-no").addEventListener("click", function () { $("sure").hidden = true; $("delete").focus(); });
   $("sure-yes").addEventListener("click", function () {
     $("sure").hidden = true;
-    api.remove("/workspaces/" + workspace).then(function () { workspace = null; $("detail").hidden = true; $("file").focus(); }).then(settled).then(refresh).catch(problem);
+    api.remove("/workspaces/" + workspace).then(function () { workspace = asked = null; $("detail").hidden = true; $("file").focus(); }).then(settled).then(refresh).catch(problem);
   });
 
   function select(entry) {
@@ -193,9 +193,9 @@
       if (quality.length) $("curves").append(plot("validation, dB", [{ name: "PSNR", points: quality }], false));
     }
     api.events(entry.id, watching.signal, function (kind, data) {
-      if (workspace === entry.request.workspace && kind !== "state" && Date.now() - looked > 5000) {
+      if (asked === entry.request.workspace && kind !== "state" && Date.now() - looked > 5000) {
         looked = Date.now();  // stages and costs go on meanwhile
-        open(workspace).catch(problem);
+        open(asked).catch(problem);
       }
       if (kind === "progress") {
         $("bar").max = data.total; $("bar").value = data.done;
@@ -214,17 +214,17 @@
           live(entry.request.workspace, last, mine).catch(problem);
         }, 200);
         shown = data;
-      } else if (kind === "picture" && workspace === entry.request.workspace) {
-        open(workspace, data.view).catch(problem);
+      } else if (kind === "picture" && asked === entry.request.workspace) {
+        open(asked, data.view).catch(problem);
       } else if (kind === "state") {
         $("note").textContent = data.state + (data.why ? ": " + data.why : "");
         if (FINAL.includes(data.state)) {
           refresh();
-          if (workspace === entry.request.workspace) open(workspace).catch(problem);
+          if (asked === entry.request.workspace) open(asked).catch(problem);
         }
       }
     }).then(function () { over = mine === watching || over; }).catch(problem);
-    open(entry.request.workspace).catch(function () { $("detail").hidden = true; });
+    open(entry.request.workspace).catch(function () { if (asked === entry.request.workspace) $("detail").hidden = true; });
     refresh();
   }
 
@@ -264,8 +264,11 @@
     }));
   }
 
+  /* Shows the workspace, unless another one is asked for before the server has answered. */
   async function open(name, view) {
+    asked = name;
     const found = await api.get("/workspaces/" + name);
+    if (name !== asked) return;
     workspace = name;
     $("detail").hidden = false;
     $("detail-title").textContent = name;
@@ -290,6 +293,7 @@
     $("sure").hidden = true;
     showPlan(found.plan);
     await showResults(name);
+    if (name !== asked) return;
     $("sphere-card").hidden = !found.sphere;
     if (found.sphere && found.sphere !== sphere) {  // else it stays as it was turned
       sphere = found.sphere;
@@ -311,10 +315,12 @@
     }
   }
   async function pictures() {
-    const path = "/workspaces/" + workspace + "/pictures/" + $("view").value + "/";
+    const name = workspace, path = "/workspaces/" + name + "/pictures/" + $("view").value + "/";
     for (const kind of ["truth", "prediction"]) {
+      const picture = await api.picture(path + kind);
+      if (name !== asked) return;
       URL.revokeObjectURL($(kind).src);
-      $(kind).src = await api.picture(path + kind);
+      $(kind).src = picture;
     }
     $("psnr").textContent = "Held-out view " + $("view").selectedOptions[0].text;
   }
