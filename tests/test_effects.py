@@ -19,6 +19,7 @@ from dnrpipe.core.settings import CameraSettings, Settings, resolve
 from dnrpipe.effects.bundle import bundle_facts, write_without
 from dnrpipe.effects.plan import DepthPilot, EffectPlan, plan_effects
 from dnrpipe.raytrace.statistics import DepthStep, difference, enough, remaining, significance
+from dnrpipe.stages.base_images import LightPlan, light_plan
 from dnrpipe.studies.effect_costs import override_settings, table
 from dnrtrain.settings import ModelSettings
 
@@ -32,10 +33,9 @@ GLASS = MATT | {
 }
 
 
-def pilot(depth: int) -> DepthPilot:
-    steps = tuple(
-        DepthStep(depth=d, mean=0.1 / d**2 if d < depth else 0.001, mean_error=0, pixel=0) for d in (2, depth)
-    )
+def pilot(depth: int, bounced: float = 0.025) -> DepthPilot:
+    """bounced: share of the light that direct light alone would miss."""
+    steps = tuple(DepthStep(depth=d, mean=bounced if d < depth else 0.001, mean_error=0, pixel=0) for d in (2, depth))
     return DepthPilot(
         fingerprint="f",
         max_depth=depth,
@@ -48,6 +48,23 @@ def pilot(depth: int) -> DepthPilot:
         seconds=1.0,
         steps=steps,
     )
+
+
+def test_how_light_is_baked() -> None:
+    """By what has bounced, and by the size of the images; the user's word goes first."""
+    sunny, indoors = (plan_effects(scene_census(), {}, pilot=pilot(6, bounced)) for bounced in (0.2, 0.5))
+
+    def of(side: int, plan: EffectPlan = sunny, **base: object) -> LightPlan:
+        size = {"width": side, "height": side // 2}
+        return light_plan(resolve("draft", {"cameras": size, "base": base}, environment={}), plan)
+
+    sizes = [(of(side).size, of(side, indoors).size) for side in (32, 64, 128, 256, 640, 4096)]
+    assert sizes == [(256, 256), (512, 512), (1024, 1024), (1024, 1024), (2048, 1024), (4096, 4096)]
+    assert of(128) == LightPlan(gathered=False, size=1024, spp=16)
+    assert of(128, indoors) == LightPlan(gathered=True, size=1024, spp=32)
+    assert of(128, indoors, light="traced", light_size=300, light_spp=7) == LightPlan(gathered=False, size=300, spp=7)
+    assert of(128, plan_effects(scene_census(), {}, max_depth=9)) == of(128)  # nobody measured it
+    assert of(640, indoors).paths < 0.4 * of(640).paths
 
 
 def on(plan: EffectPlan) -> set[str]:

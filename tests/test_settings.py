@@ -148,25 +148,6 @@ def test_merge_leaves_its_arguments_alone_and_the_later_wins(base: dict, extra: 
     assert merge(merged, extra) == merged
 
 
-def test_paths_per_texel_of_the_baked_light() -> None:
-    from dnrpipe.stages.base_images import light_paths, light_size, light_spp
-
-    def of(side: int, **base: object) -> tuple[int, int]:
-        settings = resolve("draft", {"cameras": {"width": side, "height": side}, "base": base}, environment={})
-        return light_size(settings), light_spp(settings)
-
-    assert of(64) == (256, 64)  # never more than at 512
-    assert of(128) == (512, 64)
-    assert of(256) == (1024, 16)
-    assert of(800)[1] == 16
-    assert of(256, light_size=512) == (512, 64)
-    assert of(256, light_spp=7) == (1024, 7)
-    assert [of(side, light="gathered") for side in (128, 256, 640)] == [(256, 64), (512, 64), (1024, 32)]
-    ways = [{"cameras": {"width": 640}, "base": {"light": light}} for light in ("traced", "gathered")]
-    traced, gathered = (light_paths(resolve("standard", way, environment={})) for way in ways)
-    assert gathered < 0.4 * traced
-
-
 def test_targets_of_tracing_are_one_wish() -> None:
     """Flags forget what others said before; with a target, --spp is its limit; settings read the same amounts."""
     from dnrpipe.cli.options import tracing_overrides

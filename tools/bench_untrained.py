@@ -10,7 +10,8 @@ Variants, at the draft preset with 8 test views:
     untrained   --budget 0
     6 views     --budget 6, 180 steps on from the shipped corrector
     25 views    the preset: 25 views, 1000 steps on from the shipped corrector
-    fresh       25 views, 1000 steps of a fresh network with guides in world space: the default before
+    fresh       25 views, 1000 steps of a fresh network with guides in world space, grainy base images: the default
+                before; its light is baked anew and counted
 
 With `untrained` goes what `--budget auto` says of the scene: what its trial gained, and how many views it would take.
 
@@ -39,7 +40,11 @@ from dnrtrain.atomic import write_json
 ROOT = Path(__file__).resolve().parents[1]
 OUT = ROOT / "docs" / "results" / "untrained.json"
 TESTS = ("--set", "cameras.test=8", "--set", "cameras.val=0")
-FRESH = ("--set", "finetune.step2.start=fresh", "--set", "model.guides=true")
+FRESH = (
+    *("--set", "finetune.step2.start=fresh", "--set", "model.guides=true"),
+    *("--set", "base.denoise=false", "--set", "base.light=traced"),
+    *("--set", "base.light_size=512", "--set", "base.light_spp=64"),
+)
 VARIANTS: dict[str, tuple[str, ...]] = {
     "untrained": ("--budget", "0"),
     "6 views": ("--budget", "6", "--set", "finetune.step2.epochs=30"),
@@ -79,10 +84,11 @@ def measured(scene: Path, root: Path, variants: list[str], options: argparse.Nam
     shutil.rmtree(root, ignore_errors=True)
     chosen = (*TESTS, "--set", f"raytrace.evaluation_spp={evaluation_spp}", "--set", f"finetune.seed={seed}")
     prepared = run(root, "prepare", str(scene), "--set", "select.budget=0", *chosen)
-    shared = 0.0
+    shared = light = 0.0
     for variant in variants:
         selecting = run(root, "select", *VARIANTS[variant])
         spent = selecting + run(root, "raytrace-selected", "--force") + run(root, "finetune")
+        spent += 0 if variant in ("untrained", "fresh") else light
         run(root, "evaluate")
         mean = json.loads((root / "evaluation" / "metrics.json").read_text())["mean"]
         figures = {name: mean[name] for name in FIGURES}
@@ -93,7 +99,8 @@ def measured(scene: Path, root: Path, variants: list[str], options: argparse.Nam
             shared += selecting
         elif variant == "untrained":
             ledger = [json.loads(line) for line in (root / "costs.jsonl").read_text().splitlines()]
-            shared = sum(r["cpu_seconds"] for r in ledger if r["name"] in ("light", "path depth pilot")) / CORES
+            cpu = {r["name"]: r["cpu_seconds"] for r in ledger if r["name"] in ("light", "path depth pilot")}
+            light, shared = cpu["light"] / CORES, cpu.get("path depth pilot", 0.0) / CORES
             run(root, "select", "--budget", "auto", "--set", "finetune.step2.epochs=40")
             rows[-1]["worth"] = json.loads((root / "selection.json").read_text())["details"]["worth"]
         print(f"{scene.stem}, {variant}: {mean['psnr']:.2f} dB, {seconds:.0f} s", flush=True)

@@ -109,20 +109,21 @@ class RaytraceSettings(Strict):
 class BaseSettings(Strict):
     """The image that the network corrects, where `model.base` is rendered (baked, direct, path)."""
 
-    light: Literal["traced", "gathered"] = Field(
-        default="traced",
-        description="how light is baked: by paths, or by rays that end at a coarse map after one bounce",
+    light: Literal["auto", "traced", "gathered"] = Field(
+        default="auto",
+        description="how light is baked: by paths, or by rays that end at a coarse map after one bounce;"
+        " auto: the latter where much of the light has bounced",
     )
     light_size: Annotated[int, Field(ge=16, le=16384)] | Literal["auto"] = Field(
-        default="auto", description="texels of the baked light's side; auto: about one a pixel"
+        default="auto", description="texels of the baked light's side; auto: 1024 at 128 to 256 pixels"
     )
     light_spp: Annotated[int, Field(ge=1, le=1_000_000)] | Literal["auto"] = Field(
         default="auto",
-        description="paths or rays per texel of the baked light; auto: 64 up to 512 texels a side, then fewer",
+        description="paths or rays per texel of the baked light; auto: 16 paths, 32 gathered rays",
     )
     samples: int = Field(default=8, ge=1, le=64, description="rays per pixel of a base image")
     denoise: bool = Field(
-        default=False, description="take the grain off base images of kind baked; the network does it as well"
+        default=True, description="take the grain off base images of kind baked, before the network sees them"
     )
     spp: int = Field(default=4, ge=1, le=1_000_000, description="path-traced samples of the kinds direct and path")
 

@@ -20,7 +20,7 @@ from ..core.ledger import Purpose
 from ..core.scene_files import scene_fingerprint
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest
-from ..effects.plan import EffectPlan
+from ..effects.plan import DIRECT_DEPTH, EffectPlan
 from ..effects.store import plan_of, trace_config
 from ..raytrace.gathering import COARSE_PATHS
 from ..raytrace.variants import choose_variant
@@ -32,14 +32,19 @@ from .stage import Run
 LIGHT_VERSION, BASE_VERSION, DENOISE_VERSION = 9, 15, 3
 RENDERED = ("baked", "direct", "path")
 """Kinds of base images that are rendered into files of their own."""
-AUTOMATIC_TEXELS = {"traced": 4, "gathered": 2}
-"""Light map texels per pixel of an image's side. Four are about one texel a pixel where the atlas shows a part of
-itself; gathered light is better of half as many with four times the rays, where charts are large."""
+TEXELS, MANY, MOST = 8, 1024, 4096
+"""Texels of the light map per pixel of an image's longer side as far as MANY, and the most that there are."""
+TEXELS_BEYOND = {"traced": 4, "gathered": 2}
+"""The same from MANY on. Four are about one a pixel where the atlas shows a part of itself; gathered light is better of
+half as many with more rays, where charts are large."""
+SPP = {"traced": 16, "gathered": 32}
+"""Paths or gathered rays per texel: few, for the denoiser averages over texels."""
+GATHER_FROM = 0.4
+"""Share of the light that direct light alone would miss, from which on it is gathered: it pays at 0.49 (`interior`) and
+does not at 0.21 (`materials`)."""
 CHUNK, WARM_UP = 64, 8
 """Frames of a sequence that remember one another; those before a chunk's first that are rendered for it once more, so
 that no seam is seen. A chunk is what an interrupted run does again at most."""
-SIZES = (256, 4096)
-SPP = {"traced": (16, 64), "gathered": (32, 64)}
 RAY = 0.6
 """Seconds of a gathered ray, with its samples of emitters, over those of a path of E and one of S."""
 
@@ -79,29 +84,39 @@ def light_path(workspace: Workspace) -> Path:
     return workspace.root / "base" / "light.npz"
 
 
-def light_size(settings: Settings) -> int:
-    """Texels of the light map's side: the setting, else a power of two that suits the images."""
-    if settings.base.light_size != "auto":
-        return settings.base.light_size
-    wanted = AUTOMATIC_TEXELS[settings.base.light] * max(settings.cameras.width, settings.cameras.height)
-    return int(min(max(2 ** round(np.log2(wanted)), SIZES[0]), SIZES[1]))
+@dataclass(frozen=True)
+class LightPlan:
+    """How light is baked.
 
-
-def light_spp(settings: Settings) -> int:
-    """Paths or gathered rays per texel: the setting, else as many as keep their sum what it is at 512², within SPP.
-
-    A finer map has more texels on the same surface, and the denoiser averages over them.
+    Args:
+        gathered: by rays that end at a coarse map after one bounce; else by paths.
+        size: texels of the map's side. spp: paths or gathered rays per texel.
     """
-    if settings.base.light_spp != "auto":
-        return settings.base.light_spp
-    least, most = SPP[settings.base.light]
-    return int(min(max(most * (512 / light_size(settings)) ** 2, least), most))
+
+    gathered: bool
+    size: int
+    spp: int
+
+    @property
+    def paths(self) -> float:
+        """Of a full atlas; gathered light: as many as take its seconds."""
+        rays = self.size**2 * self.spp
+        return COARSE_PATHS + RAY * rays if self.gathered else rays
 
 
-def light_paths(settings: Settings) -> float:
-    """Paths that the light of a full atlas takes; gathered light: as many as take its seconds."""
-    rays = light_size(settings) ** 2 * light_spp(settings)
-    return rays if settings.base.light == "traced" else COARSE_PATHS + RAY * rays
+def light_plan(settings: Settings, plan: EffectPlan) -> LightPlan:
+    """As the settings say; where they say auto, what suits the images and how much of the light has bounced."""
+    chosen, way = settings.base, settings.base.light
+    if way == "auto":
+        steps = plan.pilot.steps if plan.pilot else ()
+        way = "gathered" if any(step.depth == DIRECT_DEPTH and step.mean >= GATHER_FROM for step in steps) else "traced"
+    side = max(settings.cameras.width, settings.cameras.height)
+    wanted = max(min(TEXELS * side, MANY), TEXELS_BEYOND[way] * side)
+    return LightPlan(
+        gathered=way == "gathered",
+        size=min(2 ** round(np.log2(wanted)), MOST) if chosen.light_size == "auto" else chosen.light_size,
+        spp=SPP[way] if chosen.light_spp == "auto" else chosen.light_spp,
+    )
 
 
 def base_views(
@@ -188,12 +203,13 @@ def base_renderer(workspace: Workspace, settings: Settings, plan: EffectPlan) ->
         "samples": chosen.samples,
     }
     if kind == "baked":
+        baked = light_plan(settings, plan)
         common |= {"light": str(light_path(workspace)), "denoise": chosen.denoise}
         light = {
             "output": common["light"],
-            "size": light_size(settings),
-            "spp": light_spp(settings),
-            "gather": chosen.light == "gathered",
+            "size": baked.size,
+            "spp": baked.spp,
+            "gather": baked.gathered,
             "gloss": not chosen.denoise,
             "integrator": config["integrator"],
             "max_depth": config["max_depth"],

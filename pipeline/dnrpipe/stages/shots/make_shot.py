@@ -19,7 +19,7 @@ from ...core.scene_files import scene_fingerprint
 from ...core.units import duration
 from ...core.workspace import digest, file_sha256
 from ...workers.view_tasks import is_made
-from ..base_images import BASE_VERSION, base_renderer, light_paths
+from ..base_images import BASE_VERSION, base_renderer, light_plan
 from ..effect_plan import resolve_plan
 from ..render import write_mp4
 from ..session import Session
@@ -37,10 +37,7 @@ from .renderers import Renderer, path_tracer, shipped_renderer, trained_renderer
 CHECKED = 2
 """Frames of a shot that are traced to check it."""
 PLAN_VERSION = 6
-GATHER_FROM = 0.4
-"""Share of the light that direct light alone would miss, from which on it is gathered: it pays at 0.49 (`interior`) and
-does not at 0.21 (`materials`)."""
-LIGHT_SIZES = {"traced": (512, 2048), "gathered": (1024, 2048)}
+LIGHT_SIZES = (1024, 2048)
 """Texels of the light map's side: of few frames, of many."""
 BATCH = 8
 """Bundles of single frames that are on disk at once."""
@@ -91,22 +88,14 @@ def plan_shot(session: Session, shot: Shot) -> ShotPlan:
 
 
 def choose_light(session: Session, frames: Sequence[ShotFrame]) -> None:
-    """Set how light is baked where the user has not (figures: docs/experiments.md): gathered where much of it has
-    bounced; finer where the shot has more pixels than its paths, so that they take a small part of the time.
-
-    Base images are denoised.
-    """
-    own = session.workspace.manifest.overrides.get("base", {})
-    pilot = resolve_plan(session.run.for_stage("render")).pilot
-    bounced = next((step.mean for step in pilot.steps if step.depth == 2), 0.0) if pilot else 0.0
-    light = own.get("light", "gathered" if bounced >= GATHER_FROM else "traced")
-    session.adopt({"base": {"light": light, "denoise": own.get("denoise", True)}})
-    if "light_size" in own:
+    """Set the light map's size where the user has not (figures: docs/experiments.md): finer where the shot has more
+    pixels than the light would have paths, so that these take a small part of the time."""
+    if "light_size" in session.workspace.manifest.overrides.get("base", {}):
         return
-    pixels = sum(frame.view.width * frame.view.height for frame in frames if not frame.moving)
-    few, many = LIGHT_SIZES[light]
+    few, many = LIGHT_SIZES
     session.adopt({"base": {"light_size": many}})
-    if light_paths(session.settings) > pixels:
+    pixels = sum(frame.view.width * frame.view.height for frame in frames if not frame.moving)
+    if light_plan(session.settings, resolve_plan(session.run.for_stage("render"))).paths > pixels:
         session.adopt({"base": {"light_size": few}})
 
 

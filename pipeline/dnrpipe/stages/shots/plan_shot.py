@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ...core.units import duration
-from ..base_images import base_renderer, light_paths
+from ..base_images import base_renderer, light_plan
 from ..stage import Run
 from ..worth import worth
 from .frame_tasks import Way
@@ -148,7 +148,7 @@ def _no_baked_light(
         return ""
     most = ladder[-1]
     tracing = path_option(most, shape).seconds
-    light = light_paths(run.settings) * LIGHT_PATH * most.pixel / most.way.spp
+    light = light_plan(run.settings, run.effect_plan).paths * LIGHT_PATH * most.pixel / most.way.spp
     if tracing < light:
         return (
             f"path tracing all frames at {most.way.spp} samples takes {duration(tracing)}, baking the light about"
