@@ -64,6 +64,24 @@ class Worker:
         (output.parent / "beside.txt").write_text("beside")
         return {"inside": inside, "output": str(output), "here": str(self.folder)}
 """
+WAITING = """
+import pathlib, time
+import ray
+
+class Worker:
+    def __init__(self, common):
+        self.folder, self.doomed = pathlib.Path(common["folder"]), common["doomed"]
+    def __call__(self, task):
+        here = ray.get_runtime_context().get_node_id()
+        (self.folder / here).touch()
+        until = time.monotonic() + 90
+        while here == self.doomed or not (self.folder / "killed").exists():
+            if time.monotonic() > until:
+                raise ValueError("no node was killed")
+            time.sleep(0.05)
+        return {}
+"""
+"""A task tells its node, then waits for the doomed node's end; on that one, for ever."""
 
 
 @pytest.fixture(scope="session")
@@ -86,17 +104,25 @@ def modules(tmp_path: Path) -> Path:
     folder.mkdir()
     (folder / "fragile_worker.py").write_text(WORKER)
     (folder / "filing_worker.py").write_text(FILES)
+    (folder / "waiting_worker.py").write_text(WAITING)
     return folder
 
 
-def _run(cluster: Cluster, modules: Path, kinds: list[str], **options) -> tuple[list[TaskResult], list[Retry], Path]:
+def _run(
+    cluster: Cluster,
+    modules: Path,
+    kinds: list[str],
+    worker: str = "fragile_worker",
+    common: dict[str, str] | None = None,
+    **options,
+) -> tuple[list[TaskResult], list[Retry], Path]:
     root = modules.parent / "root"
     root.mkdir(exist_ok=True)
     place = Placement(ExecutorSettings(engine="ray", address=cluster.address), (root,))
     retries: list[Retry] = []
     outcomes = run_tasks(
-        "fragile_worker",
-        {"folder": str(modules)},
+        worker,
+        {"folder": str(modules), **(common or {})},
         [{"kind": kind, "n": n} for n, kind in enumerate(kinds)],
         workers=2,
         log=root / "log.txt",
@@ -129,9 +155,19 @@ def test_a_task_that_hangs_is_ended(cluster: Cluster, modules: Path) -> None:
 def test_a_killed_node_costs_time_only(cluster: Cluster, modules: Path) -> None:
     node = cluster.add_node(**NODE)
     cluster.wait_for_nodes()
-    threading.Timer(4.0, lambda: cluster.remove_node(node, allow_graceful=False)).start()
-    results, retries, _ = _run(cluster, modules, ["sleep"] * 40)
-    assert [result.error for result in results] == [None] * 40
+
+    def kill() -> None:
+        until = time.monotonic() + 60
+        while not (modules / node.node_id).exists() and time.monotonic() < until:  # until a task runs there
+            time.sleep(0.05)
+        cluster.remove_node(node, allow_graceful=False)
+        (modules / "killed").touch()
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    results, retries, _ = _run(cluster, modules, ["wait"] * 8, "waiting_worker", {"doomed": node.node_id})
+    killer.join()
+    assert [result.error for result in results] == [None] * 8
     assert all(result.attempts == 1 for result in results)  # not the task's doing
     assert any("is gone" in retry.reason for retry in retries)
 
