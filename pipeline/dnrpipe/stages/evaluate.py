@@ -166,7 +166,8 @@ def _shipped(run: Run, device: str) -> DNR | None:
         return None
     model = corrector()
     traced = [view for view in split_views(run.workspace)["train"] if view.name in names]
-    best_share(model, load(run.workspace, traced, "train", raytraced=True, raw=True, base="baked"))
+    both = (load(run.workspace, traced, "train", raytraced=True, raw=raw, base="baked") for raw in (True, False))
+    best_share(model, *both)
     return model.to(device)
 
 

@@ -61,41 +61,37 @@ def traced_small(run: Run) -> list[View]:
 
 
 def measure_trust(run: Run, model: DNR) -> Trust:
-    """Find the share that is good on the small views, whether their references are denoised or as traced. ``model`` is
-    left with it.
-
-    What was traced is clipped for display, which darkens bright noise (by 0.02 on `jewels`' caustics) and speaks for a
-    darker picture, as a denoiser's softness speaks for a soft one: the lesser share does no harm by either.
-    """
+    """Find the share that does best on the small views. ``model`` is left with it."""
     views, base = traced_small(run), run.settings.model.base
-    noisy = best_share(model, load(run.workspace, views, SPLIT, raytraced=True, raw=True, base=base))
-    clean = load(run.workspace, views, SPLIT, raytraced=True, base=base)
-    share = min(noisy, best_share(model, clean))
-    _apply(model, share)
+    noisy, clean = (load(run.workspace, views, SPLIT, raytraced=True, raw=raw, base=base) for raw in (True, False))
+    share = best_share(model, noisy, clean)
     before, after = mean_psnr(model, clean)
     return Trust(share=share, psnr=(before, after))
 
 
-def best_share(model: DNR, views: ViewSet) -> float:
-    """The share of the model's correction that is best on views with their references. ``model`` is left with it.
+def best_share(model: DNR, noisy: ViewSet, clean: ViewSet) -> float:
+    """The share of the model's correction that does best on views with references, whether these are as traced or
+    denoised. ``model`` is left with it.
 
-    Load them raw where they have many samples: a denoiser's softness speaks for a soft picture, while noise that is not
-    clipped adds the same to the error of all.
+    Noise is clipped for display, which darkens it (by 0.02 on `jewels`' caustics) and speaks for a darker picture; a
+    denoiser's softness speaks for a soft one. The lesser share does no harm by either.
+
+    Args:
+        noisy, clean: the same views, their targets before and after the denoiser.
     """
     import torch
 
     from dnrtrain.model import render_views
 
-    target = views.tensors.target
-    assert target is not None  # loaded with raytraced=True
-
-    def error(share: float) -> float:
+    def errors(share: float) -> list[float]:
         _apply(model, share)
-        return float((render_views(model, views) - target).square().mean())
+        pictures = render_views(model, noisy)
+        targets = (views.tensors.target for views in (noisy, clean))
+        return [float((pictures - target).square().mean()) for target in targets if target is not None]
 
     with torch.inference_mode():
-        found = {share: error(share) for share in SHARES}
-    share = min(found, key=lambda share: found[share])
+        found = {share: errors(share) for share in SHARES}
+    share = min(min(found, key=lambda share: found[share][kind]) for kind in range(2))
     _apply(model, share)
     return share
 

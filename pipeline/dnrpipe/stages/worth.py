@@ -69,7 +69,7 @@ def worth(run: Run, candidates: int) -> Worth:
         found = []
         for train, test in (halves, halves[::-1]):
             before = corrector()
-            best_share(before, noisy.subset(train))
+            best_share(before, noisy.subset(train), views.subset(train))
             found.append(trial(run, before, views.subset(train), views.subset(test)))
             bar.advance()
     spent = time.monotonic() - started

@@ -167,7 +167,7 @@ class Worker:
         if self.settings.model.base != "baked":
             return None
         model = corrector()
-        best_share(model, self._views(task, raw=True))
+        best_share(model, self._views(task, raw=True), self._views(task))
         return model
 
     def _frames(self, task: FramesTask) -> dict[str, Any]:
