@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import resource
 import shutil
@@ -34,6 +35,11 @@ from typing import Any
 
 import numpy as np
 
+from dnrpipe.core.cameras import spread
+from dnrpipe.core.ledger import break_even_frames
+from dnrpipe.core.scene_files import split_views
+from dnrpipe.core.workspace import Workspace
+from dnrpipe.stages.evaluate import BASELINE_VIEWS
 from dnrpipe.studies.cells.intervals import Difference, summarise
 from dnrtrain.atomic import write_json
 
@@ -53,6 +59,8 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 }
 CORES = 2
 FIGURES = ("psnr", "ssim", "lpips_alex", "flip")
+RUNG_FIGURES = {"psnr": "psnr", "lpips": "lpips_alex"}
+"""Of path tracing's ladder, and what a view's row calls them."""
 
 
 def main() -> None:
@@ -90,8 +98,11 @@ def measured(scene: Path, root: Path, variants: list[str], options: argparse.Nam
         spent = selecting + run(root, "raytrace-selected", "--force") + run(root, "finetune")
         spent += 0 if variant in ("untrained", "fresh") else light
         run(root, "evaluate")
-        mean = json.loads((root / "evaluation" / "metrics.json").read_text())["mean"]
-        figures = {name: mean[name] for name in FIGURES}
+        metrics = json.loads((root / "evaluation" / "metrics.json").read_text())
+        mean = metrics["mean"]
+        figures: dict[str, Any] = {name: mean[name] for name in FIGURES}
+        figures["frame"] = mean["seconds_base"] + mean["seconds_neural"]
+        figures["rival"], figures["rival_views"] = metrics["baseline"], beside_rival(root, metrics["views"])
         seconds = round(prepared + shared + spent, 1)
         facts = {"scene": scene.stem, "variant": variant, "seed": seed, "evaluation_spp": evaluation_spp}
         rows.append({**facts, "base": mean["psnr_base"], **figures, "seconds": seconds})
@@ -105,6 +116,13 @@ def measured(scene: Path, root: Path, variants: list[str], options: argparse.Nam
             rows[-1]["worth"] = json.loads((root / "selection.json").read_text())["details"]["worth"]
         print(f"{scene.stem}, {variant}: {mean['psnr']:.2f} dB, {seconds:.0f} s", flush=True)
     return rows
+
+
+def beside_rival(root: Path, rows: list[dict[str, Any]]) -> dict[str, float]:
+    """The renderer's mean PSNR and LPIPS on the test views that path tracing was measured on."""
+    names = {view.name for view in spread(split_views(Workspace.open(root))["test"], BASELINE_VIEWS)}
+    own = [row for row in rows if row["name"] in names]
+    return {rung: float(np.mean([row[figure] for row in own])) for rung, figure in RUNG_FIGURES.items()}
 
 
 def run(root: Path, command: str, *options: str) -> float:
@@ -155,7 +173,46 @@ def markdown(results: dict[str, Any]) -> str:
     if timed:
         shares = [rows[s, "untrained", seed]["seconds"] / rows[s, "fresh", seed]["seconds"] for s, seed in timed]
         lines.append(f"- untrained, of fresh's seconds before the first frame: {np.mean(shares):.0%}")
-    return "\n".join(lines)
+    return "\n".join(lines + break_evens(results["rows"]))
+
+
+def break_evens(rows: list[dict[str, Any]]) -> list[str]:
+    """A table of N*, the number of frames from which a renderer is cheaper than path tracing with a denoiser that is as
+    good, in the median of the seeds."""
+    names = ("untrained", "6 views")
+    found: dict[tuple[str, str, str], list[float]] = {}
+    frames: dict[tuple[str, str], list[float]] = {}
+    for row in rows:
+        if row["variant"] in names and row.get("rival"):
+            frames.setdefault((row["scene"], row["variant"]), []).append(row["frame"])
+            for figure, own in row["rival_views"].items():
+                traced = rival_seconds(row["rival"], figure, own)
+                fewest = break_even_frames(row["seconds"], traced, row["frame"])
+                found.setdefault((row["scene"], row["variant"], figure), []).append(
+                    math.inf if fewest is None else fewest
+                )
+    if not found:
+        return []
+    heads = [f"{name}, {what}" for name in names for what in ("ms a frame", "N* at equal PSNR", "N* at equal LPIPS")]
+    lines = ["", f"| scene | {' | '.join(heads)} |", "|---" * (1 + len(heads)) + "|"]
+    for scene in sorted({scene for scene, _ in frames}):
+        shown = []
+        for name in names:
+            own = frames.get((scene, name))
+            shown.append(f"{1000 * np.median(own):.0f}" if own else "-")
+            for figure in RUNG_FIGURES:
+                fewest = np.median(found[scene, name, figure]) if own else math.nan
+                shown.append("-" if math.isnan(fewest) else "never" if math.isinf(fewest) else f"{fewest:.0f}")
+        lines.append(f"| {scene} | {' | '.join(shown)} |")
+    return lines
+
+
+def rival_seconds(rungs: list[dict[str, float]], figure: str, own: float) -> float:
+    """Of a frame of path tracing with that PSNR or LPIPS, between its rungs; beyond its best, the best's, which is less
+    than it would take."""
+    sign = -1 if figure == "lpips" else 1
+    known = sorted((sign * rung[figure], rung["seconds"]) for rung in rungs)
+    return float(np.interp(sign * own, *zip(*known, strict=True)))
 
 
 def interval(found: Difference) -> str:

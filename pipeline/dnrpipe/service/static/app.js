@@ -234,11 +234,12 @@
     if (Math.abs(found.time - told.time) > 5) return;
     const pictures = { prediction: await api.picture(base + "/prediction") };
     if (found.truth) pictures.truth = await api.picture(base + "/truth");
-    if (mine !== watching) return;  // another job was chosen meanwhile
+    const wanted = mine === watching;  // else another job was chosen meanwhile
     Object.keys(pictures).forEach(function (kind) {
-      URL.revokeObjectURL($("live-" + kind).src);
-      $("live-" + kind).src = pictures[kind];
+      URL.revokeObjectURL(wanted ? $("live-" + kind).src : pictures[kind]);
+      if (wanted) $("live-" + kind).src = pictures[kind];
     });
+    if (!wanted) return;
     $("live-beside").hidden = !found.truth;
     $("live-caption").textContent = (found.split === "test" ? "Test view " + found.view + ", which training never sees" : "Training view " + found.view + "; none is held out") +
       ": epoch " + found.epoch + " of " + found.epochs +
@@ -318,8 +319,9 @@
     const name = workspace, path = "/workspaces/" + name + "/pictures/" + $("view").value + "/";
     for (const kind of ["truth", "prediction"]) {
       const picture = await api.picture(path + kind);
-      if (name !== asked) return;
-      URL.revokeObjectURL($(kind).src);
+      const wanted = name === asked;
+      URL.revokeObjectURL(wanted ? $(kind).src : picture);
+      if (!wanted) return;
       $(kind).src = picture;
     }
     $("psnr").textContent = "Held-out view " + $("view").selectedOptions[0].text;
