@@ -27,6 +27,7 @@ import numpy as np
 from dnrpipe.core.cameras import look_at_view, shot_views
 from dnrpipe.core.console import Console
 from dnrpipe.core.images import flip_error, picture_of
+from dnrpipe.core.ledger import break_even_frames
 from dnrpipe.core.machine import processor
 from dnrpipe.core.scene_files import read_summary
 from dnrpipe.core.settings import CameraSettings
@@ -275,8 +276,8 @@ def markdown(results: dict[str, Any]) -> str:
         "",
         "| scene | size | way, rays | before the first frame, s | a frame, s | dB | LPIPS | FLIP | flicker"
         " | path tracing as good (dB and LPIPS) | its frame, s | its flicker"
-        " | 240 frames, s | path tracing, s | ratio |",
-        "|---" * 15 + "|",
+        " | 240 frames, s | path tracing, s | ratio | N* at equal PSNR | at equal LPIPS |",
+        "|---" * 17 + "|",
     ]
     for row in results["rows"]:
         own, rung = row["ours"], equal_rung(row, ("psnr", "lpips"))
@@ -291,8 +292,17 @@ def markdown(results: dict[str, Any]) -> str:
         else:
             cells += [f"{rung['spp']} spp, {rung['quality']}", f"{rung['frame']:.2f}", f"{rung['flicker']:.4f}"]
             cells += [f"{ours:.0f}", f"{REEL * rung['frame']:.0f}", f"{ours / (REEL * rung['frame']):.2f}"]
+        cells += [break_even(row, name) for name in ("psnr", "lpips")]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def break_even(row: dict[str, Any], name: str) -> str:
+    """N*: from how many frames on the shot is cheaper than path tracing as good by the figure."""
+    rung = equal_rung(row, (name,))
+    traced = (rung or row["rungs"][-1])["frame"]
+    fewest = break_even_frames(row["before"], traced, row["frame"])
+    return "never" if fewest is None else f"{fewest}" if rung else f"< {fewest}"
 
 
 if __name__ == "__main__":
