@@ -3,8 +3,8 @@
 python -m tools.bench_untrained FOLDER [SCENE.blend ...] [--variants untrained,fresh] [--seed 1] [--out RESULTS.json]
 
 FOLDER keeps the workspaces; rows that are in the results are not measured again. Without scenes: the example scenes.
-`--seed` is of the trainings; PSNR in the table are means over the seeds, seconds those of the first, and a renderer is
-paired with the one of its seed.
+`--seed` is of the trainings; PSNR in the table are means over the seeds, seconds those of the first where they are of
+one run, and a renderer is paired with the one of its seed.
 Variants, at the draft preset with 8 test views:
 
     untrained   --budget 0
@@ -57,6 +57,10 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "25 views": ("--budget", "25", "--set", "finetune.step2.epochs=40"),
     "fresh": ("--budget", "25", "--set", "finetune.step2.epochs=40", *FRESH),
 }
+TRAINED = ("6 views", "25 views", "fresh")
+"""Variants that have seeds."""
+BASES = {"base image": "untrained", "grainy base image": "fresh"}
+"""What is corrected, by the variant whose it is."""
 CORES = 2
 FIGURES = ("psnr", "ssim", "lpips_alex", "flip")
 RUNG_FIGURES = {"psnr": "psnr", "lpips": "lpips_alex"}
@@ -135,44 +139,55 @@ def run(root: Path, command: str, *options: str) -> float:
 
 
 def markdown(results: dict[str, Any]) -> str:
-    """PSNR and seconds of every scene, and the mean differences over scenes with their 95% intervals."""
+    """PSNR and seconds of every scene, the mean differences over scenes with their 95% intervals, and N*."""
     rows = {(row["scene"], row["variant"], row["seed"]): row for row in results["rows"]}
     scenes = sorted({scene for scene, _, _ in rows})
     seeds = sorted({seed for _, _, seed in rows})
+    variants = [name for name in VARIANTS if any(variant == name for _, variant, _ in rows)]
+
+    def value(scene: str, variant: str, seed: int, figure: str) -> float | None:
+        if variant in BASES:
+            variant, figure = BASES[variant], "base"
+        if variant not in TRAINED or figure == "base":
+            seed = seeds[0]  # nothing in it depends on a seed
+        return rows.get((scene, variant, seed), {}).get(figure)
 
     def mean(scene: str, variant: str, figure: str) -> float | None:
         counted = seeds[:1] if figure == "seconds" else seeds  # seconds are of one machine, and of one run
-        own = [rows[scene, variant, seed][figure] for seed in counted if (scene, variant, seed) in rows]
+        own = [found for seed in counted if (found := value(scene, variant, seed, figure)) is not None]
         return float(np.mean(own)) if own else None
 
-    heads = [*VARIANTS, *(f"{name}, s" for name in VARIANTS), "trial", "auto"]
-    lines = [f"| scene | base image | {' | '.join(heads)} |", "|---" * (2 + len(heads)) + "|"]
+    heads = [*BASES, *variants, *(f"{name}, s" for name in variants), "trial", "auto"]
+    lines = [f"| scene | {' | '.join(heads)} |", "|---" * (1 + len(heads)) + "|"]
     for scene in scenes:
-        shown = [f"{mean(scene, 'untrained', 'base'):.2f}"]
-        for figure, digits in (("psnr", 2), ("seconds", 0)):
-            values = [mean(scene, variant, figure) for variant in VARIANTS]
+        shown = []
+        for names, figure, digits in (((*BASES, *variants), "psnr", 2), (variants, "seconds", 0)):
+            values = [mean(scene, name, figure) for name in names]
             shown += ["-" if value is None else f"{value:.{digits}f}" for value in values]
-        worth = rows[scene, "untrained", 0].get("worth")
+        worth = rows[scene, "untrained", seeds[0]].get("worth")
         shown += ["-", "-"] if worth is None else [f"{worth['gain']:+.2f} dB", f"{worth['views']} views"]
         lines.append(f"| {scene} | {' | '.join(shown)} |")
     lines.append("")
-    psnr = {key: row["psnr"] for key, row in rows.items()}
-    for scene, variant, seed in rows:
-        if variant == "untrained":
-            psnr[scene, "base image", seed] = rows[scene, variant, seed]["base"]
-    pairs = [("untrained", "base image"), *((name, "fresh") for name in ("untrained", "6 views", "25 views"))]
+    pairs = [("untrained", base) for base in BASES]
+    pairs += [(name, "fresh") for name in ("untrained", *TRAINED) if name in variants and name != "fresh"]
     for name, other in pairs:
-        both = [(s, seed) for s in scenes for seed in seeds if {(s, name, seed), (s, other, seed)} <= set(psnr)]
-        found = summarise({(s, seed): psnr[s, name, seed] - psnr[s, other, seed] for s, seed in both})
+        both = {
+            (scene, seed): own - compared
+            for scene in scenes
+            for seed in (seeds if {name, other} & set(TRAINED) else seeds[:1])
+            if (own := value(scene, name, seed, "psnr")) is not None
+            and (compared := value(scene, other, seed, "psnr")) is not None
+        }
+        found = summarise(both)
         if found is not None:
             worst, least = min(found.scenes.items(), key=lambda item: item[1])
             told = f"over {len(found.scenes)} scenes, {len(both)} pairs, worst {least:+.2f} ({worst})"
             lines.append(f"- {name} to {other}: {interval(found)} dB {told}")
-    first = seeds[0]
-    timed = [(s, first) for s in scenes if {(s, "untrained", first), (s, "fresh", first)} <= set(rows)]
-    if timed:
-        shares = [rows[s, "untrained", seed]["seconds"] / rows[s, "fresh", seed]["seconds"] for s, seed in timed]
-        lines.append(f"- untrained, of fresh's seconds before the first frame: {np.mean(shares):.0%}")
+    both = [(mean(scene, "untrained", "seconds"), mean(scene, "fresh", "seconds")) for scene in scenes]
+    shares = [ours / fresh for ours, fresh in both if ours and fresh]
+    if shares:
+        told = f"{np.mean(shares):.0%} ({len(shares)} scenes)"
+        lines.append(f"- untrained, of fresh's seconds before the first frame: {told}")
     return "\n".join(lines + break_evens(results["rows"]))
 
 

@@ -23,15 +23,17 @@ def _dnrpipe(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return done
 
 
-SHORT = ("finetune.step2.epochs=14", "cameras.test=4", "raytrace.evaluation_spp=256")
-"""A third of the draft preset's training and of its held-out views: what every run of the tests can wait for."""
+SHORT = ("select.budget=8", "finetune.step2.epochs=20", "cameras.test=4", "raytrace.evaluation_spp=256")
+"""A third of the draft preset's views, a sixth of its steps: what every run of the tests can wait for."""
+
+WHOLE = ["--budget", "25"]
 
 
 @pytest.fixture(scope="module", params=["short", pytest.param("whole", marks=pytest.mark.robustness)])
 def demo(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, demo_blend: Path) -> Path:
     folder = tmp_path_factory.mktemp(request.param)
-    settings = [part for setting in SHORT for part in ("--set", setting)] if request.param == "short" else []
-    _dnrpipe("run", str(demo_blend), "--budget", "25", "--quiet", *settings, folder=folder)
+    settings = [part for setting in SHORT for part in ("--set", setting)] if request.param == "short" else WHOLE
+    _dnrpipe("run", str(demo_blend), "--quiet", *settings, folder=folder)
     return folder / "demo.dnr"
 
 
@@ -42,8 +44,9 @@ def test_held_out_quality(demo: Path) -> None:
     assert len(metrics["views"]) == (12 if whole else 4)
     mean = metrics["mean"]
     print({key: round(value, 4) for key, value in mean.items() if value is not None})
-    assert mean["psnr"] >= (32.0 if whole else 30.5)
-    assert mean["ssim"] >= (0.965 if whole else 0.96)
+    assert mean["psnr"] >= (33.5 if whole else 33.2)
+    assert mean["ssim"] >= 0.975
+    assert mean["psnr_base"] < mean["psnr_shipped"] < mean["psnr"]
     rungs = metrics["baseline"]  # path tracing with a denoiser: more samples are better, and take longer
     assert [rung["spp"] for rung in rungs] == [1, 4, 16, 64]
     for less, more in pairwise(rungs):
@@ -60,7 +63,9 @@ def test_held_out_quality(demo: Path) -> None:
 
 def test_again_does_nothing(demo: Path, demo_blend: Path) -> None:
     started = time.monotonic()
-    done = _dnrpipe("run", str(demo_blend), "--budget", "25", folder=demo.parent)
+    done = _dnrpipe(
+        "run", str(demo_blend), *(WHOLE if demo.parent.name.startswith("whole") else []), folder=demo.parent
+    )
     assert time.monotonic() - started < 10
     assert done.stdout.count("up to date") == 5
 
