@@ -24,7 +24,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import resource
 import shutil
@@ -41,6 +40,7 @@ from dnrpipe.core.scene_files import split_views
 from dnrpipe.core.workspace import Workspace
 from dnrpipe.stages.evaluate import BASELINE_VIEWS
 from dnrpipe.studies.cells.intervals import Difference, summarise
+from dnrpipe.studies.frames.pareto_front import crossover, frontier
 from dnrtrain.atomic import write_json
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -193,41 +193,38 @@ def markdown(results: dict[str, Any]) -> str:
 
 def break_evens(rows: list[dict[str, Any]]) -> list[str]:
     """A table of N*, the number of frames from which a renderer is cheaper than path tracing with a denoiser that is as
-    good, in the median of the seeds."""
-    names = ("untrained", "6 views")
-    found: dict[tuple[str, str, str], list[float]] = {}
-    frames: dict[tuple[str, str], list[float]] = {}
-    for row in rows:
-        if row["variant"] in names and row.get("rival"):
-            frames.setdefault((row["scene"], row["variant"]), []).append(row["frame"])
-            for figure, own in row["rival_views"].items():
-                traced = rival_seconds(row["rival"], figure, own)
-                fewest = break_even_frames(row["seconds"], traced, row["frame"])
-                found.setdefault((row["scene"], row["variant"], figure), []).append(
-                    math.inf if fewest is None else fewest
-                )
-    if not found:
+    good. Of rows that have a rival, the first seed's."""
+    timed = {(row["scene"], row["variant"]): row for row in reversed(rows) if row.get("rival")}
+    if not timed:
         return []
+    names = ("untrained", "6 views")
     heads = [f"{name}, {what}" for name in names for what in ("ms a frame", "N* at equal PSNR", "N* at equal LPIPS")]
     lines = ["", f"| scene | {' | '.join(heads)} |", "|---" * (1 + len(heads)) + "|"]
-    for scene in sorted({scene for scene, _ in frames}):
-        shown = []
-        for name in names:
-            own = frames.get((scene, name))
-            shown.append(f"{1000 * np.median(own):.0f}" if own else "-")
-            for figure in RUNG_FIGURES:
-                fewest = np.median(found[scene, name, figure]) if own else math.nan
-                shown.append("-" if math.isnan(fewest) else "never" if math.isinf(fewest) else f"{fewest:.0f}")
+    for scene in sorted({scene for scene, _ in timed}):
+        shown = [cell for name in names for cell in break_even_cells(timed.get((scene, name)))]
         lines.append(f"| {scene} | {' | '.join(shown)} |")
     return lines
+
+
+def break_even_cells(row: dict[str, Any] | None) -> list[str]:
+    """Milliseconds of a frame, N* at equal PSNR and at equal LPIPS."""
+    if row is None:
+        return ["-"] * 3
+    cells = [f"{1000 * row['frame']:.0f}"]
+    for figure, own in row["rival_views"].items():
+        fewest = break_even_frames(row["seconds"], rival_seconds(row["rival"], figure, own), row["frame"])
+        cells.append("never" if fewest is None else str(fewest))
+    return cells
 
 
 def rival_seconds(rungs: list[dict[str, float]], figure: str, own: float) -> float:
     """Of a frame of path tracing with that PSNR or LPIPS, between its rungs; beyond its best, the best's, which is less
     than it would take."""
     sign = -1 if figure == "lpips" else 1
-    known = sorted((sign * rung[figure], rung["seconds"]) for rung in rungs)
-    return float(np.interp(sign * own, *zip(*known, strict=True)))
+    points = {str(rung["spp"]): (rung["seconds"], sign * rung[figure]) for rung in rungs}
+    line = [points[name] for name in frontier(points)]
+    found = crossover(line, sign * own)
+    return line[-1][0] if found is None else found
 
 
 def interval(found: Difference) -> str:

@@ -31,6 +31,7 @@ VIEWS, SIDE, SPP = 4, 128, 32
 """Views, pixels of their longer side, samples per pixel: seconds, and half a decibel is seen."""
 SHARES = tuple(i / 10 for i in range(11))
 ENOUGH = 0.95
+"""Of the most that any share gains."""
 
 
 class Trust(BaseModel, frozen=True):
@@ -86,15 +87,17 @@ def best_share(model: DNR, noisy: ViewSet, clean: ViewSet) -> float:
 
     from dnrtrain.model import render_views
 
+    raw, smooth = noisy.tensors.target, clean.tensors.target
+    assert raw is not None and smooth is not None  # loaded with raytraced=True
+
     def errors(share: float) -> list[float]:
         _apply(model, share)
         pictures = render_views(model, noisy)
-        targets = (views.tensors.target for views in (noisy, clean))
-        return [float((pictures - target).square().mean()) for target in targets if target is not None]
+        return [float((pictures - target).square().mean()) for target in (raw, smooth)]
 
     with torch.inference_mode():
-        found = {share: errors(share) for share in SHARES}
-    share = min(_sufficient([found[share][kind] for share in SHARES]) for kind in range(2))
+        found = [errors(share) for share in SHARES]
+    share = min(_sufficient(list(each)) for each in zip(*found, strict=True))
     _apply(model, share)
     return share
 
