@@ -20,6 +20,10 @@ JOBS = click.option(
     "--jobs", type=int, default=0, metavar="N", help="Cells side by side (default: one per core; 1 on a GPU)."
 )
 JSON = click.option("--json", "as_json", is_flag=True, help="Print results.json; messages to stderr.")
+FIRST_SEED = click.option(
+    "--first-seed", type=click.IntRange(min=0), default=0, show_default=True, metavar="N",
+    help="Seeds count from here: each machine may take some.",
+)  # fmt: skip
 EXECUTOR = options(EXECUTOR_OPTIONS)
 QUIET = click.option("-q", "--quiet", is_flag=True, help="Warnings and errors only.")
 
@@ -32,6 +36,7 @@ QUIET = click.option("-q", "--quiet", is_flag=True, help="Warnings and errors on
     help="Rows or groups: core (default), paper-table, paper-more, fig7a, fig7b, fig7c, ingredients, all, vanilla, ...",
 )
 @click.option("--seeds", type=int, default=3, show_default=True, metavar="N", help="Every row is trained N times.")
+@FIRST_SEED
 @PRESET
 @click.option("--budget", type=int, metavar="M", help="Training views (default 25).")
 @click.option(
@@ -78,6 +83,7 @@ def ablate(as_json: bool, quiet: bool, out: Path, **given: Any) -> None:
     help="Policies or groups: core (default: all that need no training), simple, rewards, all, random, rl-paper, ...",
 )  # fmt: skip
 @click.option("--seeds", type=int, default=3, show_default=True, metavar="N", help="Every cell is trained N times.")
+@FIRST_SEED
 @click.option("--views", type=int, metavar="N", help="Candidates in every pool (default 100).")
 @PRESET
 @click.option(

@@ -93,6 +93,7 @@ class Study(ABC, Generic[Place]):
     """What to run, and the state of the run.
 
     Args:
+        seeds, first_seed: how many, counted from the latter.
         base: settings of all cells.
         seconds: of training, None: the preset's epochs.
         jobs: workers; 0: one per core, one on a GPU.
@@ -109,6 +110,7 @@ class Study(ABC, Generic[Place]):
 
     sources: list[Path]
     seeds: int
+    first_seed: int = 0
     base: Settings
     seconds: float | None
     out: Path
@@ -149,7 +151,7 @@ class Study(ABC, Generic[Place]):
         """Prepare all scenes, then go seed by seed, so that a whole table of the first seed exists early."""
         self.perceptual = perceptual_weights(self.console) is not None
         self.open_scenes()
-        for seed in range(self.seeds):
+        for seed in range(self.first_seed, self.first_seed + self.seeds):
             self.run_seed(seed)
 
     @abstractmethod
