@@ -118,6 +118,19 @@ def test_the_commands_of_the_papers_tables_ask_for_what_there_is(name: str) -> N
         assert choose_budgets(options["--budgets"], 100) == [5, 10, 15, 25, 50, 100]
 
 
+def test_pieces_of_a_table_add_up_and_others_do_not() -> None:
+    whole = json.loads((paper_tables.RESULTS / "paper-steps.json").read_text())
+    first = {**whole, "cells": [cell for cell in whole["cells"] if cell["seed"] == 0]}
+    again = [{**cell, "psnr": 0.0} for cell in first["cells"] if cell["row"] == "paper"]
+    piece = {**whole, "cells": [*again, *({**cell, "seed": 7} for cell in first["cells"])], "seeds": 2}
+    both = paper_tables.added(first, piece)
+    assert both["seeds"] == 2 and len(both["cells"]) == 2 * len(first["cells"])
+    redone = [cell for cell in both["cells"] if cell["psnr"] == 0.0]
+    assert [(cell["row"], cell["seed"]) for cell in redone] == [("paper", 0)] * len(again)
+    with pytest.raises(ValueError, match="resolution"):
+        paper_tables.added(first, {**piece, "resolution": "256x256"})
+
+
 def test_the_papers_numbers_are_the_papers() -> None:
     """Implementation details of the paper: weights of the six losses, reward, "RGB absolute loss"."""
     settings = settings_of(ROWS["paper"], resolve("draft", {}, environment={}), {})

@@ -4,21 +4,25 @@
     python -m tools.paper_tables b      # quality against the number of traced views
     python -m tools.paper_tables c      # figures 7a, 7b and 7c
 
-Each is one run of `dnrpipe ablate` or `dnrpipe bench-select` that goes on where it stopped; its results are copied to
-docs/results/, also after Ctrl-C. What stands after `--` goes to that command and wins:
+Each is one run of `dnrpipe ablate` or `dnrpipe bench-select` that goes on where it stopped. Its results are added to
+those in docs/results/, also after Ctrl-C, so that a table may be made in pieces, also on several machines. What stands
+after `--` goes to that command and wins:
 
-    python -m tools.paper_tables a -- --seeds 1 --scenes furniture
+    python -m tools.paper_tables a -- --rows paper-table --seeds 1 --first-seed 2
     python -m tools.paper_tables a --size 256 --results paper-steps-256.json      # on a GPU
 """
 
 from __future__ import annotations
 
 import argparse
-import shutil
+import json
 import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+from dnrtrain.atomic import write_json
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
 COMMON = ("--preset", "paper-128", "--scenes", "furniture,bricks,microphone", "--seeds", "3")
@@ -48,6 +52,31 @@ TABLES = {
     "c": Table(("ablate", *COMMON, "--rows", "fig7a,fig7b,fig7c"), "paper-figure7.json", "rows"),
 }
 
+PLACE = ("scene", "row", "pool", "budget", "policy", "seed")
+"""What tells the cells of a table apart."""
+SAME = ("schema", "preset", "resolution", "seconds", "spp", "device", "threads", "budget", "candidates")
+"""What cells of one table have in common."""
+
+
+def added(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
+    """Results with the cells of both, those of ``new`` where both have one. Raises ValueError: not of one table."""
+    for name in SAME:
+        if old.get(name) != new.get(name):
+            raise ValueError(f"{name} is {old.get(name)} there and {new.get(name)} here")
+    places = {_place(cell): cell for cell in (*old["cells"], *new["cells"])}
+    whole = {**new, "cells": list(places.values()), "seeds": len({cell["seed"] for cell in places.values()})}
+    for name in ("scenes", "pools", "budgets", "raster_engines"):
+        if name in new:
+            whole[name] = list(dict.fromkeys((*old[name], *new[name])))
+    for name in ("rows", "policies"):
+        if name in new:
+            whole[name] = {**old[name], **new[name]}
+    return whole
+
+
+def _place(cell: dict[str, Any]) -> tuple[Any, ...]:
+    return tuple(cell.get(name) for name in PLACE)
+
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -65,16 +94,25 @@ def main() -> int:
         out = out.with_name(f"{table.folder}-{given.size}")
         for key in ("cameras.width", "cameras.height", "model.texture_size"):
             size += ["--set", f"{key}={given.size}"]
-    target = RESULTS / (given.results or table.results)
+    target, made = RESULTS / (given.results or table.results), out / "results.json"
+    made.unlink(missing_ok=True)  # another table's, or of a run that this one goes on with
+    command = [sys.executable, "-m", "dnrpipe.cli", *table.command, *size, *more, "--out", str(out)]
     try:
-        command = [sys.executable, "-m", "dnrpipe.cli", *table.command, *size, *more, "--out", str(out)]
-        return subprocess.run(command, check=False).returncode
-    finally:
-        made = out / "results.json"
-        if made.exists():
-            RESULTS.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(made, target)
-            print(f"copied to {target}")
+        code = subprocess.run(command, check=False).returncode
+    except KeyboardInterrupt:
+        code = 130
+    if made.exists():
+        results = json.loads(made.read_text())
+        try:
+            if target.exists():
+                results = added(json.loads(target.read_text()), results)
+        except ValueError as error:
+            print(f"{target}: not of this table ({error}); name another with --results", file=sys.stderr)
+            return 2
+        RESULTS.mkdir(parents=True, exist_ok=True)
+        write_json(target, results)
+        print(f"{len(results['cells'])} cells: {target}")
+    return code
 
 
 if __name__ == "__main__":
