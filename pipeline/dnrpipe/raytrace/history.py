@@ -34,7 +34,7 @@ from .base_renderer import CHAIN
 from .recorded import Recorded
 from .sensors import opaque_camera
 
-MOST_DIFFUSE, MOST_MIRRORED, MOST_GLOSSY, MOST_UNEVEN = 2.0, 16.0, 2.0, 1.0
+MOST_DIFFUSE, MOST_MIRRORED, MOST_GLOSSY, MOST_UNEVEN = 3.0, 16.0, 3.0, 2.0
 """Rays of earlier frames that count: for D, for S that follows V, for S that follows P, and at most where the corners
 lie on several surfaces. Each lookup blurs a little, and light moves on what is not a mirror."""
 MOST_RESTING = 512.0
@@ -47,7 +47,7 @@ FLAT = 0.9998
 """Least cosine between normals of neighbouring pixels of a flat mirror: about a degree."""
 DISPLACED = 4.0
 """Pixels, as large as they are at the end of a path, up to which two ends show the same."""
-SPREAD, REACH = 1.5, 2
+SPREAD, REACH = 2.5, 2
 """Standard deviations of the neighbourhood within which S stays; pixels that it reaches to each side."""
 LEAST_WEIGHT = 0.2
 """Share of the corners, by their distance, that must lie on the same surface."""
