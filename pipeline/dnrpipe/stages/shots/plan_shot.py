@@ -58,10 +58,14 @@ def weigh(
     rays = run.settings.base.samples
     counts = [*(n for n in FEWER if n < rays), rays]
     base, neural = ([Way(name=name, spp=n) for n in counts] for name in ("base", "neural"))
-    measured = pilot.measure(shipped_renderer(run, tracer.common.background, trust=1.0), [*base, *neural])
-    trust, corrected = pilot.trusted(neural)
-    run.console.say(_trust_told(trust))
-    ours = measured[: len(base)] + (corrected if trust or wanted.way == "neural" else [])
+    if wanted.way == "base":
+        neural = []
+    ours = pilot.measure(shipped_renderer(run, tracer.common.background, trust=1.0), [*base, *neural])[: len(base)]
+    trust = 0.0
+    if neural:
+        trust, corrected = pilot.trusted(neural)
+        run.console.say(_trust_told(trust))
+        ours += corrected if trust or wanted.way == "neural" else []
     options += [baked_option(found, options, shape) for found in ours]
     if _wants_more(options, wanted) and wanted.way in (None, "neural"):
         found = worth(run, shape.still)

@@ -54,8 +54,8 @@ STEPS = (100, 300)
 SAMPLE_COUNTS = (1, 4, 16, 64)
 METHODS = ("raw", "clean16-fast", "clean16")
 """Samples per pixel of path tracing, and what the denoiser is given (`frames.baselines`)."""
-LIGHT_PATHS = 2 * 512 * 512 * 128
-"""Paths of a bake of light that the pilot can afford: twice what ``light_spp = auto`` asks for at any size."""
+LIGHT_PATHS = 2048 * 2048 * 16
+"""Paths of a bake of light that the pilot can afford: what ``light_spp = auto`` asks for at 2048² texels."""
 TIMEOUT = 600.0
 """Seconds after which a part counts as hung: ten times what the whole pilot should take."""
 
