@@ -184,7 +184,7 @@ def beside(root: Path, views: Sequence[View], pairs: Sequence[tuple[int, int]]) 
     rungs: list[dict[str, Any]] = []
     for denoiser, ladder in LADDERS.items():
         ways = [Way.model_validate({"name": "path", "spp": spp, "quality": denoiser}) for spp in ladder]
-        for part in (ways[:AT_ONCE], ways[AT_ONCE:]):
+        for part in filter(None, (ways[:AT_ONCE], ways[AT_ONCE:])):
             for way, seconds in zip(part, traced([(way, 0) for way in part]), strict=True):
                 found = figures(lambda n, way=way: path_of(way, 0, n))
                 rungs.append({"spp": way.spp, "quality": denoiser, "frame": seconds, **found})
