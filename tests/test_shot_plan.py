@@ -14,8 +14,8 @@ from dnrpipe.stages.shots.check import held_out
 from dnrpipe.stages.shots.frame_tasks import Way
 from dnrpipe.stages.shots.open_shot import parse_size, resized, told_frames
 from dnrpipe.stages.shots.options import Option, Wanted, choose
-from dnrpipe.stages.shots.pilot import Measured, best_mix, between
-from dnrpipe.stages.shots.plan_shot import Shape, baked_option, moving_way, path_option
+from dnrpipe.stages.shots.pilot import Measured, best_mix, reckoned
+from dnrpipe.stages.shots.plan_shot import Shape, baked_option, moving_way, outdone, path_option
 from dnrpipe.stages.shots.records import ShotFrame
 from dnrpipe.stages.shots.render_frames import frame_tasks
 
@@ -61,14 +61,30 @@ def test_as_few_rays_as_cost_next_to_nothing() -> None:
     assert choose([few, smeared, most], Wanted())[0] is most, "PSNR alone is not enough"
 
 
-def test_rungs_between_those_measured() -> None:
+def test_rungs_between_and_beyond_those_measured() -> None:
     low = Measured(Way(name="path", spp=4), pixel=1.0, start=2.0, psnr=30.0, lpips=0.1)
-    high = Measured(Way(name="path", spp=16), pixel=4.0, start=1.0, psnr=34.0, lpips=None)
-    rungs = between([high, low])
-    assert [rung.way.spp for rung in rungs] == [4, 8, 16]
-    assert rungs[1].psnr == pytest.approx(32.0) and rungs[1].pixel == pytest.approx(2.0)
+    high = Measured(Way(name="path", spp=16), pixel=4.0, start=1.0, psnr=34.0, lpips=0.025)
+    rungs = reckoned([high, low], 64)
+    assert [rung.way.spp for rung in rungs] == [4, 8, 16, 32, 64]
     assert rungs[0] is low and rungs[2] is high
-    assert rungs[1].lpips is None
+    assert [rung.psnr for rung in rungs] == pytest.approx([30, 32, 34, 36, 38])
+    assert [rung.pixel for rung in rungs] == pytest.approx([1, 2, 4, 8, 16])
+    assert [rung.lpips for rung in rungs] == pytest.approx([0.1, 0.05, 0.025, 0.0125, 0.00625])
+    blind = reckoned([low, Measured(Way(name="path", spp=16), pixel=4.0, start=1.0, psnr=34.0, lpips=None)], 16)
+    assert [rung.lpips for rung in blind] == [0.1, None, None]
+
+
+def test_baked_light_is_given_up_where_path_tracing_is_far_ahead() -> None:
+    shape = Shape(still=100, moving=0, pixels=1000, convert=5.0)
+    ours = Measured(Way(name="base", spp=8), pixel=0.001, start=0.0, psnr=27.0, lpips=0.1)
+
+    def path(pixel: float, psnr: float, lpips: float) -> Option:
+        return path_option(Measured(Way(name="path", spp=1), pixel, 0.0, psnr, lpips), shape)
+
+    far = path(0.0005, 30.0, 0.03)
+    assert outdone(ours, [far], shape) is far
+    for near in (path(0.0009, 30.0, 0.03), path(0.0005, 28.0, 0.03), path(0.0005, 30.0, 0.09)):
+        assert outdone(ours, [near], shape) is None, "fewer rays or the corrector might win"
 
 
 def test_seconds_of_a_shot_add_up() -> None:

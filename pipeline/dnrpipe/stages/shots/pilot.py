@@ -8,9 +8,10 @@ finished frames (`check`) says how far off the windows were.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,12 +39,14 @@ FRAMES, SIZE = 2, (192, 108)
 """Frames of the pilot, and pixels of a window."""
 PLACES = ((0.2, 0.7), (0.75, 0.4))
 """Of the windows in a frame."""
-LADDER, QUICK = (1, 4, 16, 64), (1, 4, 16)
-"""Samples per pixel of path-traced pictures, and of those that are denoised quickly; those between are interpolated."""
+LADDER, MOST = (1, 4, 16), 64
+"""Samples per pixel of path-traced pictures; and the most that are reckoned from them (`reckoned`)."""
 REFERENCE = Way(name="path", spp=128)
 REFERENCE_SEED = 7
 LEAD = 4
 """Frames before a frame of the pilot that it remembers."""
+LEAST_LPIPS = 1e-6
+"""Below it, pictures are the same."""
 
 
 @dataclass(frozen=True)
@@ -80,8 +83,12 @@ class Pilot:
         self.references: dict[int, Any] = {}
         self.rows: dict[Way, list[_Window]] = {}
 
-    def measure(self, renderer: Renderer, ways: Sequence[Way]) -> list[Measured]:
+    def measure(
+        self, renderer: Renderer, ways: Sequence[Way], enough: Callable[[Measured], bool] = lambda found: False
+    ) -> list[Measured]:
         """The ways on the windows, one after the other in a process of its own.
+
+        enough: told each way when it is measured; those after it are left out where it says so.
 
         Raises UserError: a frame failed twice.
         """
@@ -98,9 +105,11 @@ class Pilot:
                     tasks.append(self._task(way, at, place, earlier, len(tasks)))
         found: dict[Way, list[_Window]] = {}
         label = "pilot: " + ("path tracing" if ways[-1].name == "path" else "base image and network")
-        with self.run.console.bar(label, len(tasks)) as bar:
-            outcomes = frame_outcomes(self.run, renderer, tasks, "pilot")
-            for (way, key, counts), task, outcome in zip(keys, tasks, outcomes, strict=True):
+        with (
+            closing(frame_outcomes(self.run, renderer, tasks, "pilot")) as outcomes,
+            self.run.console.bar(label, len(tasks)) as bar,
+        ):
+            for (way, key, counts), task, outcome in zip(keys, tasks, outcomes, strict=False):
                 if outcome.result is None:
                     raise UserError(f"{label} failed twice: {outcome.error}; see {self.run.log}")
                 self.run.book(
@@ -117,6 +126,9 @@ class Pilot:
                     spent = outcome.result["seconds"] + outcome.result["write_seconds"]
                     found.setdefault(way, []).append(_Window(key, picture, spent, outcome.seconds - spent))
                 bar.advance(note=way.told)
+                done = len(found.get(way, [])) == len(self.windows)
+                if done and self.references and enough(self._measured(way, found[way])):
+                    break
         if REFERENCE in found and not self.references:
             self.references = {row.key: row.picture for row in found.pop(REFERENCE)}
         self.rows |= found
@@ -209,26 +221,35 @@ def shown(display: DisplayTransform, path: Path) -> Any:
     return over_white(display, np.stack([channels[name] for name in COLOUR], axis=-1)).clamp(0, 1)
 
 
-def between(measured: Sequence[Measured]) -> list[Measured]:
-    """Path tracing at all powers of two from the least to the most samples measured; those that were not are
-    interpolated: quality by the logarithm of the samples, seconds by the samples."""
+def reckoned(measured: Sequence[Measured], most: int) -> list[Measured]:
+    """Path tracing at all powers of two from the least samples measured to ``most``. Those that were not measured lie
+    on the line through the two next to them: decibels and the logarithm of LPIPS by the logarithm of the samples,
+    seconds by the samples. (`bricks`, 64 samples by 4 and 16: 38.05 dB, .0061; measured 38.08, .0050.)
+
+    measured: two or more, of several samples.
+    """
     rungs = sorted(measured, key=lambda found: found.way.spp)
-    result: list[Measured] = []
-    for low, high in pairwise(rungs):
-        result.append(low)
-        spp = 2 * low.way.spp
-        while spp < high.way.spp:
-            t = math.log2(spp / low.way.spp) / math.log2(high.way.spp / low.way.spp)
-            share = (spp - low.way.spp) / (high.way.spp - low.way.spp)
-            lpips = None if low.lpips is None or high.lpips is None else low.lpips + t * (high.lpips - low.lpips)
-            result.append(
-                Measured(
-                    way=low.way.model_copy(update={"spp": spp}),
-                    pixel=low.pixel + share * (high.pixel - low.pixel),
-                    start=low.start,
-                    psnr=low.psnr + t * (high.psnr - low.psnr),
-                    lpips=lpips,
-                )
-            )
-            spp *= 2
-    return [*result, *rungs[-1:]]
+    known = [rung.way.spp for rung in rungs]
+    result = []
+    spp = known[0]
+    while spp <= most:
+        place = min(bisect_left(known, spp), len(rungs) - 1)
+        exact = rungs[place] if known[place] == spp else None
+        result.append(exact or _on_line(rungs[place - 1], rungs[place], spp))
+        spp *= 2
+    return result
+
+
+def _on_line(low: Measured, high: Measured, spp: int) -> Measured:
+    t = math.log2(spp / low.way.spp) / math.log2(high.way.spp / low.way.spp)
+    share = (spp - low.way.spp) / (high.way.spp - low.way.spp)
+    lpips = None
+    if low.lpips is not None and high.lpips is not None:
+        lpips = max(low.lpips, LEAST_LPIPS) ** (1 - t) * max(high.lpips, LEAST_LPIPS) ** t
+    return Measured(
+        way=low.way.model_copy(update={"spp": spp}),
+        pixel=low.pixel + share * (high.pixel - low.pixel),
+        start=low.start,
+        psnr=low.psnr + t * (high.psnr - low.psnr),
+        lpips=lpips,
+    )

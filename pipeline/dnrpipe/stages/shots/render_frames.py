@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -128,7 +128,9 @@ def pictures(folder: Path, frames: Sequence[ShotFrame]) -> Iterator[np.ndarray]:
             yield np.asarray(image.convert("RGB"))
 
 
-def frame_outcomes(run: Run, renderer: Renderer, tasks: Sequence[FrameTask], label: str) -> Iterator[TaskResult]:
+def frame_outcomes(
+    run: Run, renderer: Renderer, tasks: Sequence[FrameTask], label: str
+) -> Generator[TaskResult, None, None]:
     """Render frames to be measured, each with the whole machine -> their outcomes, in order, whatever is on disk."""
     return run_tasks(
         FRAME_WORKER,
