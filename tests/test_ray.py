@@ -239,6 +239,7 @@ def _require_the_same(here: Path, there: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.robustness
 def test_a_run_gives_the_same_pictures_selection_and_weights(cluster: Cluster, tmp_path: Path) -> None:
     """The whole pipeline, here and on the cluster; its nodes see no workspace but what is sent to them."""
     subprocess.run([sys.executable, "-c", BUILD, str(tmp_path)], check=True, capture_output=True)

@@ -78,9 +78,10 @@ def main() -> None:
         ):
             continue
         root = root_of(options.folder, scene.stem, options.size).resolve()
-        rows.append({"size": options.size, **measured(scene.resolve(), root, size, options.frames)})
-        write_json(options.out, {"machine": processor(), "rows": sorted(rows, key=lambda row: row["scene"])})
-    print(markdown({"machine": processor(), "rows": rows}))
+        row = measured(scene.resolve(), root, size, options.frames)
+        rows.append({"machine": processor(), "size": options.size, **row})
+        write_json(options.out, {"rows": sorted(rows, key=lambda row: row["scene"])})
+    print(markdown({"rows": rows}))
 
 
 def measured(scene: Path, root: Path, size: tuple[int, int], frames: int) -> dict[str, Any]:
@@ -260,18 +261,23 @@ def as_good(rung: dict[str, Any], own: dict[str, Any], names: Sequence[str]) -> 
 
 
 def markdown(results: dict[str, Any]) -> str:
-    """Seconds and quality of every shot, and path tracing at equal quality."""
-    if not results["rows"]:
-        return "Not measured yet."
+    """Seconds and quality of every shot, and path tracing at equal quality: a table for each machine."""
+    by_machine: dict[str, list[dict[str, Any]]] = {}
+    for row in results["rows"]:
+        by_machine.setdefault(row["machine"], []).append(row)
+    return "\n\n".join(_table(machine, rows) for machine, rows in by_machine.items()) or "Not measured yet."
+
+
+def _table(machine: str, rows: Sequence[dict[str, Any]]) -> str:
     lines = [
-        f"Measured on {results['machine']}.",
+        f"Measured on {machine}.",
         "",
         "| scene | size | way, rays | before the first frame, s | a frame, s | dB | LPIPS | FLIP | flicker"
         " | path tracing as good (dB and LPIPS) | its frame, s | its flicker"
         " | 240 frames, s | path tracing, s | ratio | N* at equal PSNR | at equal LPIPS |",
         "|---" * 17 + "|",
     ]
-    for row in results["rows"]:
+    for row in rows:
         own, rung = row["ours"], equal_rung(row, ("psnr", "lpips"))
         ours = row["before"] + REEL * row["frame"]
         way = f"{row['chosen']['way']['name']} {row['chosen']['way']['spp']}"

@@ -22,6 +22,8 @@ from .workspace import digest
 
 PACKAGES = ("bpy", "mitsuba", "drjit")
 DRIVERS = ("libEGL*", "libGL*", "libLLVM*", "libcuda*", "libnvidia-gl*", "dri/*")
+VECTORS = {"avx512f": "AVX-512", "avx2": "AVX2"}
+"""Names of instruction sets by their flags, the widest first."""
 VARIABLES = ("DISPLAY", "LIBGL_", "EGL_", "__EGL_", "__GLX_", "MESA_", "GALLIUM_", "CUDA_VISIBLE_DEVICES", "DRJIT_")
 """Beginnings of the names of environment variables that choose a driver."""
 
@@ -59,12 +61,17 @@ def machine_fingerprint() -> str:
 
 
 def processor() -> str:
-    """The processor's name; the architecture's where the system does not tell it."""
+    """The processor's name and widest vectors, which decide how fast kernels are; the architecture's name where the
+    system does not tell it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
         return platform.processor()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
+    told = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
+    flags = told.get("flags", "").split()
+    vectors = next((name for flag, name in VECTORS.items() if flag in flags), None)
+    name = told.get("model name", platform.machine())
+    return f"{name}, {vectors}" if vectors else name
 
 
 def _path(name: str) -> Path:
