@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+from dnrpipe.core.machine import processor
 from dnrpipe.studies.frames.ours import BASE, NEURAL
 from dnrpipe.studies.frames.pareto_front import frontier
 from dnrtrain.atomic import atomic_path, write_json
@@ -43,20 +44,11 @@ def _made() -> dict[str, Any]:
         "date": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
         "commit": git("rev-parse", "--short", "HEAD"),
         "changed_files": len(git("status", "--porcelain").splitlines()),
-        "machine": f"{_processor()}, {os.cpu_count()} cores, {platform.system()}",
+        "machine": f"{processor()}, {os.cpu_count()} cores, {platform.system()}",
         "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "python": platform.python_version(),
         "versions": {name: importlib.metadata.version(name) for name in PACKAGES},
     }
-
-
-def _processor() -> str:
-    information = Path("/proc/cpuinfo")
-    if information.exists():
-        for line in information.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
 
 
 def markdown(record: dict[str, Any]) -> str:

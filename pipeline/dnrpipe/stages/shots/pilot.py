@@ -84,16 +84,18 @@ class Pilot:
         self.rows: dict[Way, list[_Window]] = {}
 
     def measure(
-        self, renderer: Renderer, ways: Sequence[Way], enough: Callable[[Measured], bool] = lambda found: False
+        self, renderer: Renderer, ways: Sequence[Way], hopeless: Callable[[Measured], bool] | None = None
     ) -> list[Measured]:
         """The ways on the windows, one after the other in a process of its own.
 
-        enough: told each way when it is measured; those after it are left out where it says so.
+        hopeless: told the first way once it is measured; the others are left out where it says so. (Asking after each
+            way would disturb the seconds of the next.) The references must have been traced before.
 
         Raises UserError: a frame failed twice.
         """
         tasks: list[FrameTask] = []
         keys: list[tuple[Way, int, bool]] = []  # way, window, whether it is measured
+        first = ways[0]
         if not self.references:
             ways = [REFERENCE, *ways]
         for way in ways:
@@ -109,7 +111,7 @@ class Pilot:
             closing(frame_outcomes(self.run, renderer, tasks, "pilot")) as outcomes,
             self.run.console.bar(label, len(tasks)) as bar,
         ):
-            for (way, key, counts), task, outcome in zip(keys, tasks, outcomes, strict=False):
+            for (way, key, counts), task, outcome in zip(keys, tasks, outcomes, strict=True):
                 if outcome.result is None:
                     raise UserError(f"{label} failed twice: {outcome.error}; see {self.run.log}")
                 self.run.book(
@@ -126,8 +128,8 @@ class Pilot:
                     spent = outcome.result["seconds"] + outcome.result["write_seconds"]
                     found.setdefault(way, []).append(_Window(key, picture, spent, outcome.seconds - spent))
                 bar.advance(note=way.told)
-                done = len(found.get(way, [])) == len(self.windows)
-                if done and self.references and enough(self._measured(way, found[way])):
+                done = way == first and len(found.get(way, [])) == len(self.windows)
+                if done and hopeless is not None and hopeless(self._measured(way, found[way])):
                     break
         if REFERENCE in found and not self.references:
             self.references = {row.key: row.picture for row in found.pop(REFERENCE)}

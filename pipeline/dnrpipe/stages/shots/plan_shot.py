@@ -58,8 +58,8 @@ def weigh(
     if why := _no_baked_light(run, frames, shape, ladder, wanted):
         run.console.say(f"baked light is not weighed: {why}")
         return options, None
-    most = run.settings.base.samples
-    counts = [*(n for n in FEWER if n < most), most]
+    rays = run.settings.base.samples
+    counts = [*(n for n in FEWER if n < rays), rays]
     base, neural = ([Way(name=name, spp=n) for n in counts] for name in ("base", "neural"))
     if wanted.way == "base":
         neural = []
@@ -67,16 +67,16 @@ def weigh(
 
     def hopeless(found: Measured) -> bool:
         aimless = wanted.way is None and wanted.psnr is None and wanted.lpips is None
-        return aimless and found.way == base[-1] and outdone(found, options, shape) is not None
+        return aimless and outdone(found, options, shape) is not None
 
     measured = pilot.measure(renderer, [base[-1], *base[:-1], *neural], hopeless)  # the best base image first
     ours = sorted(measured[: len(base)], key=lambda found: found.way.spp)
-    if len(measured) == 1 < len(base):
-        run.console.say("baked light is not weighed further: path tracing is better in less time")
-    elif neural:
+    if len(measured) > len(base):
         trust, corrected = pilot.trusted(neural)
         run.console.say(_trust_told(trust))
         ours += corrected if trust or wanted.way == "neural" else []
+    elif neural:
+        run.console.say("baked light is not weighed further: path tracing is better in less time")
     options += [baked_option(found, options, shape) for found in ours]
     if _wants_more(options, wanted) and wanted.way in (None, "neural"):
         found = worth(run, shape.still)
