@@ -16,7 +16,7 @@ from . import plugins
 from .auxiliary import auxiliary_integrator
 from .recorded import without_collection
 from .second_targets import second_targets
-from .sensors import scaled_lens, scaled_view, sensor_dict, unit_scale
+from .sensors import row_of_sensors, scaled_lens, scaled_view, sensor_dict, unit_scale
 from .tasks import BundleCommon
 from .visibility import camera_integrator
 
@@ -89,8 +89,16 @@ class Engine:
 
     def sensor(self, view: View, lens: dict[str, float] | None = None) -> Any:
         """A Mitsuba sensor for the view, in the bundles' units."""
+        return self.mi.load_dict(self._camera(view, lens))
+
+    def sensor_row(self, views: Sequence[View], lenses: Sequence[dict[str, float] | None]) -> Any:
+        """One for views of the same size, whose pictures it shows side by side."""
+        cameras = [self._camera(view, lens) for view, lens in zip(views, lenses, strict=True)]
+        return self.mi.load_dict(row_of_sensors(cameras))
+
+    def _camera(self, view: View, lens: dict[str, float] | None) -> dict[str, Any]:
         view, lens = scaled_view(view, self.unit_scale), scaled_lens(lens, self.unit_scale)
-        return self.mi.load_dict(sensor_dict(self.mi, view, lens))
+        return sensor_dict(self.mi, view, lens)
 
     def render(self, scene: Any, **options: Any) -> Any:
         """``mi.render`` with no garbage collection meanwhile."""
@@ -129,7 +137,7 @@ class Engine:
             bundle: one of the engine's.
             integrator: of `integrator`.
             sensor: of `sensor`, for the same view.
-            view: in scene units.
+            view: in scene units; its size alone counts.
             spp: samples per pixel.
             seed: its lower 20 bits count.
         """

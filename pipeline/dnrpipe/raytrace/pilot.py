@@ -123,20 +123,33 @@ class Worker:
         }
 
     def _pictures(self, config: PilotConfig, depth: int, views: list[PilotView], spp: int) -> np.ndarray:
-        """[V, 2, H, W, 4]: two halves of each view; the seeds depend on view and half only."""
-        rows = [
-            [self._picture(config, depth, entry, spp, 2 * index + half) for half in range(2)]
-            for index, entry in enumerate(views)
-        ]
-        return np.array(rows)
+        """[V, 2, H, W, 4]: two halves of each view, all in one launch; a pixel's numbers depend on its place alone."""
+        engine = self.engines[config.variant]
+        integrator = self._integrator(config, depth)
+        both = [entry for entry in views for _ in range(2)]
+        sensor = engine.sensor_row(
+            [entry.view for entry in both], [entry.lens if config.lenses else None for entry in both]
+        )
+        view = both[0].view
+        row = view.model_copy(update={"width": view.width * len(both)})
+        picture = self._counted(engine.frame(config.bundle, integrator, sensor, row, spp, 0)[0])
+        side_by_side = picture.reshape(view.height, len(views), 2, view.width, 4)
+        return side_by_side.transpose(1, 2, 0, 3, 4)
 
     def _picture(self, config: PilotConfig, depth: int, entry: PilotView, spp: int, seed: int) -> np.ndarray:
         """[H, W, 4] linear Rec.709, premultiplied."""
         engine = self.engines[config.variant]
-        engine.mi.set_variant(engine.variant)
-        integrator, _ = engine.integrator(config.bundle, config.integrator, depth, config.passes)
+        integrator = self._integrator(config, depth)
         sensor = engine.sensor(entry.view, entry.lens if config.lenses else None)
-        picture, _ = engine.frame(config.bundle, integrator, sensor, entry.view, spp, seed)
+        return self._counted(engine.frame(config.bundle, integrator, sensor, entry.view, spp, seed)[0])
+
+    def _integrator(self, config: PilotConfig, depth: int) -> Any:
+        engine = self.engines[config.variant]
+        engine.mi.set_variant(engine.variant)
+        return engine.integrator(config.bundle, config.integrator, depth, config.passes)[0]
+
+    def _counted(self, picture: np.ndarray) -> np.ndarray:
+        """The picture with 0 where it was not finite, which is counted."""
         picture, lost = masked(picture)
         self.masked += lost
         return picture

@@ -64,6 +64,17 @@ def sensor_dict(mi: Any, view: View, lens: dict[str, float] | None = None) -> di
     return {**common, "type": "dnr_camera", **intrinsics, **(lens or {})}
 
 
+def row_of_sensors(cameras: list[dict[str, Any]]) -> dict[str, Any]:
+    """Sensor whose picture shows those of ``cameras``, dictionaries of `sensor_dict` of one size, side by side.
+
+    Small pictures cost what recording and starting a kernel costs; so they are rendered in one launch
+    (https://mitsuba.readthedocs.io/en/stable/src/generated/plugins_sensors.html, "batch").
+    """
+    film = cameras[0]["film"] | {"width": cameras[0]["film"]["width"] * len(cameras)}
+    named = {f"camera{i}": camera for i, camera in enumerate(cameras)}
+    return {"type": "batch", "film": film, "sampler": cameras[0]["sampler"], **named}
+
+
 def unit_scale(bundle: Path) -> float:
     """What the bundle's lengths are multiples of the scene's by; 1 for scenes of usual size."""
     with bundle.open(encoding="utf-8") as file:
