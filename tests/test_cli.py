@@ -188,6 +188,16 @@ def test_help_is_cheap_and_has_examples(tmp_path: Path) -> None:
     assert done.stdout.strip().endswith("[]"), done.stdout
 
 
+def test_commands_that_train_nothing_load_no_torch() -> None:
+    """It takes one to three seconds; so do Blender and Mitsuba, which have processes of their own."""
+    code = (
+        "import sys; import dnrpipe.stages.session, dnrpipe.stages.shots.make_shot;"
+        "print(sorted({'torch', 'bpy', 'mitsuba'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
 def test_manifest_round_trip(workspace: Workspace) -> None:
     workspace.finish_stage("prepare", fingerprint="f", output="o", seconds=1.5, detail={"views": {"train": 3}})
     again = Workspace.open(workspace.root)

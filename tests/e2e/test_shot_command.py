@@ -14,7 +14,7 @@ pytest.importorskip("bpy")
 from tests import shot_scenes
 
 from dnrpipe.core.scene_files import read_summary
-from dnrpipe.stages.shots.frame_worker import LAYERS
+from dnrpipe.stages.shots.frame_tasks import LAYERS
 from dnrtrain.exr import read_exr, read_metadata
 
 pytestmark = [pytest.mark.slow, pytest.mark.e2e]

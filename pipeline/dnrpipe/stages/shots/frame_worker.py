@@ -1,7 +1,7 @@
 """The process that renders a shot's frames: scene, kernels and network are kept between them.
 
-A frame's file holds scene-linear Rec.709, premultiplied (see `LAYERS`); its picture goes through the scene's view
-transform.
+A frame's file holds scene-linear Rec.709, premultiplied (see `frame_tasks.LAYERS`); its picture goes through the
+scene's view transform.
 """
 
 from __future__ import annotations
@@ -30,14 +30,8 @@ from dnrtrain.exr import write_exr
 from dnrtrain.model import render
 
 from ..trainer import torch_device
-from .frame_tasks import FrameAnswer, FrameCommon, FrameTask
+from .frame_tasks import COLOUR, HALF, LAYERS, FrameAnswer, FrameCommon, FrameTask
 
-COLOUR = ("R", "G", "B", "A")
-LAYERS = (*COLOUR, "depth.Z", "normal.X", "normal.Y", "normal.Z", "albedo.R", "albedo.G", "albedo.B", "object.Id")
-"""Channels of a frame. Normals are of world space; all but colour and albedo are of the ray through the pixel's
-centre; albedo is the diffuse reflectance."""
-HALF = ("R", "G", "B", "A", "normal.X", "normal.Y", "normal.Z", "albedo.R", "albedo.G", "albedo.B")
-"""Of them, those that are written in 16 bits."""
 GUIDE_RAYS = 16
 """Primary rays per pixel of the denoiser's auxiliary images: clean."""
 MAX_RAYS = 1 << 22

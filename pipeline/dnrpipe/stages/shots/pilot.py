@@ -26,8 +26,7 @@ from ...core.images import over_white
 from ...core.scene_files import read_frame
 from ..stage import Run
 from ..trust import SHARES
-from .frame_tasks import FrameTask, Way
-from .frame_worker import COLOUR
+from .frame_tasks import COLOUR, FrameTask, Way
 from .records import ShotFrame
 from .render_frames import frame_outcomes
 from .renderers import Renderer
