@@ -94,24 +94,25 @@ def _clear(scene: bpy.types.Scene) -> Clear:
 
 def _tree(depsgraph: Any) -> Any:
     """A tree of all visible triangles in world space; None of more than TREE_TRIANGLES."""
-    corners, total = list[np.ndarray](), 0
+    points, faces, vertices, triangles = list[np.ndarray](), list[np.ndarray](), 0, 0
     for instance in depsgraph.object_instances:
         if not (instance.show_self and instance.object.type == "MESH"):
             continue
         mesh = instance.object.data
         mesh.calc_loop_triangles()
-        total += len(mesh.loop_triangles)
-        if total > TREE_TRIANGLES:
+        triangles += len(mesh.loop_triangles)
+        if triangles > TREE_TRIANGLES:
             return None
         places, index = np.empty(3 * len(mesh.vertices), np.float32), np.empty(3 * len(mesh.loop_triangles), np.int32)
         mesh.vertices.foreach_get("co", places)
         mesh.loop_triangles.foreach_get("vertices", index)
         matrix = np.array(instance.matrix_world, np.float64)
-        corners.append(places.reshape(-1, 3)[index] @ matrix[:3, :3].T + matrix[:3, 3])
-    if not total:
+        faces.append(index.reshape(-1, 3) + vertices)
+        points.append(places.reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3])
+        vertices += len(mesh.vertices)
+    if not triangles:
         return None
-    faces = np.arange(3 * total).reshape(-1, 3)
-    return BVHTree.FromPolygons(np.concatenate(corners).tolist(), faces.tolist(), all_triangles=True)
+    return BVHTree.FromPolygons(np.concatenate(points).tolist(), np.concatenate(faces).tolist(), all_triangles=True)
 
 
 def _tries(found: Sequence[Standpoint]) -> Iterator[None]:
@@ -129,7 +130,7 @@ def _about(camera: np.ndarray, clear: Clear, reach: float, rng: np.random.Genera
         start = places[int(rng.integers(len(places)))]  # from any place found: round corners, too
         way = _direction(rng)
         ahead = min(clear(start, way), 2 * reach)
-        place = start + way * ahead * FARTHEST * math.sqrt(rng.uniform())
+        place = start + way * ahead * FARTHEST * math.sqrt(rng.random())
         target = _seen_from(place, clear, reach, rng)
         if target is None or _is_tight(place, clear, reach):
             continue
@@ -165,7 +166,7 @@ def _along(
             continue
         target = pose[:3, 3] + forward * ahead
         way = _direction(rng)
-        aside = min(clear(pose[:3, 3], way) * FARTHEST, STRAY * reach) * rng.uniform() ** (1 / 3)
+        aside = min(clear(pose[:3, 3], way) * FARTHEST, STRAY * reach) * rng.random() ** (1 / 3)
         place = pose[:3, 3] + way * aside
         gaze = target - place
         distance = float(np.linalg.norm(gaze))
@@ -192,7 +193,7 @@ def _rounded(point: np.ndarray) -> Any:
 
 def _direction(rng: np.random.Generator) -> np.ndarray:
     """A unit vector, evenly over the sphere."""
-    z, turn = rng.uniform(-1, 1), rng.uniform(0, 2 * math.pi)
+    z, turn = 2 * rng.random() - 1, 2 * math.pi * rng.random()  # `uniform` takes ten times longer
     ring = math.sqrt(1 - z * z)
     return np.array([ring * math.cos(turn), ring * math.sin(turn), z])
 
