@@ -27,6 +27,8 @@ LAYERS = (*COLOUR, "depth.Z", "normal.X", "normal.Y", "normal.Z", "albedo.R", "a
 centre; albedo is the diffuse reflectance."""
 HALF = ("R", "G", "B", "A", "normal.X", "normal.Y", "normal.Z", "albedo.R", "albedo.G", "albedo.B")
 """Of them, those that are written in 16 bits."""
+NETWORK = "network"
+"""Name of the network's part of a frame's milliseconds."""
 WayName = Literal["path", "base", "neural"]
 
 
@@ -79,6 +81,7 @@ class FrameTask(Task):
 
     Args:
         lens: thin lens of the camera, for ``path``; other ways have pinholes.
+        plain: where the base image alone goes, too; of ``neural``. For comparison: it has no picture.
         earlier: the frames of the camera's way that this one remembers (`raytrace.history`), in their order; None: it
             stands alone. number: of the first of them in the camera's way.
     """
@@ -91,6 +94,7 @@ class FrameTask(Task):
     seed: int
     output: Path
     picture: Path
+    plain: Path | None = None
     fingerprint: str
 
 

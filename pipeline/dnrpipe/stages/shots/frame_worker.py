@@ -30,12 +30,14 @@ from dnrtrain.exr import write_exr
 from dnrtrain.model import render
 
 from ..trainer import torch_device
-from .frame_tasks import COLOUR, HALF, LAYERS, FrameAnswer, FrameCommon, FrameTask
+from .frame_tasks import COLOUR, HALF, LAYERS, NETWORK, FrameAnswer, FrameCommon, FrameTask
 
 GUIDE_RAYS = 16
 """Primary rays per pixel of the denoiser's auxiliary images: clean."""
-MAX_RAYS = 1 << 22
-"""Of a launch of the path tracer: bounds its memory."""
+MAX_RAYS, MAX_SAMPLES = 1 << 22, 16
+"""Of a launch of the path tracer, and of a pixel in it: bounds its memory, and what it takes to record a kernel, which
+renders several pictures."""
+Layers = dict[str, np.ndarray]
 
 
 class Worker:
@@ -78,7 +80,7 @@ class Worker:
             self.warm.add(kernel)
         ms: dict[str, float] = {}
         started, cpu = time.monotonic(), time.process_time()
-        layers, lost = self.render(task, ms)
+        (layers, *plain), lost = self.render(task, ms)
         picture = self.shown(layers)
         costs = costs_since(started, cpu)
         answer: FrameAnswer = {
@@ -95,10 +97,13 @@ class Worker:
         write_png(task.picture, picture)
         write_exr(task.output, layers, header, half=HALF)  # last: it says that the frame is made
         answer["write_seconds"] = time.monotonic() - began
+        if task.plain is not None:
+            write_exr(task.plain, plain[0], header, half=HALF)
         return answer
 
-    def render(self, task: FrameTask, ms: dict[str, float]) -> tuple[dict[str, np.ndarray], int]:
-        """(channels of LAYERS, float32 [H, W] each; pixels that were not finite). ms: milliseconds of the parts."""
+    def render(self, task: FrameTask, ms: dict[str, float]) -> tuple[list[Layers], int]:
+        """(channels of LAYERS, float32 [H, W] each, of the frame and, if wanted, of its base image; pixels that were
+        not finite). ms: milliseconds of the parts."""
 
         def timed(name: str, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
             began = time.perf_counter()
@@ -107,23 +112,24 @@ class Worker:
             return found
 
         if task.way.name == "path":
-            layers, lost = self._path(task, timed)
+            found, lost = self._path(task, timed)
         else:
-            layers, lost = self._from_base(task, timed)
+            found, lost = self._from_base(task, timed)
         if self.background is not None:
             behind = timed("background", self.background.frame, task.view)
-            clear = 1 - np.clip(layers["A"], 0, 1)
-            for i, name in enumerate("RGB"):
-                layers[name] = layers[name] + clear * behind[..., i]
-            layers["A"] = np.ones_like(layers["A"])
-        return layers, lost
+            for layers in found:
+                clear = 1 - np.clip(layers["A"], 0, 1)
+                for i, name in enumerate("RGB"):
+                    layers[name] = layers[name] + clear * behind[..., i]
+                layers["A"] = np.ones_like(layers["A"])
+        return found, lost
 
     def shown(self, layers: dict[str, np.ndarray]) -> np.ndarray:
         """Display RGB over white, float32 [H, W, 3] in [0, 1]."""
         image = np.stack([layers[name] for name in COLOUR], axis=-1)
         return over_white(self.display, image)[0].permute(1, 2, 0).numpy()
 
-    def _from_base(self, task: FrameTask, timed: Callable[..., Any]) -> tuple[dict[str, np.ndarray], int]:
+    def _from_base(self, task: FrameTask, timed: Callable[..., Any]) -> tuple[list[Layers], int]:
         if self.base is None:
             raise UserError(f"frame {task.view.name}: {task.way.told} need baked light")
         self.base.repaired = self.base.masked = 0
@@ -133,15 +139,16 @@ class Worker:
             asked = (task.view, task.earlier, task.number, task.way.spp)
             channels = timed("base image", self.base.remembered, *asked)
         lost = self.base.masked
-        alpha = channels["coverage"]
+        colours: list[np.ndarray] = []
         if task.way.name == "neural":
-            colour = timed("network", self._corrected, task.view, channels)
-        else:
+            colours.append(timed(NETWORK, self._corrected, task.view, channels))
+        if task.way.name == "base" or task.plain is not None:
             premultiplied = np.stack([channels[f"base.{c}"] for c in "RGB"], axis=-1)
-            colour = premultiplied / np.maximum(channels["base.A"], LEAST_ALPHA)[..., None]
-        layers = {name: channels[name] for name in LAYERS if name in channels}
-        layers |= {name: colour[..., i] * alpha for i, name in enumerate("RGB")}
-        return layers | {"A": alpha}, lost
+            colours.append(premultiplied / np.maximum(channels["base.A"], LEAST_ALPHA)[..., None])
+        alpha, others = channels["coverage"], {name: channels[name] for name in LAYERS if name in channels}
+        return [
+            others | {name: colour[..., i] * alpha for i, name in enumerate("RGB")} | {"A": alpha} for colour in colours
+        ], lost
 
     def _corrected(self, view: View, channels: dict[str, np.ndarray]) -> np.ndarray:
         """The network's radiance, linear Rec.709, straight, float32 [H, W, 3]."""
@@ -151,7 +158,7 @@ class Worker:
             raise UserError("shots need a model whose output is radiance: type --set model.output=log")
         return radiance[0].permute(1, 2, 0).numpy()
 
-    def _path(self, task: FrameTask, timed: Callable[..., Any]) -> tuple[dict[str, np.ndarray], int]:
+    def _path(self, task: FrameTask, timed: Callable[..., Any]) -> tuple[list[Layers], int]:
         view = task.view
         frames = self.frames((view.width, view.height))
         image, lost = masked(timed("path tracing", self._traced, task, frames))
@@ -161,7 +168,7 @@ class Worker:
         alpha = guide.coverage if task.lens is None else image[..., 3]
         layers = {name: clean[..., i] for i, name in enumerate("RGB")} | {"A": alpha}
         layers |= {name: gbuffer[name] for name in LAYERS if name in gbuffer}
-        return layers | {f"albedo.{c}": guide.albedo[..., i] for i, c in enumerate("RGB")}, lost + more
+        return [layers | {f"albedo.{c}": guide.albedo[..., i] for i, c in enumerate("RGB")}], lost + more
 
     def _traced(self, task: FrameTask, frames: Frames) -> np.ndarray:
         """Path-traced RGBA, premultiplied, float32 [H, W, 4], in launches that fit in memory."""
@@ -179,5 +186,5 @@ class Worker:
 
 def _at_once(task: FrameTask) -> int:
     """Samples per pixel of one launch: a power of two, so that few kernels are compiled."""
-    most = min(task.way.spp, MAX_RAYS // (task.view.width * task.view.height))
+    most = min(task.way.spp, MAX_SAMPLES, MAX_RAYS // (task.view.width * task.view.height))
     return 1 << max(0, most.bit_length() - 1)

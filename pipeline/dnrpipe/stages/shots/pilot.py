@@ -26,7 +26,7 @@ from ...core.images import over_white
 from ...core.scene_files import read_frame
 from ..stage import Run
 from ..trust import SHARES
-from .frame_tasks import COLOUR, FrameTask, Way
+from .frame_tasks import COLOUR, NETWORK, FrameTask, Way
 from .records import ShotFrame
 from .render_frames import frame_outcomes
 from .renderers import Renderer
@@ -85,16 +85,18 @@ class Pilot:
     def measure(
         self, renderer: Renderer, ways: Sequence[Way], hopeless: Callable[[Measured], bool] | None = None
     ) -> list[Measured]:
-        """The ways on the windows, one after the other in a process of its own.
+        """The ways on the windows, one after the other in a process of its own; of each neural one also the base image
+        that it corrects, before it.
 
-        hopeless: told the first way once it is measured; the others are left out where it says so. (Asking after each
-            way would disturb the seconds of the next.) The references must have been traced before.
+        hopeless: told the first way once it is measured (of a neural one, its base image); the others are left out
+            where it says so. (Asking after each way would disturb the seconds of the next.) The references must have
+            been traced before.
 
         Raises UserError: a frame failed twice.
         """
         tasks: list[FrameTask] = []
-        keys: list[tuple[Way, int, bool]] = []  # way, window, whether it is measured
-        first = ways[0]
+        keys: list[int | None] = []  # the window, where it is measured
+        first, last = ways[0], ways[-1]
         if not self.references:
             ways = [REFERENCE, *ways]
         for way in ways:
@@ -102,34 +104,44 @@ class Pilot:
                 lead = [] if way.name == "path" else list(self._lead(index))
                 for number, at in enumerate([*lead, index]):
                     earlier = None if way.name == "path" else tuple(self._view(i, place) for i in lead[:number])
-                    keys.append((way, key, at == index))
-                    tasks.append(self._task(way, at, place, earlier, len(tasks)))
+                    # What a frame remembers are base images. The first one readies the network all the same: later,
+                    # that would cost the memory.
+                    rendered = way if at == index or number == 0 else way.model_copy(update={"name": "base"})
+                    keys.append(key if at == index else None)
+                    tasks.append(self._task(rendered, at, place, earlier, len(tasks)))
         found: dict[Way, list[_Window]] = {}
-        label = "pilot: " + ("path tracing" if ways[-1].name == "path" else "base image and network")
+        label = "pilot: " + ("path tracing" if last.name == "path" else "base image and network")
         with (
             closing(frame_outcomes(self.run, renderer, tasks, "pilot")) as outcomes,
             self.run.console.bar(label, len(tasks)) as bar,
         ):
-            for (way, key, counts), task, outcome in zip(keys, tasks, outcomes, strict=True):
+            for key, task, outcome in zip(keys, tasks, outcomes, strict=True):
                 if outcome.result is None:
                     raise UserError(f"{label} failed twice: {outcome.error}; see {self.run.log}")
                 self.run.book(
                     "training",
                     "view",
-                    f"pilot/{way.name} {way.spp}",
+                    f"pilot/{task.way.name} {task.way.spp}",
                     outcome.result["seconds"],
                     cpu_seconds=outcome.result["cpu_seconds"],
                     width=task.view.width,
                     height=task.view.height,
                 )
-                if counts:
-                    picture = shown(self.display, task.output)
+                if key is not None:
                     spent = outcome.result["seconds"] + outcome.result["write_seconds"]
-                    found.setdefault(way, []).append(_Window(key, picture, spent, outcome.seconds - spent))
-                bar.advance(note=way.told)
-                done = way == first and len(found.get(way, [])) == len(self.windows)
-                if done and hopeless is not None and hopeless(self._measured(way, found[way])):
-                    break
+                    start = outcome.seconds - spent
+                    if task.plain is not None:
+                        network = outcome.result["ms"][NETWORK] / 1000
+                        row = _Window(key, shown(self.display, task.plain), spent - network, start)
+                        found.setdefault(base_of(task.way), []).append(row)
+                    row = _Window(key, shown(self.display, task.output), spent, start)
+                    found.setdefault(task.way, []).append(row)
+                bar.advance(note=task.way.told)
+                if hopeless is not None and len(found.get(first, [])) == len(self.windows):
+                    plainest = base_of(first) if first.name == "neural" else first
+                    if hopeless(self._measured(plainest, found[plainest])):
+                        break
+                    hopeless = None
         if REFERENCE in found and not self.references:
             self.references = {row.key: row.picture for row in found.pop(REFERENCE)}
         self.rows |= found
@@ -138,10 +150,10 @@ class Pilot:
     def trusted(self, ways: Sequence[Way]) -> tuple[float, list[Measured]]:
         """(the share of the shipped corrector's correction that does best on the windows; the ways with that share).
 
-        ways: neural ones, measured with all of it, as the base images of as many rays were. Pictures are mixed as they
-        are displayed, which is close to what the network does (see `dnrtrain.correction`).
+        ways: neural ones, measured with all of it. Pictures are mixed as they are displayed, which is close to what the
+        network does (see `dnrtrain.correction`).
         """
-        pairs = {way: list(zip(self.rows[Way(name="base", spp=way.spp)], self.rows[way], strict=True)) for way in ways}
+        pairs = {way: list(zip(self.rows[base_of(way)], self.rows[way], strict=True)) for way in ways}
         everything = [both for rows in pairs.values() for both in rows]
         share = best_mix([(a.picture, b.picture, self.references[a.key]) for a, b in everything])
         mixed = {
@@ -184,8 +196,14 @@ class Pilot:
             seed=REFERENCE_SEED if way == REFERENCE else 0,
             output=self.folder / f"{stem}.exr",
             picture=self.folder / f"{stem}.png",
+            plain=self.folder / f"{stem}-plain.exr" if way.name == "neural" else None,
             fingerprint="",
         )
+
+
+def base_of(way: Way) -> Way:
+    """The base images that a neural way corrects."""
+    return way.model_copy(update={"name": "base"})
 
 
 def best_mix(pictures: Sequence[tuple[Any, Any, Any]]) -> float:

@@ -59,24 +59,22 @@ def weigh(
         run.console.say(f"baked light is not weighed: {why}")
         return options, None
     rays = run.settings.base.samples
-    counts = [*(n for n in FEWER if n < rays), rays]
-    base, neural = ([Way(name=name, spp=n) for n in counts] for name in ("base", "neural"))
-    if wanted.way == "base":
-        neural = []
+    counts = [rays, *(n for n in FEWER if n < rays)]  # the best base image first
+    ways = [Way(name="base" if wanted.way == "base" else "neural", spp=n) for n in counts]
     renderer, trust = shipped_renderer(run, tracer.common.background, trust=1.0), 0.0
 
     def hopeless(found: Measured) -> bool:
         aimless = wanted.way is None and wanted.psnr is None and wanted.lpips is None
         return aimless and outdone(found, options, shape) is not None
 
-    measured = pilot.measure(renderer, [base[-1], *base[:-1], *neural], hopeless)  # the best base image first
-    ours = sorted(measured[: len(base)], key=lambda found: found.way.spp)
-    if len(measured) > len(base):
-        trust, corrected = pilot.trusted(neural)
+    measured = pilot.measure(renderer, ways, hopeless)
+    ours = sorted((found for found in measured if found.way.name == "base"), key=lambda found: found.way.spp)
+    if len(ours) < len(ways):
+        run.console.say("baked light is not weighed further: path tracing is better in less time")
+    elif wanted.way != "base":
+        trust, corrected = pilot.trusted(sorted(ways, key=lambda way: way.spp))
         run.console.say(_trust_told(trust))
         ours += corrected if trust or wanted.way == "neural" else []
-    elif neural:
-        run.console.say("baked light is not weighed further: path tracing is better in less time")
     options += [baked_option(found, options, shape) for found in ours]
     if _wants_more(options, wanted) and wanted.way in (None, "neural"):
         found = worth(run, shape.still)
