@@ -15,7 +15,7 @@ from dnrpipe.stages.shots.frame_tasks import Way
 from dnrpipe.stages.shots.open_shot import parse_size, resized, told_frames
 from dnrpipe.stages.shots.options import Option, Wanted, choose
 from dnrpipe.stages.shots.pilot import Measured, best_mix, reckoned
-from dnrpipe.stages.shots.plan_shot import Shape, baked_option, moving_way, outdone, path_option
+from dnrpipe.stages.shots.plan_shot import Shape, baked_option, moving_way, path_option
 from dnrpipe.stages.shots.records import ShotFrame
 from dnrpipe.stages.shots.render_frames import frame_tasks
 
@@ -74,17 +74,22 @@ def test_rungs_between_and_beyond_those_measured() -> None:
     assert [rung.lpips for rung in blind] == [0.1, None, None]
 
 
-def test_baked_light_is_given_up_where_path_tracing_is_far_ahead() -> None:
-    shape = Shape(still=100, moving=0, pixels=1000, convert=5.0)
-    ours = Measured(Way(name="base", spp=8), pixel=0.001, start=0.0, psnr=27.0, lpips=0.1)
+def test_without_baked_light_what_it_usually_has_is_enough() -> None:
+    def path(spp: int, psnr: float, lpips: float) -> Option:
+        way = Way(name="path", spp=spp)
+        return Option(way=way, before=1.0, frame=float(spp), seconds=float(spp), psnr=psnr, lpips=lpips)
 
-    def path(pixel: float, psnr: float, lpips: float) -> Option:
-        return path_option(Measured(Way(name="path", spp=1), pixel, 0.0, psnr, lpips), shape)
+    flickers, some, more = path(1, 32.0, 0.02), path(4, 33.0, 0.02), path(16, 36.0, 0.01)
+    assert choose([flickers, some, more], Wanted())[0] is some
+    assert choose([flickers, some.model_copy(update={"lpips": 0.05}), more], Wanted(way="path"))[0] is more
+    poor = path(16, 29.0, 0.05)
+    assert choose([path(1, 22.0, 0.2), poor], Wanted()) == (poor, "the best of its kind")
 
-    far = path(0.0005, 30.0, 0.03)
-    assert outdone(ours, [far], shape) is far
-    for near in (path(0.0009, 30.0, 0.03), path(0.0005, 28.0, 0.03), path(0.0005, 30.0, 0.09)):
-        assert outdone(ours, [near], shape) is None, "fewer rays or the corrector might win"
+
+def test_a_shot_without_aim_wants_no_time_no_quality_and_no_baked_light() -> None:
+    assert Wanted().aimless and Wanted(way="path").aimless
+    others = Wanted(seconds=60.0), Wanted(psnr=30.0), Wanted(lpips=0.1), Wanted(way="base"), Wanted(way="neural")
+    assert not any(wanted.aimless for wanted in others)
 
 
 def test_seconds_of_a_shot_add_up() -> None:

@@ -83,14 +83,13 @@ class Pilot:
         self.rows: dict[Way, list[_Window]] = {}
 
     def measure(
-        self, renderer: Renderer, ways: Sequence[Way], hopeless: Callable[[Measured], bool] | None = None
+        self, renderer: Renderer, ways: Sequence[Way], enough: Callable[[Measured], bool] | None = None
     ) -> list[Measured]:
         """The ways on the windows, one after the other in a process of its own; of each neural one also the base image
         that it corrects, before it.
 
-        hopeless: told the first way once it is measured (of a neural one, its base image); the others are left out
-            where it says so. (Asking after each way would disturb the seconds of the next.) The references must have
-            been traced before.
+        enough: told the first way once it is measured; the others are left out where it says so. (Asking after each
+            way would disturb the seconds of the next.)
 
         Raises UserError: a frame failed twice.
         """
@@ -137,13 +136,12 @@ class Pilot:
                     row = _Window(key, shown(self.display, task.output), spent, start)
                     found.setdefault(task.way, []).append(row)
                 bar.advance(note=task.way.told)
-                if hopeless is not None and len(found.get(first, [])) == len(self.windows):
-                    plainest = base_of(first) if first.name == "neural" else first
-                    if hopeless(self._measured(plainest, found[plainest])):
+                if not self.references and len(found.get(REFERENCE, [])) == len(self.windows):
+                    self.references = {row.key: row.picture for row in found.pop(REFERENCE)}
+                if enough is not None and len(found.get(first, [])) == len(self.windows):
+                    if enough(self._measured(first, found[first])):
                         break
-                    hopeless = None
-        if REFERENCE in found and not self.references:
-            self.references = {row.key: row.picture for row in found.pop(REFERENCE)}
+                    enough = None
         self.rows |= found
         return [self._measured(way, rows) for way, rows in found.items()]
 

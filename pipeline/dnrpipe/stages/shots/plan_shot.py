@@ -1,7 +1,8 @@
 """Which way to make a shot: what the pilot measured, reckoned to all of its frames.
 
-Light is baked only where baked light can be worth it: where path tracing all frames at the most samples takes longer
-than baking is expected to.
+Light is baked only where baked light can be worth it: where few samples and a quick denoiser, which take no longer than
+baked light, are worse, unless something else than that is wanted; and where path tracing all frames at the most samples
+takes longer than baking is expected to.
 """
 
 from __future__ import annotations
@@ -16,16 +17,13 @@ from ..base_images import base_renderer, light_plan
 from ..stage import Run
 from ..worth import worth
 from .frame_tasks import Way
-from .options import Option, Wanted
+from .options import STEADY, USUAL, Option, Wanted
 from .pilot import LADDER, MOST, Measured, Pilot, reckoned
 from .records import ShotFrame
 from .renderers import Renderer, shipped_renderer
 
 FEWER = (2, 4)
 """Rays per pixel of base images that are tried beside the settings'."""
-HOPE, FEWER_COST = (1.5, 0.65), 0.75
-"""Decibels, and times LPIPS, by which the corrector may better a base image (in pilots of six example scenes it did by
-up to 1.1, 0.69); seconds of a shot with half the rays over those with all."""
 LIGHT_PATH = 2.5
 """Seconds of a path of baked light over those of a camera path: it sets out from everywhere, in all directions."""
 
@@ -51,28 +49,29 @@ def weigh(
     moving = sum(bool(frame.moving) for frame in frames)
     shape = Shape(len(frames) - moving, moving, view.width * view.height, _conversion_seconds(run))
     pilot = Pilot(run, frames, folder, lpips)
-    quick = [Way(name="path", spp=spp, quality="balanced") for spp in LADDER]
-    measured = pilot.measure(tracer, [*quick, *(Way(name="path", spp=spp) for spp in LADDER)])
+    quick = [Way(name="path", spp=spp, quality="balanced") for spp in (STEADY, *(n for n in LADDER if n != STEADY))]
+
+    def enough(found: Measured) -> bool:
+        return wanted.aimless and path_option(found, shape).reaches(*USUAL)
+
+    measured = pilot.measure(tracer, [*quick, *(Way(name="path", spp=spp) for spp in LADDER)], enough)
+    if len(measured) == 1:
+        run.console.say("baked light is not weighed: few samples are as good here, and take no longer")
+        return [path_option(measured[0], shape)], None
     ladder = [*reckoned(measured[: len(quick)], max(LADDER)), *reckoned(measured[len(quick) :], MOST)]
     options = [path_option(found, shape) for found in ladder]
     if why := _no_baked_light(run, frames, shape, ladder, wanted):
         run.console.say(f"baked light is not weighed: {why}")
         return options, None
     rays = run.settings.base.samples
-    counts = [rays, *(n for n in FEWER if n < rays)]  # the best base image first
+    counts = [*(n for n in FEWER if n < rays), rays]
     ways = [Way(name="base" if wanted.way == "base" else "neural", spp=n) for n in counts]
     renderer, trust = shipped_renderer(run, tracer.common.background, trust=1.0), 0.0
 
-    def hopeless(found: Measured) -> bool:
-        aimless = wanted.way is None and wanted.psnr is None and wanted.lpips is None
-        return aimless and outdone(found, options, shape) is not None
-
-    measured = pilot.measure(renderer, ways, hopeless)
-    ours = sorted((found for found in measured if found.way.name == "base"), key=lambda found: found.way.spp)
-    if len(ours) < len(ways):
-        run.console.say("baked light is not weighed further: path tracing is better in less time")
-    elif wanted.way != "base":
-        trust, corrected = pilot.trusted(sorted(ways, key=lambda way: way.spp))
+    measured = pilot.measure(renderer, ways)
+    ours = [found for found in measured if found.way.name == "base"]
+    if wanted.way != "base":
+        trust, corrected = pilot.trusted(ways)
         run.console.say(_trust_told(trust))
         ours += corrected if trust or wanted.way == "neural" else []
     options += [baked_option(found, options, shape) for found in ours]
@@ -111,15 +110,6 @@ def baked_option(found: Measured, paths: Sequence[Option], shape: Shape) -> Opti
         rung = as_good(paths, found.psnr, found.lpips)
         total += shape.moving * (rung.frame + rung.before + shape.convert)
     return Option(way=found.way, before=found.start, frame=frame, seconds=total, psnr=found.psnr, lpips=found.lpips)
-
-
-def outdone(found: Measured, paths: Sequence[Option], shape: Shape) -> Option | None:
-    """The quickest path tracing that is better than the base image of most rays, ``found``, can become by the
-    corrector, in less time than half the rays would take."""
-    own = baked_option(found, paths, shape)
-    psnr, lpips = found.psnr + HOPE[0], None if found.lpips is None else found.lpips * HOPE[1]
-    better = [path for path in paths if path.seconds <= FEWER_COST * own.seconds and path.reaches(psnr, lpips)]
-    return min(better, key=lambda path: path.seconds, default=None)
 
 
 def as_good(options: Sequence[Option], psnr: float | None, lpips: float | None) -> Option:
