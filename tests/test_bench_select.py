@@ -318,6 +318,7 @@ def work(out: Path) -> dict[str, int]:
 
 
 @pytest.mark.slow
+@pytest.mark.robustness
 def test_smoke_measures_every_cell_and_says_what_it_took(smoke: tuple[Path, dict[str, Any]]) -> None:
     from PIL import Image
 
@@ -341,6 +342,7 @@ def test_smoke_measures_every_cell_and_says_what_it_took(smoke: tuple[Path, dict
 
 
 @pytest.mark.slow
+@pytest.mark.robustness
 def test_a_lost_cell_is_made_again_the_same_and_nothing_else(smoke: tuple[Path, dict[str, Any]]) -> None:
     out, answer = smoke
     before = work(out)
@@ -356,6 +358,7 @@ def test_a_lost_cell_is_made_again_the_same_and_nothing_else(smoke: tuple[Path, 
 
 
 @pytest.mark.slow
+@pytest.mark.robustness
 def test_cells_train_equally_long_and_policies_that_agree_share_one(smoke: tuple[Path, dict[str, Any]]) -> None:
     """All ten views: whatever chose them, and in whatever order, it is one training."""
     out, _ = smoke

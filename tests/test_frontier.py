@@ -152,6 +152,7 @@ def test_lists_of_numbers() -> None:
             numbers(text, "--budgets", (6,), 40)
 
 
+@pytest.mark.robustness
 def test_a_scene_is_swept_and_measured_once(
     tmp_path: Path, demo_blend: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

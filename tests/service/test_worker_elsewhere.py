@@ -160,6 +160,7 @@ def test_cancel_and_limits_reach_a_worker(server: Server, start: Callable[..., E
         assert "start 1 on one/cpu" in client.log(refused.id).text and "has not run" in client.log(refused.id).text
 
 
+@pytest.mark.robustness
 def test_a_restart_of_the_server_is_no_end_of_a_job(server: Server, start: Callable[..., Elsewhere]) -> None:
     """kill -9 of the server while a worker elsewhere trains: one start, every epoch told once, all results here."""
     with server.client() as client:
