@@ -38,7 +38,7 @@ demo: setup  ## the demo scene from .blend to report, untrained and trained; pri
 	@$(BIN)/dnrpipe report -w $(DEMO)/demo.dnr
 
 test: setup browser lint types imports docs-check  ## lint, types, import rules, documentation, the quick tests
-	$(PYTEST) -m "not robustness" --durations 15
+	$(PYTEST) -m "not robustness" --durations 40
 
 browser:
 	@sh tools/system-libraries.sh $(APT_DEV)
