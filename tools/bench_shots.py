@@ -253,7 +253,7 @@ def equal_rung(row: dict[str, Any], names: Sequence[str]) -> dict[str, Any] | No
     """The cheapest path tracing that is as good as ours by each of the figures; None: not by its last rung.
 
     A shot that is path-traced is as good as the rung that it is, whose frames take what the shot's do: there are more
-    of those, and seconds of single frames vary by a tenth.
+    of those, and seconds of few frames vary by up to a fifth.
     """
     own = row["chosen"]["way"]
     same = [own["name"] == "path" and all(rung[key] == own[key] for key in ("spp", "quality")) for rung in row["rungs"]]

@@ -15,7 +15,7 @@ from .errors import UserError
 from .scene_records import Census, Conversion, RasterChoice, SceneSummary
 from .workspace import Workspace, digest, file_sha256
 
-SCENE_VERSION = 8  # raise when the conversion or the G-buffer scene changes what it writes
+SCENE_VERSION = 9  # raise when the conversion or the G-buffer scene changes what it writes
 
 
 def read_json(path: Path) -> Any:

@@ -136,8 +136,8 @@ class Engine:
         Args:
             bundle: one of the engine's.
             integrator: of `integrator`.
-            sensor: of `sensor`, for the same view.
-            view: in scene units; its size alone counts.
+            sensor: of `sensor` or `sensor_row`.
+            view: of the picture's size; nothing else of it counts.
             spp: samples per pixel.
             seed: its lower 20 bits count.
         """

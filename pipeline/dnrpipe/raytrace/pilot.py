@@ -123,7 +123,8 @@ class Worker:
         }
 
     def _pictures(self, config: PilotConfig, depth: int, views: list[PilotView], spp: int) -> np.ndarray:
-        """[V, 2, H, W, 4]: two halves of each view, all in one launch; a pixel's numbers depend on its place alone."""
+        """[V, 2, H, W, 4]: two halves of each view, all in one launch; a pixel's random numbers depend on its place and
+        on ``spp`` alone."""
         engine = self.engines[config.variant]
         integrator = self._integrator(config, depth)
         both = [entry for entry in views for _ in range(2)]

@@ -34,8 +34,10 @@ from .frame_tasks import COLOUR, HALF, LAYERS, NETWORK, FrameAnswer, FrameCommon
 
 GUIDE_RAYS = 16
 """Primary rays per pixel of the denoiser's auxiliary images: clean."""
-MAX_RAYS, MAX_SAMPLES = 1 << 22, 16
-"""Of a launch of the path tracer, and of a pixel in it: bounds its memory, and what it takes to record a kernel, which
+MAX_RAYS = 1 << 22
+"""Of a launch of the path tracer: bounds its memory."""
+MANY, EACH = 64, 16
+"""Pictures of more than so many samples per pixel, which are references, take this many a launch: recording a kernel
 renders several pictures."""
 Layers = dict[str, np.ndarray]
 
@@ -186,5 +188,6 @@ class Worker:
 
 def _at_once(task: FrameTask) -> int:
     """Samples per pixel of one launch: a power of two, so that few kernels are compiled."""
-    most = min(task.way.spp, MAX_SAMPLES, MAX_RAYS // (task.view.width * task.view.height))
+    spp = task.way.spp if task.way.spp <= MANY else EACH
+    most = min(spp, MAX_RAYS // (task.view.width * task.view.height))
     return 1 << max(0, most.bit_length() - 1)

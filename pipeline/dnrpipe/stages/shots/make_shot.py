@@ -36,7 +36,7 @@ from .renderers import Renderer, path_tracer, shipped_renderer, trained_renderer
 
 CHECKED = 2
 """Frames of a shot that are traced to check it."""
-PLAN_VERSION = 8
+PLAN_VERSION = 9
 LIGHT_SIZES = (1024, 2048)
 """Texels of the light map's side: of few frames, of many."""
 BATCH = 8

@@ -18,7 +18,7 @@ from ..stage import Run
 from ..worth import worth
 from .frame_tasks import Way
 from .options import STEADY, USUAL, Option, Wanted
-from .pilot import LADDER, MOST, Measured, Pilot, reckoned
+from .pilot import LADDER, MOST, SAME, Measured, Pilot, reckoned
 from .records import ShotFrame
 from .renderers import Renderer, shipped_renderer
 
@@ -52,15 +52,17 @@ def weigh(
     quick = [Way(name="path", spp=spp, quality="balanced") for spp in (STEADY, *(n for n in LADDER if n != STEADY))]
 
     def enough(found: Measured) -> bool:
-        return wanted.aimless and path_option(found, shape).reaches(*USUAL)
+        told = found.lpips is not None and found.psnr < SAME  # windows that show something
+        return told and path_option(found, shape).reaches(*USUAL)
 
-    measured = pilot.measure(tracer, [*quick, *(Way(name="path", spp=spp) for spp in LADDER)], enough)
+    ladder = [*quick, *(Way(name="path", spp=spp) for spp in LADDER)]
+    measured = pilot.measure(tracer, ladder, enough if wanted.aimless and not _light_is_ready(run) else None)
     if len(measured) == 1:
-        run.console.say("baked light is not weighed: few samples are as good here, and take no longer")
+        run.console.say(f"baked light is not weighed: {quick[0].told}, are as good as it usually is, in its time")
         return [path_option(measured[0], shape)], None
-    ladder = [*reckoned(measured[: len(quick)], max(LADDER)), *reckoned(measured[len(quick) :], MOST)]
-    options = [path_option(found, shape) for found in ladder]
-    if why := _no_baked_light(run, frames, shape, ladder, wanted):
+    rungs = [*reckoned(measured[: len(quick)], max(LADDER)), *reckoned(measured[len(quick) :], MOST)]
+    options = [path_option(found, shape) for found in rungs]
+    if why := _no_baked_light(run, frames, shape, rungs, wanted):
         run.console.say(f"baked light is not weighed: {why}")
         return options, None
     rays = run.settings.base.samples
@@ -139,6 +141,14 @@ def _conversion_seconds(run: Run) -> float:
     """Of the workspace's scene, by the ledger; a few where it does not say."""
     found = [record.seconds for record in run.workspace.ledger.read() if record.name == "convert"]
     return found[-1] if found else 5.0
+
+
+def _light_is_ready(run: Run) -> bool:
+    """Whether an earlier run has baked it."""
+    return (
+        run.settings.model.base == "baked"
+        and base_renderer(run.workspace, run.settings, run.effect_plan).light_is_baked
+    )
 
 
 def _no_baked_light(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -131,8 +132,11 @@ def pictures(folder: Path, frames: Sequence[ShotFrame]) -> Iterator[np.ndarray]:
 def frame_outcomes(
     run: Run, renderer: Renderer, tasks: Sequence[FrameTask], label: str
 ) -> Generator[TaskResult, None, None]:
-    """Render frames to be measured, each with the whole machine -> their outcomes, in order, whatever is on disk."""
-    return run_tasks(
+    """Render frames to be measured, each with the whole machine -> their outcomes, in order, whatever is on disk.
+
+    One that is tried again is rendered last: those after it wait for it.
+    """
+    outcomes = run_tasks(
         FRAME_WORKER,
         renderer.common.data(),
         [task.data() for task in tasks],
@@ -141,3 +145,10 @@ def frame_outcomes(
         retried=warn_of_retries(label, run.console),
         environment=renderer.environment,
     )
+    known: dict[Path, TaskResult] = {}
+    with closing(outcomes):
+        for task in tasks:
+            while task.output not in known:
+                outcome = next(outcomes)
+                known[Path(outcome.task["output"])] = outcome
+            yield known.pop(task.output)
