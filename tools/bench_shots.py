@@ -255,8 +255,8 @@ def equal_rung(row: dict[str, Any], names: Sequence[str]) -> dict[str, Any] | No
     A shot that is path-traced is as good as the rung that it is, whose frames take what the shot's do: there are more
     of those, and seconds of few frames vary by up to a fifth.
     """
-    own = row["chosen"]["way"]
-    same = [own["name"] == "path" and all(rung[key] == own[key] for key in ("spp", "quality")) for rung in row["rungs"]]
+    own = Way.model_validate(row["chosen"]["way"])  # in records, defaults are left out
+    same = [own.name == "path" and (rung["spp"], rung["quality"]) == (own.spp, own.quality) for rung in row["rungs"]]
     enough = [
         rung | {"frame": row["frame"]} if it_is else rung
         for rung, it_is in zip(row["rungs"], same, strict=True)
