@@ -19,7 +19,7 @@ USUAL = 31.0, 0.03
 """PSNR and LPIPS that base images of eight rays have on the pilot's windows, give or take (`food` 31.6 dB, .024; `ship`
 32.4, .029; `drums` 29.7, .018). Five example scenes of ten have it by path tracing with STEADY samples, quickly
 denoised, in no more time (31.6 to 36.5 dB): there light would not pay. The others are far from it (19.8 to 29.1 dB):
-there it does."""
+there it does, but for `jewels`, whose caustics baked light leaves out."""
 STEADY = 4
 """Samples per pixel; with fewer, denoised frames flicker."""
 

@@ -108,7 +108,7 @@ class Pilot:
                     earlier = None if way.name == "path" else tuple(self._view(i, place) for i in lead[:number])
                     # What a frame remembers are base images. The first one readies the network all the same: later,
                     # that would cost the memory.
-                    rendered = way if at == index or number == 0 else way.model_copy(update={"name": "base"})
+                    rendered = way if at == index or number == 0 else base_of(way)
                     keys.append(key if at == index else None)
                     tasks.append(self._task(rendered, at, place, earlier, len(tasks)))
         found: dict[Way, list[_Window]] = {}

@@ -165,8 +165,7 @@ def _no_baked_light(
         return "no frame stands still"
     if run.settings.model.base != "baked":
         return f"model.base = {run.settings.model.base}"
-    base = base_renderer(run.workspace, run.settings, run.effect_plan)
-    if base.light_is_baked:
+    if _light_is_ready(run):
         return ""
     most = ladder[-1]
     tracing = path_option(most, shape).seconds
