@@ -15,7 +15,7 @@ import pytest
 
 from dnrpipe.core.errors import UserError
 from dnrpipe.workers import task_list as task_list_module
-from dnrpipe.workers.processes import LocalWorker, TaskFailed, WorkerDied
+from dnrpipe.workers.processes import KeptWorker, LocalWorker, TaskFailed, WorkerDied
 from dnrpipe.workers.task_list import Retry, TaskResult, run_tasks
 
 WORKER = """
@@ -68,6 +68,39 @@ def _run(module: str, folder: Path, kinds: list[str], **options) -> tuple[list[T
     options = {"workers": 2, "log": folder / "log.txt", "retried": retries.append, **options}
     results = sorted(run_tasks(module, {"folder": str(folder)}, tasks, **options), key=lambda o: o.task["n"])
     return results, retries
+
+
+def _lives(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_a_kept_worker_serves_one_list_after_the_other(module: str, tmp_path: Path) -> None:
+    """Until something else is wanted, or it crashed, or a list is broken off."""
+
+    def pids(kinds: list[str], environment: dict[str, str] | None = None) -> set[int]:
+        results, _ = _run(module, tmp_path, kinds, kept=kept, environment=environment)
+        return {result.result["pid"] for result in results if result.result}
+
+    with KeptWorker() as kept:
+        (first,) = pids(["sleep"] * 2)
+        assert pids(["sleep"]) == {first}
+        (other,) = pids(["sleep"], {"WANTED": "otherwise"})
+        assert other != first and not _lives(first)
+        crashed = pids(["sleep", "crash-once"], {"WANTED": "otherwise"})
+        assert other in crashed and len(crashed) == 2
+        (fresh,) = pids(["sleep"], {"WANTED": "otherwise"})
+        tasks = [{"kind": kind, "n": n} for n, kind in enumerate(("sleep", "hang"))]
+        wanted = {"workers": 1, "log": tmp_path / "log.txt", "environment": {"WANTED": "otherwise"}}
+        outcomes = run_tasks(module, {"folder": str(tmp_path)}, tasks, kept=kept, **wanted)
+        assert next(outcomes).result["pid"] == fresh
+        outcomes.close()
+        assert not _lives(fresh)
+        (last,) = pids(["sleep"])
+    assert not _lives(last)
 
 
 def test_all_tasks_are_done_on_several_processes(module: str, tmp_path: Path) -> None:

@@ -18,9 +18,10 @@ from dnrpipe.stages.shots.check import held_out
 from dnrpipe.stages.shots.frame_tasks import Way
 from dnrpipe.stages.shots.open_shot import parse_size, resized, told_frames
 from dnrpipe.stages.shots.options import Option, Wanted, choose
-from dnrpipe.stages.shots.pilot import Measured, Pilot, _Window, best_mix, reckoned
+from dnrpipe.stages.shots.pilot import Measured, Pilot, _Process, _Window, best_mix, reckoned
 from dnrpipe.stages.shots.plan_shot import Shape, baked_option, moving_way, path_option
 from dnrpipe.stages.shots.records import ShotFrame
+from dnrpipe.stages.shots.references import Truth
 from dnrpipe.stages.shots.render_frames import frame_tasks
 from dnrpipe.workers.task_list import TaskResult
 
@@ -150,7 +151,7 @@ def test_outcomes_come_in_the_order_of_their_tasks(tmp_path, monkeypatch) -> Non
     tasks = frame_tasks(frames(4, cut=4), tmp_path, Way(name="path", spp=4), "inputs")
     answers = [TaskResult(tasks[i].data(), {"seconds": float(i)}) for i in (0, 2, 3, 1)]
     monkeypatch.setattr(render_frames, "run_tasks", lambda *_, **__: (answer for answer in answers))
-    run: Any = SimpleNamespace(log=tmp_path / "log", console=None)
+    run: Any = SimpleNamespace(log=tmp_path / "log", console=None, kept=None)
     renderer: Any = SimpleNamespace(common=SimpleNamespace(data=dict), environment={})
     found = render_frames.frame_outcomes(run, renderer, tasks, "frames")
     assert [outcome.result for outcome in found] == [{"seconds": float(i)} for i in range(4)]
@@ -159,15 +160,17 @@ def test_outcomes_come_in_the_order_of_their_tasks(tmp_path, monkeypatch) -> Non
 def test_windows_that_show_nothing_do_not_count() -> None:
     pilot: Any = object.__new__(Pilot)
     black, white = torch.zeros(1, 3, 8, 8), torch.ones(1, 3, 8, 8)
-    pilot.references, pilot.lpips, pilot.windows = {0: white, 1: black}, None, [(0, (0.5, 0.5))]
+    pilot.references = {0: Truth(white, 0.0), 1: Truth(black, 0.0)}
+    pilot.lpips, pilot.windows = None, [(0, (0.5, 0.5))]
     pilot.frames = frames(1, cut=1)
     way = Way(name="path", spp=4)
-    rows = [_Window(0, white, 1.0, 2.0), _Window(1, black + 0.1, 3.0, 2.0)]
+    pilot.processes = {True: _Process(start=2.0, whole=0.5)}
+    rows = [_Window(0, white, 1.0), _Window(1, black + 0.1, 3.0)]
     found = pilot._measured(way, rows)
     assert found.psnr == pytest.approx(20, abs=0.01) and found.start == 2.0
     view = pilot.frames[0].view  # smaller than a window
-    assert found.pixel == pytest.approx(2.0 / (view.width * view.height))
-    assert pilot._measured(way, rows[:1]).psnr == pytest.approx(100, abs=0.01), "none shows anything"
+    assert found.pixel == pytest.approx(0.5 * 2.0 / (view.width * view.height)), "a whole frame takes half as long"
+    assert pilot._measured(way, rows[:1]).psnr == pytest.approx(80, abs=0.01), "none shows anything"
 
 
 def test_a_frame_in_which_things_move_is_not_remembered(tmp_path) -> None:  # type: ignore[no-untyped-def]

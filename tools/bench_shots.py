@@ -37,7 +37,7 @@ from dnrpipe.stages.shot_scene import look_at_shot
 from dnrpipe.stages.shots.frame_tasks import FrameTask, Way
 from dnrpipe.stages.shots.make_shot import lpips_of
 from dnrpipe.stages.shots.open_shot import parse_size
-from dnrpipe.stages.shots.pilot import compared, display_of, shown
+from dnrpipe.stages.shots.references import compared, display_of, shown
 from dnrpipe.stages.shots.render_frames import FRAMES_FOLDER, frame_outcomes
 from dnrpipe.stages.shots.renderers import path_tracer
 from dnrpipe.stages.stage import Run

@@ -12,7 +12,7 @@ from dnrtrain.contract import View
 from .engine import Engine
 from .frames import pinhole
 from .recorded import Recorded
-from .sensors import opaque_camera, scaled_view
+from .sensors import Camera, opaque_camera, scaled_view
 
 CELLS = 2
 """Rays per pixel and side: a sun or a sharp horizon is not jagged."""
@@ -35,7 +35,7 @@ class Background:
         planes = [np.broadcast_to(np.array(value), view.width * view.height) for value in values]  # a colour may be one
         return np.stack(planes, axis=-1).reshape(view.height, view.width, 3)
 
-    def _kernel(self, scene: Any, camera: tuple[list[Any], list[Any]], width: int, height: int) -> list[Any]:
+    def _kernel(self, scene: Any, camera: Camera, width: int, height: int) -> list[Any]:
         import drjit as dr
 
         mi = self.mi
@@ -44,6 +44,6 @@ class Background:
         for cell in range(CELLS * CELLS):
             offset = mi.Point2f((cell % CELLS + 0.5) / CELLS, (cell // CELLS + 0.5) / CELLS)
             hit = dr.zeros(mi.SurfaceInteraction3f, width * height)
-            hit.wi = -pinhole(mi, camera, pixel, offset, width).d
+            hit.wi = -pinhole(mi, camera, pixel, offset).d
             total += mi.Color3f(scene.environment().eval(hit)) / (CELLS * CELLS)
         return [total.x, total.y, total.z]

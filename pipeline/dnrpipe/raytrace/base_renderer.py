@@ -27,7 +27,7 @@ import numpy as np
 from .engine import masked_channels
 from .lightmap import light_textures
 from .recorded import Recorded, prepare_emitters
-from .sensors import opaque_camera
+from .sensors import Camera, opaque_camera
 from .sequence import GOLDEN, ORDER, TILE, fraction
 
 MAX_RAYS = 1 << 22
@@ -87,7 +87,7 @@ class BaseRenderer:
         import drjit as dr
 
         mi = self.mi
-        axes, film = opaque_camera(mi, view)
+        camera = opaque_camera(mi, view)
         rays = dr.opaque(mi.UInt32, samples)  # as data: the kernel is the same for all numbers of them
         turn = dr.opaque(mi.UInt32, number % FRAMES)
         names = (LOST, *MEANS, *CENTRES, NOISE)
@@ -100,7 +100,7 @@ class BaseRenderer:
             first = min(first, view.height - rows)
             start = dr.opaque(mi.UInt32, first)
             size = view.width, rows, samples
-            values = self.kernel(self.scene, self.light, self.tables, axes, film, rays, turn, start, *size)
+            values = self.kernel(self.scene, self.light, self.tables, camera, rays, turn, start, *size)
             dr.eval(values)
             for plane, value in zip(channels.values(), values, strict=True):
                 plane[first : first + rows] = np.array(value).reshape(rows, view.width)
@@ -116,8 +116,7 @@ class BaseRenderer:
         scene: Any,
         light: Any,
         tables: Any,
-        axes: Any,
-        film: Any,
+        camera: Camera,
         rays: Any,
         turn: Any,
         start: Any,
@@ -133,8 +132,7 @@ class BaseRenderer:
         Args:
             light: E and S, a texture of six channels for the front and one for the back.
             tables: places within a tile, steps of the random numbers.
-            axes: the camera's axes and its place, columns of c2w.
-            film: fl_x, fl_y, cx, cy in pixels.
+            camera: see `opaque_camera`.
             rays: ``samples``, as data.
             turn: number of the frame.
             start: the first row.
@@ -144,7 +142,8 @@ class BaseRenderer:
         mi = self.mi
         index = dr.arange(mi.UInt32, width * height * samples)
         pixel, sample = index // rays, index % rays
-        x, y = pixel % width, start + pixel // width
+        axes, film, across = camera
+        x, y = pixel % across, start + pixel // across
         tile = dr.gather(mi.UInt32, tables[0], (y % TILE) * TILE + x % TILE)
         order = mi.Float(sample * (TILE * TILE) + tile)
         number = order + mi.Float(turn * rays * (TILE * TILE))

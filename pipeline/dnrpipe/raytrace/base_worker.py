@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,8 +16,9 @@ from .engine import BundleWorker, masked
 from .frames import Frames
 from .history import History
 from .light_worker import read_light
+from .recorded import Stopwatch
 from .sensors import scaled_view
-from .tasks import BakedCommon, BaseAnswer, BaseTask, SampledCommon, costs_since
+from .tasks import BakedCommon, BaseAnswer, BaseTask, SampledCommon
 
 COLOUR = ("base.R", "base.G", "base.B", "base.A")
 PREMULTIPLIED = tuple(f"{kind}.{c}" for kind in ("base", "diffuse", "albedo", "fresh") for c in "RGB")
@@ -44,21 +44,16 @@ class Worker(BundleWorker):
         self.silhouettes: dict[tuple[int, int], Frames] = {}
         self.history, self.seen = History(self.engine.mi), list[tuple[View, int | None]]()
         """Of the frames ``seen``, and their rays per pixel."""
-        self.warm = False
         self.repaired = self.masked = 0  # pixels of the view at hand: samples left out, set to zero
 
     def __call__(self, asked: dict[str, Any]) -> BaseAnswer:
         task = BaseTask.model_validate(asked)
         view = task.view
-        if not self.warm:  # compiles the kernels, which is no cost of a frame
-            self.remembered(view, ()) if task.earlier is not None else self.channels(view)
-            self.seen, self.warm = [], True
         self.repaired = self.masked = 0
-        started, cpu = time.monotonic(), time.process_time()
-        earlier = task.earlier
+        watch, earlier = Stopwatch(), task.earlier
         channels = self.channels(view) if earlier is None else self.remembered(view, earlier, task.number)
         answer: BaseAnswer = {
-            **costs_since(started, cpu),
+            **watch.costs(),
             "kind": self.common.kind,
             "samples": self.common.samples,
             "repaired": self.repaired,

@@ -2,7 +2,8 @@
 
 Python that describes a frame to Dr.Jit (our integrators and BSDFs) takes ten times longer than the kernel of a frame at
 one sample per pixel. `recorded.Recorded` keeps the kernel. What differs between frames goes in as opaque numbers:
-camera, seed, samples; a Mitsuba sensor per view would be recorded anew each time, so rays are made here.
+camera, seed, samples; a Mitsuba sensor per view would be recorded anew each time, so rays are made here. Each kind of
+picture is recorded at its first one, which takes longer than the others.
 
 Notation
     n     rays of a launch: H x W x samples, those of a pixel side by side
@@ -25,14 +26,12 @@ from .auxiliary import shown_first
 from .engine import Engine
 from .lobes import lets_through, mean_of
 from .recorded import Recorded, prepare_emitters
-from .sensors import opaque_camera, scaled_view
+from .sensors import Camera, opaque_camera, scaled_view
 from .texels import ATTRIBUTE
 from .visibility import first_visible_of
 
 MAX_RAYS = 1 << 24
 """Of a launch: bounds its memory (2 GiB). What needs more is the mean of several launches."""
-WARM_FRAMES = 3
-"""Calls until nothing is recorded any more: the first ones teach Dr.Jit which inputs change."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +128,7 @@ class Frames:
     def _edge_kernel(self, count: int) -> Any:
         import drjit as dr
 
-        mi, scene, width, seen = self.mi, self.scene, self.size[0], seen_first(self.mi, self.scene)
+        mi, scene, seen = self.mi, self.scene, seen_first(self.mi, self.scene)
         cells = math.isqrt(count)
         if cells * cells != count:
             raise ValueError(f"rays: is {count}, expected a square number")
@@ -137,7 +136,7 @@ class Frames:
         @Recorded
         def kernel(camera: Any, pixel: Any, place: Any) -> list[Any]:
             offset = (mi.Point2f(place % cells, place // cells) + 0.5) / cells
-            hit = seen(scene, pinhole(mi, camera, pixel, offset, width), None)
+            hit = seen(scene, pinhole(mi, camera, pixel, offset), None)
             return [dr.select(hit.is_valid(), mi.Float(1), mi.Float(0))]
 
         return kernel
@@ -228,7 +227,7 @@ class Frames:
         elif cells > 1:
             cell = index - pixel * samples + start
             offset = (mi.Point2f(cell % cells, cell // cells) + offset) / cells
-        return pinhole(self.mi, camera, pixel, offset, self.size[0])
+        return pinhole(self.mi, camera, pixel, offset)
 
     @staticmethod
     def _means(values: list[Any], count: int) -> list[Any]:
@@ -251,14 +250,14 @@ class Frames:
     def _mean(self, make: Callable[[int, int], Any], view: View, rays: int, seed: int) -> np.ndarray:
         """What the kernel of ``make(rays, rays of a launch)`` gives, float32 [H, W, C]: the mean of its launches.
 
-        The kernel is made once, and warm. Of several launches each has a seed of its own.
+        The kernel is made once. Of several launches each has a seed of its own.
         """
         import drjit as dr
 
         launches = next(n for n in range(1, rays + 1) if rays % n == 0 and (n == rays or self._fits(rays // n)))
         each, key = rays // launches, (make.__name__, rays)
         if key not in self._kernels:
-            self._kernels[key] = self._warmed(make(rays, each), view, each)
+            self._kernels[key] = make(rays, each)
         total: Any = 0
         for launch in range(launches):
             start = dr.opaque(self.mi.UInt32, launch * each)
@@ -269,15 +268,6 @@ class Frames:
     def _fits(self, rays: int) -> bool:
         """Whether so many rays a pixel are no more than MAX_RAYS."""
         return rays * self.size[0] * self.size[1] <= MAX_RAYS
-
-    def _warmed(self, kernel: Any, view: View, samples: int) -> Any:
-        """``kernel`` after frames of several cameras and seeds: each input that changes is then known to."""
-        import drjit as dr
-
-        for turn in range(WARM_FRAMES):
-            nearer = view.model_copy(update={"fl_x": view.fl_x * (1 + 0.01 * turn), "cx": view.cx + 0.1 * turn})
-            self._image(kernel(*self._inputs(nearer, turn, samples), dr.opaque(self.mi.UInt32, turn)))
-        return kernel
 
     def _image(self, values: list[Any]) -> np.ndarray:
         width, height = self.size
@@ -292,11 +282,11 @@ def _differs(mask: np.ndarray) -> np.ndarray:
     return np.any(shifted, axis=0) & ~np.all(shifted, axis=0)
 
 
-def pinhole(mi: Any, camera: tuple[list[Any], list[Any]], pixel: Any, offset: Any, width: int) -> Any:
+def pinhole(mi: Any, camera: Camera, pixel: Any, offset: Any) -> Any:
     """Rays through places (0..1, 0..1) of pixels, numbered row by row. camera: see `sensors.opaque_camera`."""
     import drjit as dr
 
-    (right, up, back, origin), (fl_x, fl_y, cx, cy) = camera
+    (right, up, back, origin), (fl_x, fl_y, cx, cy), width = camera
     x = (mi.Float(pixel % width) + offset.x - cx) / fl_x
     y = (mi.Float(pixel // width) + offset.y - cy) / fl_y
     return mi.Ray3f(mi.Point3f(origin), dr.normalize(right * x - up * y - back))

@@ -272,7 +272,7 @@ class _Picture:
         import drjit as dr
 
         mi = self.mi
-        (right, up, back, origin), (fl_x, fl_y, cx, cy) = camera
+        (right, up, back, origin), (fl_x, fl_y, cx, cy), _ = camera
         normal, mask, depth = mi.Normal3f(*planes[12:15]), planes[15] > 0.5, planes[16]
         nearest = mi.Float(dr.inf)  # at rims: of the neighbours that see a surface
         for below in (-1, 0, 1):
@@ -333,7 +333,7 @@ class _Places:
     def __init__(self, mi: Any, picture: _Picture, camera: Any, points: Any) -> None:
         import drjit as dr
 
-        (right, up, back, origin), (fl_x, fl_y, cx, cy) = camera
+        (right, up, back, origin), (fl_x, fl_y, cx, cy), _ = camera
         self.mi, self.width, self.height = mi, picture.width, picture.height
         local = points - origin
         depth = -dr.dot(local, back)

@@ -21,10 +21,11 @@ class Worker:
 
     def __init__(self, common: dict[str, Any]) -> None:
         bundles: dict[str, list[Path]] = {}
-        for config in PilotCommon.model_validate(common).configs:
+        settings = PilotCommon.model_validate(common)
+        for config in settings.configs:
             bundles.setdefault(config.variant, []).append(config.bundle)
-        # One thread would stop the loader of a second variant.
-        threads = 1 if len(bundles) == 1 else 0
+        # What is compared is timed on one thread, which would stop the loader of a second variant.
+        threads = 1 if len(settings.configs) > 1 and len(bundles) == 1 else 0
         self.masked = 0  # pixels of the task at hand that were not finite
         self.engines = {name: Engine(name, threads, list(dict.fromkeys(paths))) for name, paths in bundles.items()}
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import gc
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, ClassVar
 
 from .lobes import media_of
+from .tasks import Costs, costs_since
 
 
 @contextmanager
@@ -47,8 +49,28 @@ class Recorded:
         return self.frozen.n_recordings
 
     def __call__(self, *arguments: Any) -> Any:
+        known, started = self.n_recordings, (time.monotonic(), time.process_time())
         with without_collection():
-            return self.frozen(*arguments)
+            values = self.frozen(*arguments)
+        if self.n_recordings > known:
+            Stopwatch.recording[0] += time.monotonic() - started[0]
+            Stopwatch.recording[1] += time.process_time() - started[1]
+        return values
+
+
+class Stopwatch:
+    """What pictures cost from its making on, without the seconds in which kernels were recorded."""
+
+    recording: ClassVar[list[float]] = [0.0, 0.0]
+    """Wall-clock and processor seconds of all recordings of this process."""
+
+    def __init__(self) -> None:
+        self.started, self.known = (time.monotonic(), time.process_time()), tuple(self.recording)
+
+    def costs(self) -> Costs:
+        """Up to now."""
+        times = zip(self.started, self.recording, self.known, strict=True)
+        return costs_since(*(started + recorded - known for started, recorded, known in times))
 
 
 def prepare_emitters(mi: Any, scene: Any) -> None:

@@ -17,14 +17,19 @@ from dnrtrain.contract import View
 SQUARE = 1e-6
 """Relative difference of the focal lengths up to which pixels count as square."""
 
+Camera = tuple[list[Any], list[Any], Any]
+"""Right, up, backwards and place, columns of c2w; fl_x, fl_y, cx, cy in pixels; the picture's width. As data of
+recorded kernels, which are compiled once for all views and sizes."""
 
-def opaque_camera(mi: Any, view: View) -> tuple[list[Any], list[Any]]:
-    """(right, up, backwards and place: columns of c2w; fl_x, fl_y, cx, cy in pixels), as data of recorded kernels."""
+
+def opaque_camera(mi: Any, view: View) -> Camera:
+    """The view's, in its own units."""
     import drjit as dr
 
     m = view.matrix
     axes = [mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in m[:3, i])) for i in range(4)]
-    return axes, [dr.opaque(mi.Float, float(value)) for value in (view.fl_x, view.fl_y, view.cx, view.cy)]
+    film = [dr.opaque(mi.Float, float(value)) for value in (view.fl_x, view.fl_y, view.cx, view.cy)]
+    return axes, film, dr.opaque(mi.UInt32, view.width)
 
 
 def sensor_dict(mi: Any, view: View, lens: dict[str, float] | None = None) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from ..effects.store import lenses
 from ..raytrace.variants import choose_variant
 from .records import BaselineRung
 from .shots.frame_tasks import FrameTask, Way
-from .shots.pilot import compared, display_of, shown
+from .shots.references import compared, display_of, shown
 from .shots.render_frames import frame_outcomes
 from .shots.renderers import path_tracer
 from .stage import Run

@@ -18,6 +18,7 @@ from ..core.workspace import Workspace
 from ..effects.plan import EffectPlan
 from ..effects.store import plan_of
 from ..workers.placement import Placement
+from ..workers.processes import KeptWorker
 from ..workers.task_list import run_tasks
 from ..workers.view_tasks import Book, Failures, is_made, task_name
 
@@ -33,6 +34,7 @@ class Run:
         stage: what the ledger books work under, and whose log workers write.
         id: names this run in the ledger.
         fingerprint: hash of all that the stage under way computes from; "" where none is.
+        kept: a worker that several task lists share, for those that say so.
     """
 
     workspace: Workspace
@@ -41,6 +43,7 @@ class Run:
     stage: StageName = "prepare"
     id: str = ""
     fingerprint: str = ""
+    kept: KeptWorker | None = None
 
     def for_stage(self, stage: StageName, fingerprint: str = "") -> Run:
         """The same command's work on a stage; what it knew of the scene is read anew."""
@@ -136,11 +139,12 @@ class Run:
         book: Book,
         environment: dict[str, str] | None = None,
         place: Placement | None = None,
+        kept: KeptWorker | None = None,
     ) -> None:
         """Run the tasks whose files are missing or out of date.
 
         Args:
-            module, common, environment: of `task_list.run_tasks`.
+            module, common, environment, kept: of `task_list.run_tasks`.
             place: where they run, instead of where the settings say.
 
         Raises TasksFailed after all other tasks are done when some failed twice. Raises OSError: the disk is full.
@@ -159,6 +163,7 @@ class Run:
             retried=failures.retried,
             environment=environment,
             place=place or self.place,
+            kept=kept,
         )
         with self.timed(f"{label}: processes"), self.console.bar(label, len(tasks), len(tasks) - len(due)) as bar:
             for outcome in failures.noted(outcomes):

@@ -18,7 +18,9 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -44,10 +46,24 @@ class LocalWorker:
     def __init__(self, module: str, common: dict[str, Any], log: Path | None, environment: dict[str, str]) -> None:
         self.module, self.common, self.log, self.environment = module, common, log, environment
         self._process: subprocess.Popen[str] | None = None
+        self._thread = 0
 
     def ready(self) -> bool:
         """A process is started when it is asked."""
         return True
+
+    @property
+    def runs(self) -> bool:
+        return self._process is not None and self._process.poll() is None
+
+    @property
+    def outlives_this_thread(self) -> bool:
+        """Whether another thread started the process."""
+        return self._thread != threading.get_ident()
+
+    def start(self) -> None:
+        """Start the process now, from this thread. Raises WorkerDied."""
+        self._process, self._thread = self._spawn(), threading.get_ident()
 
     def ask(self, task: dict[str, Any], timeout: float) -> dict[str, Any]:
         """The result of a task. Raises WorkerDied, TaskFailed."""
@@ -65,10 +81,10 @@ class LocalWorker:
 
         Raises WorkerDied, also after ``timeout`` seconds (``why``: where that number is from).
         """
-        if self._process is None or self._process.poll() is not None:
-            self._process = self._spawn()
+        if not self.runs:
+            self.start()
         process = self._process
-        assert process.stdin is not None and process.stdout is not None
+        assert process is not None and process.stdin is not None and process.stdout is not None
         hung = threading.Event()
 
         def kill() -> None:
@@ -135,6 +151,54 @@ class LocalWorker:
         return process
 
 
+class KeptWorker:
+    """A worker process that outlives a list of tasks: the next list that wants the same of it finds it warm.
+
+    There is one at a time. Linux kills it when the thread that asked for it ends. A context manager, which ends it.
+    """
+
+    def __init__(self) -> None:
+        self._stack = contextlib.ExitStack()
+        self._worker: LocalWorker | None = None
+        self._wanted: Any = None
+
+    def __enter__(self) -> KeptWorker:
+        return self
+
+    def __exit__(self, *exception: Any) -> None:
+        self.close()
+
+    def get(self, module: str, common: dict[str, Any], log: Path, environment: dict[str, str] | None) -> LocalWorker:
+        """The worker, another one where this is not what it was started for."""
+        wanted = (module, common, log, environment)
+        if self._worker is None or not self._worker.runs or self._wanted != wanted:
+            self.close()
+            self._wanted = wanted
+            folder = self._stack.enter_context(temporary_folder())
+            self._worker = LocalWorker(module, common, log, folder | (environment or {}))
+            with contextlib.suppress(WorkerDied):  # asked, it is started again, and says what is wrong
+                self._worker.start()
+            self._stack.callback(self._worker.close)
+        return self._worker
+
+    @property
+    def lives_on(self) -> bool:
+        """Whether it outlives the thread that asks: not where that one had to start it again."""
+        return self._worker is not None and self._worker.outlives_this_thread
+
+    def close(self) -> None:
+        """End it, so that its memory is free; the next `get` starts another."""
+        self._worker = None
+        self._stack.close()
+
+
+@contextlib.contextmanager
+def temporary_folder() -> Iterator[dict[str, str]]:
+    """Variables that name a folder for what workers leave behind: they end without Blender's own clean-up."""
+    with tempfile.TemporaryDirectory(prefix="dnrpipe-workers-", ignore_cleanup_errors=True) as folder:
+        yield dict.fromkeys(("TMPDIR", "TEMP", "TMP"), folder)
+
+
 def _exit_reason(process: subprocess.Popen[str]) -> str:
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(timeout=5)
@@ -165,17 +229,30 @@ def die_with_parent(parent: int) -> None:
 
 
 class Answerer:
-    """``MODULE.Worker(common)``, made on the first task: its failure is that task's answer."""
+    """``MODULE.Worker(common)``, made on the first task, or before by `get_ready`: a failure is that task's answer."""
 
     def __init__(self, module: str, common: dict[str, Any]) -> None:
         self.module, self.common = module, common
         self.worker: Any = None
+        self.failure: Exception | None = None
+
+    def get_ready(self) -> None:
+        try:
+            self.worker = self._made()
+        except Exception as error:
+            self.failure = error
+
+    def _made(self) -> Any:
+        return importlib.import_module(self.module).Worker(self.common)
 
     def __call__(self, task: dict[str, Any]) -> dict[str, Any]:
         """``{"result": ...}``, or ``{"error": one line, "retry": whether it is worth a second try, "errno": ...}``."""
         try:
+            failure, self.failure = self.failure, None
+            if failure is not None:
+                raise failure
             if self.worker is None:
-                self.worker = importlib.import_module(self.module).Worker(self.common)
+                self.worker = self._made()
             return {"result": self.worker(task)}
         except Exception as error:  # reported to the parent, the traceback goes to the log
             import traceback
@@ -196,6 +273,7 @@ def _worker_main(module: str, parent: int) -> int:
     answers = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
     answerer = Answerer(module, json.loads(sys.stdin.readline()))
+    answerer.get_ready()
     for line in sys.stdin:
         answers.write(json.dumps(answerer(json.loads(line))) + "\n")
         answers.flush()

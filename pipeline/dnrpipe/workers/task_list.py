@@ -10,10 +10,10 @@ from __future__ import annotations
 import errno
 import os
 import queue
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Generator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from typing import Any
 from ..core.errors import UserError
 from ..core.units import parse_seconds
 from .placement import HERE, Placement, Worker, WorkerLost
-from .processes import LocalWorker
+from .processes import KeptWorker, LocalWorker, temporary_folder
 
 MAX_ATTEMPTS, MOST_LOSSES = 2, 3
 TIMEOUT_VARIABLE = "DNRPIPE_TASK_TIMEOUT"
@@ -106,6 +106,7 @@ def run_tasks(
     environment: dict[str, str] | None = None,
     next_tasks: Callable[[TaskResult], Sequence[dict[str, Any]]] | None = None,
     place: Placement = HERE,
+    kept: KeptWorker | None = None,
 ) -> Generator[TaskResult, None, None]:
     """Run ``tasks`` on ``workers`` workers; yield each task's outcome as it comes.
 
@@ -119,6 +120,7 @@ def run_tasks(
         next_tasks: called with each TaskResult before it is yielded; returns tasks to do after it.
         place: where the workers are. On a cluster ``workers`` says how many share one machine like this one; there
             are as many as the cluster has room for.
+        kept: the one worker, of this machine, which lives on when all tasks are answered for.
 
     Closing the iterator (Ctrl-C in the consumer) kills the workers.
 
@@ -131,13 +133,14 @@ def run_tasks(
     outcomes: queue.SimpleQueue[TaskResult | Retry] = queue.SimpleQueue()
     stopping = threading.Event()
     open_tasks = len(tasks)  # not answered for yet: written by the consumer alone, read by the workers' threads
-    # Workers end without Blender's own clean-up (see _worker_main); what it leaves in the temporary folder goes here.
-    temp_dir = tempfile.TemporaryDirectory(prefix="dnrpipe-workers-", ignore_cleanup_errors=True)
-    worker_environment = dict.fromkeys(("TMPDIR", "TEMP", "TMP"), temp_dir.name) | (environment or {})
+    left_behind = ExitStack()
     answering: list[Worker] = []
-    if place.is_local:
+    if kept is not None:
+        answering.append(kept.get(module, common, log, environment))
+    elif place.is_local:
         count = max(1, min(workers, len(tasks)))
-        answering += [LocalWorker(module, common, log, worker_environment) for _ in range(count)]
+        variables = left_behind.enter_context(temporary_folder()) | (environment or {})
+        answering += [LocalWorker(module, common, log, variables) for _ in range(count)]
     else:
         from .ray_workers import ray_workers
 
@@ -183,7 +186,8 @@ def run_tasks(
                     died, number = answer.get("died", False), answer.get("errno")
                     outcomes.put(TaskResult(task, None, answer["error"], attempt, seconds, died, number, node))
         finally:
-            worker.close(force=stopping.is_set())
+            if kept is None or stopping.is_set() or not kept.lives_on:
+                worker.close(force=stopping.is_set())
 
     threads = [threading.Thread(target=serve, args=(worker,), daemon=True) for worker in answering]
     for thread in threads:
@@ -208,4 +212,4 @@ def run_tasks(
                 worker.kill()
         for thread in threads:
             thread.join(timeout=10)
-        temp_dir.cleanup()
+        left_behind.close()

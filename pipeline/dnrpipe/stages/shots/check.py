@@ -1,14 +1,6 @@
 """Held-out frames of a finished shot against references that are traced for it.
 
-Notation
-    A_i     pictures of a frame that are path-traced and denoised, each with random numbers of its own; k of them
-    truth   their mean
-    noise   mean square error of the truth by how far the A_i differ: their variance / k
-    error   mean square difference between the shot's frame and the truth, less the noise, which adds to it
-
-k is doubled until the noise is at most NOISE of the error. What the A_i have in common, the denoiser's bias, does not
-show in it. Measured on `interior`: two pictures of 32 samples tell PSNR, noise included, within 0.05 dB and LPIPS
-within 0.003 of what one of 256 does.
+Their number of pictures (notation: `references`) is doubled until their noise is at most NOISE of the error.
 """
 
 from __future__ import annotations
@@ -26,17 +18,17 @@ from ...core.images import flip_error, picture_of, write_png
 from ...core.workspace import digest
 from ..stage import Run
 from .frame_tasks import FrameTask, Way
-from .pilot import REFERENCE_SEED, compared, display_of, shown
 from .records import Check, ShotFrame
+from .references import FEWEST, SEED, SPP, Truth, compared, decibels, display_of, shown
 from .render_frames import frame_path, render_frames
 from .renderers import Renderer
 
-LEAST, MOST = 32, 256
-"""Samples of a picture A_i; for path-traced frames, four times their own: the bias of their denoiser is to show."""
-FEWEST, PICTURES = 2, 8
-"""k."""
+MOST = 256
+"""Samples of a picture A_i at most. Of a path-traced frame it has four times that one's, whose denoiser's bias is to
+show."""
+PICTURES = 8
+"""k at most."""
 NOISE = 0.25
-LEAST_ERROR = 1e-8
 
 
 def held_out(frames: Sequence[ShotFrame], count: int) -> list[int]:
@@ -59,7 +51,7 @@ class Held:
     @property
     def spp(self) -> int:
         """Samples per pixel of a picture A_i."""
-        return min(MOST, max(LEAST, 4 * self.way.spp)) if self.way.name == "path" else LEAST
+        return min(MOST, max(SPP, 4 * self.way.spp)) if self.way.name == "path" else SPP
 
     def task(self, folder: Path, inputs: Any, number: int) -> FrameTask:
         """Renders A_number."""
@@ -70,7 +62,7 @@ class Held:
             view=self.frame.view,
             way=way,
             lens=self.frame.lens,
-            seed=REFERENCE_SEED + number,
+            seed=SEED + number,
             output=stem.with_suffix(".exr"),
             picture=stem.with_suffix(".png"),
             fingerprint=digest(decides),
@@ -92,20 +84,23 @@ def check(run: Run, held: Sequence[Held], folder: Path, inputs: Any, lpips: Any)
             render_frames(run, tracer, flat, label="frames to check by", purpose="evaluation")
             noisy = []
             for one, own in zip(due, tasks, strict=True):
-                pictures: list[Any] = [shown(display, task.output) for task in own]
                 ours: Any = shown(display, frame_path(folder, one.frame))
-                truth: Any = sum(pictures) / count
-                noise = float(np.mean([((picture - truth) ** 2).mean() for picture in pictures])) / (count - 1)
-                error = max(float(((ours - truth) ** 2).mean()) - noise, LEAST_ERROR)
-                if noise > NOISE * error and count < PICTURES:
+                truth = Truth.of([shown(display, task.output) for task in own])
+                error = truth.error(ours)
+                if truth.noise > NOISE * error and count < PICTURES:
                     noisy.append(one)
                     continue
                 stem = folder / "check" / f"{one.frame.number:05d}"
-                flip, heat = flip_error(picture_of(truth[0]), picture_of(ours[0]))
-                write_png(stem.with_suffix(".truth.png"), picture_of(truth[0]))
+                flip, heat = flip_error(picture_of(truth.picture[0]), picture_of(ours[0]))
+                write_png(stem.with_suffix(".truth.png"), picture_of(truth.picture[0]))
                 write_png(stem.with_suffix(".ours.png"), picture_of(ours[0]))
                 write_png(stem.with_suffix(".error.png"), heat)
-                found = {**compared(ours, truth, lpips), "flip": flip, "noise": noise / error, "error": error}
+                found = {
+                    **compared(ours, truth.picture, lpips),
+                    "flip": flip,
+                    "noise": truth.noise / error,
+                    "error": error,
+                }
                 rows.append({"number": one.frame.number, "spp": count * one.spp, **found})
             due, count = noisy, 2 * count
     mean = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
@@ -113,7 +108,7 @@ def check(run: Run, held: Sequence[Held], folder: Path, inputs: Any, lpips: Any)
         frames=tuple(sorted(int(row["number"]) for row in rows)),
         spp=round(mean["spp"]),
         noise=mean["noise"],
-        psnr=float(np.mean([-10 * np.log10(row["error"]) for row in rows])),
+        psnr=float(np.mean([decibels(row["error"]) for row in rows])),
         ssim=mean["ssim"],
         lpips=mean.get("lpips"),
         flip=mean["flip"],

@@ -57,7 +57,7 @@ class FrameCommon(Task):
     Args:
         bundle, variant, integrator, max_depth: of path tracing (`effects.store.trace_config`).
         base: common of the base image worker (`raytrace.tasks.BakedCommon`), or None: frames are path-traced only.
-        checkpoint: folder of the model; None: the shipped corrector, of which ``trust`` is applied.
+        checkpoint: folder of the model; None: the shipped corrector.
         scene, frame: folder and facts of the converted scene, for the display transform.
         device: setting of torch.
         background: the camera sees the world behind everything.
@@ -69,7 +69,6 @@ class FrameCommon(Task):
     max_depth: int
     base: dict[str, Any] | None = None
     checkpoint: Path | None = None
-    trust: float = 1.0
     scene: Path
     frame: SceneFrame
     device: str = "auto"
@@ -81,6 +80,7 @@ class FrameTask(Task):
 
     Args:
         lens: thin lens of the camera, for ``path``; other ways have pinholes.
+        trust: share of the shipped corrector's correction that is applied.
         plain: where the base image alone goes, too; of ``neural``. For comparison: it has no picture.
         earlier: the frames of the camera's way that this one remembers (`raytrace.history`), in their order; None: it
             stands alone. number: of the first of them in the camera's way.
@@ -91,6 +91,7 @@ class FrameTask(Task):
     lens: Lens | None = None
     earlier: tuple[View, ...] | None = None
     number: int = 0
+    trust: float = 1.0
     seed: int
     output: Path
     picture: Path
@@ -101,7 +102,8 @@ class FrameTask(Task):
 class FrameAnswer(Costs):
     """Also in the header of the file, but for the seconds that writing it took.
 
-    masked: pixels that were not finite and are 0. ms: milliseconds of the parts.
+    masked: pixels that were not finite and are 0. ms: milliseconds of the parts. The seconds, not the milliseconds, leave
+    out what recording kernels took.
     """
 
     way: str

@@ -22,8 +22,7 @@ from dnrpipe.raytrace.base_worker import Worker as BaseWorker
 from dnrpipe.raytrace.denoise import denoise
 from dnrpipe.raytrace.engine import Engine, masked, masked_channels
 from dnrpipe.raytrace.frames import Frames
-from dnrpipe.raytrace.tasks import costs_since
-from dnrtrain.contract import View
+from dnrpipe.raytrace.recorded import Stopwatch
 from dnrtrain.dataset import view_in_memory
 from dnrtrain.display import DisplayTransform
 from dnrtrain.exr import write_exr
@@ -36,9 +35,8 @@ GUIDE_RAYS = 16
 """Primary rays per pixel of the denoiser's auxiliary images: clean."""
 MAX_RAYS = 1 << 22
 """Of a launch of the path tracer: bounds its memory."""
-MANY, EACH = 64, 16
-"""Pictures of more than so many samples per pixel, which are references, take this many a launch: recording a kernel
-renders several pictures."""
+EACH = 16
+"""Samples per pixel of a launch at most: a kernel is recorded for each number of them."""
 Layers = dict[str, np.ndarray]
 
 
@@ -56,7 +54,6 @@ class Worker:
             functools.partial(Frames, self.engine, settings.bundle, settings.integrator, settings.max_depth)
         )  # by (width, height)
         self.background = Background(self.engine, settings.bundle) if settings.background else None
-        self.warm: set[tuple[str, int, int, int]] = set()
 
     @functools.cached_property
     def model(self) -> Any:
@@ -67,26 +64,16 @@ class Worker:
         device = torch_device(Settings(device=self.common.device))
         if self.common.checkpoint is not None:
             return load_model(self.common.checkpoint, device)
-        model = corrector()
-        model.settings = model.settings.model_copy(update={"trust": self.common.trust})
-        return model.to(device)
+        return corrector().to(device)
 
     def __call__(self, asked: dict[str, Any]) -> FrameAnswer:
         task = FrameTask.model_validate(asked)
-        way = task.way if task.way.name != "path" else task.way.model_copy(update={"spp": _at_once(task)})
-        kernel = (way.name, way.spp, task.view.width, task.view.height)
-        if kernel not in self.warm:  # compiles the kernels, which is no cost of a frame
-            self.render(task.model_copy(update={"way": way, "earlier": task.earlier and task.earlier[-1:]}), {})
-            if self.base is not None:
-                self.base.seen = []
-            self.warm.add(kernel)
         ms: dict[str, float] = {}
-        started, cpu = time.monotonic(), time.process_time()
+        watch = Stopwatch()
         (layers, *plain), lost = self.render(task, ms)
         picture = self.shown(layers)
-        costs = costs_since(started, cpu)
         answer: FrameAnswer = {
-            **costs,
+            **watch.costs(),
             "way": task.way.name,
             "spp": task.way.spp,
             "masked": lost,
@@ -143,7 +130,7 @@ class Worker:
         lost = self.base.masked
         colours: list[np.ndarray] = []
         if task.way.name == "neural":
-            colours.append(timed(NETWORK, self._corrected, task.view, channels))
+            colours.append(timed(NETWORK, self._corrected, task, channels))
         if task.way.name == "base" or task.plain is not None:
             premultiplied = np.stack([channels[f"base.{c}"] for c in "RGB"], axis=-1)
             colours.append(premultiplied / np.maximum(channels["base.A"], LEAST_ALPHA)[..., None])
@@ -152,9 +139,11 @@ class Worker:
             others | {name: colour[..., i] * alpha for i, name in enumerate("RGB")} | {"A": alpha} for colour in colours
         ], lost
 
-    def _corrected(self, view: View, channels: dict[str, np.ndarray]) -> np.ndarray:
+    def _corrected(self, task: FrameTask, channels: dict[str, np.ndarray]) -> np.ndarray:
         """The network's radiance, linear Rec.709, straight, float32 [H, W, 3]."""
-        data = view_in_memory(channels, self.common.frame, view, display=self.display, base="baked")
+        if self.common.checkpoint is None:
+            self.model.settings = self.model.settings.model_copy(update={"trust": task.trust})
+        data = view_in_memory(channels, self.common.frame, task.view, display=self.display, base="baked")
         radiance = render(self.model, data.to(next(self.model.parameters()).device)).radiance
         if radiance is None:
             raise UserError("shots need a model whose output is radiance: type --set model.output=log")
@@ -188,6 +177,5 @@ class Worker:
 
 def _at_once(task: FrameTask) -> int:
     """Samples per pixel of one launch: a power of two, so that few kernels are compiled."""
-    spp = task.way.spp if task.way.spp <= MANY else EACH
-    most = min(spp, MAX_RAYS // (task.view.width * task.view.height))
+    most = min(task.way.spp, EACH, MAX_RAYS // (task.view.width * task.view.height))
     return 1 << max(0, most.bit_length() - 1)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from dnrtrain.records import read, write
 from ...core.scene_files import scene_fingerprint
 from ...core.units import duration
 from ...core.workspace import digest, file_sha256
+from ...workers.processes import KeptWorker
 from ...workers.view_tasks import is_made
 from ..base_images import BASE_VERSION, base_renderer, light_plan
 from ..effect_plan import resolve_plan
@@ -31,12 +32,12 @@ from .frame_tasks import Way
 from .options import Wanted, choose
 from .plan_shot import lines, moving_way, weigh
 from .records import PLAN, RECORD, ShotFrame, ShotPlan, ShotRecord, facts
-from .render_frames import frame_tasks, pictures, render_frames
+from .render_frames import be_ready, frame_tasks, pictures, render_frames
 from .renderers import Renderer, path_tracer, shipped_renderer, trained_renderer
 
 CHECKED = 2
 """Frames of a shot that are traced to check it."""
-PLAN_VERSION = 9
+PLAN_VERSION = 10
 LIGHT_SIZES = (1024, 2048)
 """Texels of the light map's side: of few frames, of many."""
 BATCH = 8
@@ -60,17 +61,21 @@ class Shot:
     wanted: Wanted
 
 
-def plan_shot(session: Session, shot: Shot) -> ShotPlan:
-    """Measure ways to make the shot on small frames, choose, and say so. A plan of the same shot is kept."""
+def plan_shot(session: Session, shot: Shot, kept: KeptWorker) -> ShotPlan:
+    """Measure ways to make the shot on small frames, choose, and say so. A plan of the same shot is kept.
+
+    kept: what renders them.
+    """
     started = time.monotonic()
     choose_light(session, shot.frames)
-    run = session.run.for_stage("render")
+    run = _run(session, kept)
     tracer, path = path_tracer(run, shot.background), folder_of(run, shot) / PLAN
     inputs = [tracer.common.model_dump(mode="json"), run.scene_fingerprint, shot.wanted.model_dump(mode="json")]
     frames = [frame.model_dump(mode="json") for frame in shot.frames]
     fingerprint = digest([PLAN_VERSION, *inputs, frames, run.settings.model_dump(mode="json")])
     plan = read(path, ShotPlan) if path.exists() and not session.options["force"] else None
     if plan is None or plan.fingerprint != fingerprint:
+        be_ready(run, tracer)
         options, trust = weigh(run, shot.frames, folder_of(run, shot) / "pilot", shot.wanted, tracer, lpips_of(run))
         chosen, why = choose(options, shot.wanted)
         plan = ShotPlan(
@@ -99,27 +104,30 @@ def choose_light(session: Session, frames: Sequence[ShotFrame]) -> None:
         session.adopt({"base": {"light_size": few}})
 
 
-def make_shot(session: Session, shot: Shot, plan: ShotPlan) -> ShotRecord:
+def make_shot(session: Session, shot: Shot, plan: ShotPlan, kept: KeptWorker) -> ShotRecord:
     """Carry the plan out: train where it says so, render all frames, make the movie, check.
+
+    kept: as of `plan_shot`; what rendered its pictures renders the frames, too, where they are of the same kind.
 
     Raises UserError, TasksFailed: as the stages do.
     """
     started = time.monotonic()
-    run, chosen = session.run.for_stage("render"), plan.chosen
+    run, chosen = _run(session, kept), plan.chosen
     folder, tracer = folder_of(run, shot), path_tracer(run, shot.background)
     if chosen.way.name == "path":
         renderer = tracer
     elif chosen.views:
+        kept.close()  # training wants the memory
         session.settings = session.settings.with_budget(chosen.views)
         session.stages("select", "raytrace", "finetune")
-        run = session.run.for_stage("render")
+        run = _run(session, kept)
         renderer = trained_renderer(run, shot.background)
     else:
         assert plan.trust is not None  # ways with baked light were weighed
         renderer = shipped_renderer(run, shot.background, plan.trust)
     inputs = _inputs(run, renderer)
     still = [place for place, frame in enumerate(shot.frames) if not frame.moving]
-    tasks = frame_tasks(shot.frames, folder, chosen.way, inputs, still)
+    tasks = frame_tasks(shot.frames, folder, chosen.way, inputs, still, renderer.trust)
     render_frames(run, renderer, tasks, label=f"frames by {chosen.way.told}")
     places = held_out(shot.frames, CHECKED)
     way_of_moving = render_moving(run, shot, plan, tracer, inputs, places)
@@ -173,6 +181,10 @@ def render_moving(
             if place not in checked:
                 shutil.rmtree(scene_at(run.workspace, number))
     return way
+
+
+def _run(session: Session, kept: KeptWorker) -> Run:
+    return replace(session.run.for_stage("render"), kept=kept)
 
 
 def _held(run: Run, frame: ShotFrame, tracer: Renderer, way: Way, way_of_moving: Way | None) -> Held:

@@ -9,30 +9,25 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from dnrtrain.contract import View
-from dnrtrain.exr import read_exr
 
 from ...core.cameras import spread, window
 from ...core.errors import UserError
-from ...core.images import over_white
-from ...core.scene_files import read_frame
 from ..stage import Run
 from ..trust import SHARES
-from .frame_tasks import COLOUR, NETWORK, FrameTask, Way
+from .frame_tasks import NETWORK, FrameTask, Way
 from .records import ShotFrame
+from .references import FEWEST, SEED, SPP, Truth, compared, decibels, display_of, shown
 from .render_frames import frame_outcomes
 from .renderers import Renderer
-
-if TYPE_CHECKING:
-    from dnrtrain.display import DisplayTransform
 
 FRAMES, SIZE = 2, (192, 108)
 """Frames of the pilot, and pixels of a window."""
@@ -40,9 +35,7 @@ PLACES = ((0.2, 0.7), (0.75, 0.4))
 """Of the windows in a frame."""
 LADDER, MOST = (1, 4, 16), 64
 """Samples per pixel of path-traced pictures; and the most that are reckoned from them (`reckoned`)."""
-REFERENCE = Way(name="path", spp=128)
-REFERENCE_SEED = 1 << 16
-"""Above the seeds of frames."""
+REFERENCE = Way(name="path", spp=SPP)
 LEAD = 4
 """Frames before a frame of the pilot that it remembers."""
 SAME, LEAST_LPIPS = 99.0, 1e-6
@@ -51,7 +44,7 @@ SAME, LEAST_LPIPS = 99.0, 1e-6
 
 @dataclass(frozen=True)
 class Measured:
-    """A way on the pilot's windows. pixel: seconds per pixel, files included. start: seconds until its process renders.
+    """A way on the pilot's windows. pixel: seconds per pixel of a whole frame, files included. start: seconds until its process renders.
     psnr: of all their pixels, dB. lpips: mean, or None where there are no weights. Windows without surfaces do not
     count, unless none has any."""
 
@@ -64,13 +57,20 @@ class Measured:
 
 @dataclass(frozen=True)
 class _Window:
-    """key: of the window. picture: display RGB over white [1, 3, H, W]. spent: its seconds. start: those from the start
-    of the process to its first picture."""
+    """key: of the window. picture: display RGB over white [1, 3, H, W]. spent: its seconds."""
 
     key: int
     picture: Any
     spent: float
+
+
+@dataclass(frozen=True)
+class _Process:
+    """start: seconds from its start to its first picture. whole: those of a frame by its pixels over those of the
+    frame's windows by theirs, of one way: windows show more than the sky, and each has a price of its own."""
+
     start: float
+    whole: float
 
 
 class Pilot:
@@ -82,26 +82,24 @@ class Pilot:
         self.display = display_of(run)
         chosen = spread(still or range(len(frames)), FRAMES)  # where all move: as converted
         self.windows = [(index, place) for index in chosen for place in PLACES]
-        self.references: dict[int, Any] = {}
+        self.references: dict[int, Truth] = {}
+        self.processes: dict[bool, _Process] = {}  # whether it path traces
         self.rows: dict[Way, list[_Window]] = {}
 
-    def measure(
-        self, renderer: Renderer, ways: Sequence[Way], enough: Callable[[Measured], bool] | None = None
-    ) -> list[Measured]:
-        """The ways on the windows, one after the other in a process of its own; of each neural one also the base image
-        that it corrects, before it.
-
-        enough: told the first way once it is measured; the others are left out where it says so. (Asking after each
-            way would disturb the seconds of the next.)
+    def measure(self, renderer: Renderer, ways: Sequence[Way]) -> list[Measured]:
+        """The ways on the windows, one after the other; of each neural one also the base image that it corrects,
+        before it. The references come first where there are none yet, then a whole frame by the first way.
 
         Raises UserError: a frame failed twice.
         """
         tasks: list[FrameTask] = []
         keys: list[int | None] = []  # the window, where it is measured
-        first, last = ways[0], ways[-1]
-        if not self.references:
-            ways = [REFERENCE, *ways]
-        for way in ways:
+        drawn: dict[int, list[Any]] = {}
+        tracing = ways[0].name == "path"
+        known = tracing in self.processes
+        references = [] if self.references else [REFERENCE] * FEWEST
+        for turn, way in enumerate([*references, *ways]):
+            seed = SEED + turn if turn < len(references) else 0
             for key, (index, place) in enumerate(self.windows):
                 lead = [] if way.name == "path" else list(self._lead(index))
                 for number, at in enumerate([*lead, index]):
@@ -110,10 +108,13 @@ class Pilot:
                     # that would cost the memory.
                     rendered = way if at == index or number == 0 else base_of(way)
                     keys.append(key if at == index else None)
-                    tasks.append(self._task(rendered, at, place, earlier, len(tasks)))
+                    tasks.append(self._task(rendered, at, place, earlier, len(tasks), seed))
+        if not known:
+            keys.append(None)
+            tasks.append(self._task(ways[0], self.windows[0][0], None, None if tracing else (), len(tasks), 0))
         found: dict[Way, list[_Window]] = {}
-        start: float | None = None
-        label = "pilot: " + ("path tracing" if last.name == "path" else "base image and network")
+        start, spent = None, 0.0
+        label = "pilot: " + ("path tracing" if tracing else "base image and network")
         with (
             closing(frame_outcomes(self.run, renderer, tasks, "pilot")) as outcomes,
             self.run.console.bar(label, len(tasks)) as bar,
@@ -133,20 +134,20 @@ class Pilot:
                 spent = outcome.result["seconds"] + outcome.result["write_seconds"]
                 if start is None:
                     start = max(0.0, outcome.seconds - spent)
-                if key is not None:
+                if key is not None and task.seed >= SEED:
+                    drawn.setdefault(key, []).append(shown(self.display, task.output))
+                elif key is not None:
                     if task.plain is not None:
                         network = outcome.result["ms"][NETWORK] / 1000
-                        row = _Window(key, shown(self.display, task.plain), spent - network, start)
+                        row = _Window(key, shown(self.display, task.plain), spent - network)
                         found.setdefault(base_of(task.way), []).append(row)
-                    row = _Window(key, shown(self.display, task.output), spent, start)
+                    row = _Window(key, shown(self.display, task.output), spent)
                     found.setdefault(task.way, []).append(row)
                 bar.advance(note=task.way.told)
-                if not self.references and len(found.get(REFERENCE, [])) == len(self.windows):
-                    self.references = {row.key: row.picture for row in found.pop(REFERENCE)}
-                if enough is not None and len(found.get(first, [])) == len(self.windows):
-                    if enough(self._measured(first, found[first])):
-                        break
-                    enough = None
+        if not known:
+            pixel = float(np.mean([row.spent for row in found[ways[0]]])) / _pixels(tasks[0].view)
+            self.processes[tracing] = _Process(start or 0.0, spent / _pixels(tasks[-1].view) / pixel)
+        self.references |= {key: Truth.of(pictures) for key, pictures in drawn.items()}
         self.rows |= found
         return [self._measured(way, rows) for way, rows in found.items()]
 
@@ -158,24 +159,26 @@ class Pilot:
         """
         pairs = {way: list(zip(self.rows[base_of(way)], self.rows[way], strict=True)) for way in ways}
         everything = [both for rows in pairs.values() for both in rows]
-        share = best_mix([(a.picture, b.picture, self.references[a.key]) for a, b in everything])
+        share = best_mix([(a.picture, b.picture, self.references[a.key].picture) for a, b in everything])
         mixed = {
             way: [replace(b, picture=a.picture.lerp(b.picture, share)) for a, b in rows] for way, rows in pairs.items()
         }
         return share, [self._measured(way, rows) for way, rows in mixed.items()]
 
     def _measured(self, way: Way, rows: Sequence[_Window]) -> Measured:
-        every = [compared(row.picture, self.references[row.key], self.lpips) for row in rows]
+        every = []
+        for row in rows:
+            truth = self.references[row.key]
+            every.append({**compared(row.picture, truth.picture, self.lpips), "error": truth.error(row.picture)})
         # A window without any surface is the same by every way, and would flatter them all.
         figures = [found for found in every if found["psnr"] < SAME] or every
         distances = [found["lpips"] for found in figures if "lpips" in found]
-        view = self._view(*self.windows[0])
-        errors = [10 ** (-found["psnr"] / 10) for found in figures]
+        process = self.processes[way.name == "path"]
         return Measured(
             way=way,
-            pixel=float(np.mean([row.spent for row in rows])) / (view.width * view.height),
-            start=rows[0].start,
-            psnr=-10 * math.log10(float(np.mean(errors))),
+            pixel=process.whole * float(np.mean([row.spent for row in rows])) / _pixels(self._view(*self.windows[0])),
+            start=process.start,
+            psnr=decibels(float(np.mean([found["error"] for found in figures]))),
             lpips=float(np.mean(distances)) if distances else None,
         )
 
@@ -186,11 +189,19 @@ class Pilot:
             first -= 1
         return range(first, index)
 
-    def _view(self, index: int, place: tuple[float, float]) -> View:
-        return window(self.frames[index].view, *SIZE, place)
+    def _view(self, index: int, place: tuple[float, float] | None) -> View:
+        """A window of a frame; None: the whole frame."""
+        view = self.frames[index].view
+        return view if place is None else window(view, *SIZE, place)
 
     def _task(
-        self, way: Way, index: int, place: tuple[float, float], earlier: tuple[View, ...] | None, number: int
+        self,
+        way: Way,
+        index: int,
+        place: tuple[float, float] | None,
+        earlier: tuple[View, ...] | None,
+        number: int,
+        seed: int,
     ) -> FrameTask:
         stem = f"{number:03d}-{way.name}"
         return FrameTask(
@@ -198,12 +209,16 @@ class Pilot:
             way=way,
             lens=self.frames[index].lens,
             earlier=earlier,
-            seed=REFERENCE_SEED if way == REFERENCE else 0,
+            seed=seed,
             output=self.folder / f"{stem}.exr",
             picture=self.folder / f"{stem}.png",
             plain=self.folder / f"{stem}-plain.exr" if way.name == "neural" else None,
             fingerprint="",
         )
+
+
+def _pixels(view: View) -> int:
+    return view.width * view.height
 
 
 def base_of(way: Way) -> Way:
@@ -218,31 +233,6 @@ def best_mix(pictures: Sequence[tuple[Any, Any, Any]]) -> float:
         return sum(float((plain.lerp(other, share) - truth).square().mean()) for plain, other, truth in pictures)
 
     return min(SHARES, key=error)
-
-
-def compared(picture: Any, truth: Any, lpips: Any) -> dict[str, float]:
-    """psnr (dB), ssim and, where the pictures are large enough for it, lpips of display pictures [1, 3, H, W]."""
-    import torch
-
-    from dnrtrain.metrics import image_metrics
-
-    everywhere = torch.ones_like(truth[:, :1])
-    found = image_metrics(picture, truth, everywhere, None if lpips is None else {"alex": lpips})
-    named = {"psnr": found["psnr"], "ssim": found["ssim"], "lpips": found["lpips_alex"]}
-    return {name: value for name, value in named.items() if value is not None}
-
-
-def display_of(run: Run) -> DisplayTransform:
-    """The scene's display transform. Raises DamagedFile."""
-    from dnrtrain.display import DisplayTransform
-
-    return DisplayTransform(read_frame(run.workspace), run.workspace.scene)
-
-
-def shown(display: DisplayTransform, path: Path) -> Any:
-    """A frame's file as display RGB over white, torch [1, 3, H, W]. Raises DamagedFile."""
-    channels, _ = read_exr(path)
-    return over_white(display, np.stack([channels[name] for name in COLOUR], axis=-1)).clamp(0, 1)
 
 
 def reckoned(measured: Sequence[Measured], most: int) -> list[Measured]:

@@ -49,18 +49,16 @@ def weigh(
     moving = sum(bool(frame.moving) for frame in frames)
     shape = Shape(len(frames) - moving, moving, view.width * view.height, _conversion_seconds(run))
     pilot = Pilot(run, frames, folder, lpips)
-    quick = [Way(name="path", spp=spp, quality="balanced") for spp in (STEADY, *(n for n in LADDER if n != STEADY))]
-
-    def enough(found: Measured) -> bool:
-        told = found.lpips is not None and found.psnr < SAME  # windows that show something
-        return told and path_option(found, shape).reaches(*USUAL)
-
-    ladder = [*quick, *(Way(name="path", spp=spp) for spp in LADDER)]
-    measured = pilot.measure(tracer, ladder, enough if wanted.aimless and not _light_is_ready(run) else None)
-    if len(measured) == 1:
-        run.console.say(f"baked light is not weighed: {quick[0].told}, are as good as it usually is, in its time")
-        return [path_option(measured[0], shape)], None
-    rungs = [*reckoned(measured[: len(quick)], max(LADDER)), *reckoned(measured[len(quick) :], MOST)]
+    steady = Way(name="path", spp=STEADY, quality="balanced")
+    quick = pilot.measure(tracer, [steady])
+    option, told = path_option(quick[0], shape), quick[0].lpips is not None and quick[0].psnr < SAME
+    if told and option.reaches(*USUAL) and wanted.aimless and not _light_is_ready(run):
+        run.console.say(f"baked light is not weighed: {steady.told}, are as good as it usually is, in its time")
+        return [option], None
+    others = [steady.model_copy(update={"spp": spp}) for spp in LADDER if spp != STEADY]
+    measured = pilot.measure(tracer, [*others, *(Way(name="path", spp=spp) for spp in LADDER)])
+    quick += measured[: len(others)]
+    rungs = [*reckoned(quick, max(LADDER)), *reckoned(measured[len(others) :], MOST)]
     options = [path_option(found, shape) for found in rungs]
     if why := _no_baked_light(run, frames, shape, rungs, wanted):
         run.console.say(f"baked light is not weighed: {why}")
@@ -68,6 +66,8 @@ def weigh(
     rays = run.settings.base.samples
     counts = [*(n for n in FEWER if n < rays), rays]
     ways = [Way(name="base" if wanted.way == "base" else "neural", spp=n) for n in counts]
+    if run.kept is not None:
+        run.kept.close()  # baking wants the memory
     renderer, trust = shipped_renderer(run, tracer.common.background, trust=1.0), 0.0
 
     measured = pilot.measure(renderer, ways)

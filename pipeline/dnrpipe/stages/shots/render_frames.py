@@ -20,7 +20,7 @@ from .frame_tasks import FrameTask, Way
 from .records import ShotFrame
 from .renderers import Renderer
 
-FRAMES_VERSION = 2
+FRAMES_VERSION = 3
 FRAME_WORKER = "dnrpipe.stages.shots.frame_worker"
 FRAMES_FOLDER, PICTURES_FOLDER = "frames", "pictures"
 """Of a shot's folder."""
@@ -37,12 +37,18 @@ def picture_path(folder: Path, frame: ShotFrame) -> Path:
 
 
 def frame_tasks(
-    frames: Sequence[ShotFrame], folder: Path, way: Way, inputs: Any, numbers: Sequence[int] | None = None
+    frames: Sequence[ShotFrame],
+    folder: Path,
+    way: Way,
+    inputs: Any,
+    numbers: Sequence[int] | None = None,
+    trust: float = 1.0,
 ) -> list[FrameTask]:
     """The tasks that render the frames by ``way``. A frame of baked light remembers those before it, back to the last
     cut and to the begin of its chunk (`base_images.CHUNK`).
 
     inputs: of all that decides a frame but its view and way. numbers: places in ``frames`` to render; None: all.
+    trust: see `FrameTask`.
     """
     tasks: list[FrameTask] = []
     for place in range(len(frames)) if numbers is None else numbers:
@@ -53,7 +59,7 @@ def frame_tasks(
             while first > begin and _goes_on(frames[first - 1], frame):
                 first -= 1
         earlier = None if way.name == "path" else tuple(other.view for other in frames[first:place])
-        decided = [FRAMES_VERSION, inputs, frame.view.model_dump(mode="json"), way.model_dump(mode="json"), frame.lens]
+        decided = [inputs, trust, frame.view.model_dump(mode="json"), way.model_dump(mode="json"), frame.lens]
         known = None if earlier is None else [other.model_dump(mode="json") for other in earlier]
         tasks.append(
             FrameTask(
@@ -62,10 +68,11 @@ def frame_tasks(
                 lens=frame.lens,
                 earlier=earlier,
                 number=first,
+                trust=trust,
                 seed=frame.number % (1 << 16),
                 output=frame_path(folder, frame),
                 picture=picture_path(folder, frame),
-                fingerprint=digest([*decided, known]),
+                fingerprint=digest([FRAMES_VERSION, *decided, known]),
             )
         )
     return tasks
@@ -75,6 +82,12 @@ def _goes_on(before: ShotFrame, after: ShotFrame) -> bool:
     """Whether two frames belong together: of one camera and one size, and nothing has moved."""
     same = (before.view.width, before.view.height) == (after.view.width, after.view.height)
     return same and before.camera == after.camera and before.moving == after.moving
+
+
+def be_ready(run: Run, renderer: Renderer) -> None:
+    """Start the run's kept process, which gets ready for the renderer's frames while this one goes on."""
+    if run.kept is not None:
+        run.kept.get(FRAME_WORKER, renderer.common.data(), run.log, renderer.environment)
 
 
 def render_frames(
@@ -117,6 +130,7 @@ def render_frames(
         book=book,
         environment=renderer.environment,
         place=HERE,
+        kept=run.kept,
     )
 
 
@@ -144,6 +158,7 @@ def frame_outcomes(
         log=run.log,
         retried=warn_of_retries(label, run.console),
         environment=renderer.environment,
+        kept=run.kept,
     )
     known: dict[Path, TaskResult] = {}
     with closing(outcomes):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ...core.scene_files import read_frame
@@ -17,10 +17,11 @@ from .frame_tasks import FrameCommon
 
 @dataclass(frozen=True)
 class Renderer:
-    """A process that renders frames: what it is told when it starts, and its environment."""
+    """A process that renders frames: what it is told when it starts, and its environment. trust: see `FrameTask`."""
 
     common: FrameCommon
     environment: dict[str, str]
+    trust: float = 1.0
 
     def at_frame(self, run: Run, frame: int) -> Renderer:
         """Path traces the scene as it is at a frame, for which `convert_frames` has made a bundle."""
@@ -54,18 +55,18 @@ def path_tracer(run: Run, background: bool) -> Renderer:
 
 def shipped_renderer(run: Run, background: bool, trust: float) -> Renderer:
     """The shipped corrector, ``trust`` of it, on baked light: bakes that where it is missing."""
-    return _neural(run, background, trust=trust, checkpoint=None)
+    return replace(_neural(run, background, checkpoint=None), trust=trust)
 
 
 def trained_renderer(run: Run, background: bool) -> Renderer:
     """The renderer that stage `finetune` trained on frames of the shot."""
-    return _neural(run, background, trust=1.0, checkpoint=run.workspace.checkpoints("step2"))
+    return _neural(run, background, checkpoint=run.workspace.checkpoints("step2"))
 
 
-def _neural(run: Run, background: bool, *, trust: float, checkpoint: Path | None) -> Renderer:
+def _neural(run: Run, background: bool, *, checkpoint: Path | None) -> Renderer:
     tracer = path_tracer(run, background)
     base = base_renderer(run.workspace, run.settings, run.effect_plan)
     with run.timed("baking light: process"):
         bake_light(run, base)
-    update = {"base": base.common, "checkpoint": checkpoint, "trust": trust}
+    update = {"base": base.common, "checkpoint": checkpoint}
     return Renderer(tracer.common.model_copy(update=update), tracer.environment | base.environment)

@@ -8,6 +8,7 @@ from typing import Any
 
 from dnrtrain.contract import file_name
 
+from ...workers.processes import KeptWorker
 from ..session import Session
 from .check import held_out
 from .make_shot import CHECKED, Shot, make_shot, plan_shot
@@ -58,8 +59,7 @@ def carry_out(session: Session, request: ShotRequest) -> dict[str, Any]:
         background=not (request.transparent or file.transparent),
         wanted=request.wanted,
     )
-    plan = plan_shot(session, shot)
     answer = {"workspace": str(workspace.root)}
-    if request.only_plan:
-        return answer | plan.data()
-    return answer | make_shot(session, shot, plan).data()
+    with KeptWorker() as kept:
+        plan = plan_shot(session, shot, kept)
+        return answer | (plan if request.only_plan else make_shot(session, shot, plan, kept)).data()
