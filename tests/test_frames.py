@@ -101,6 +101,32 @@ note(worst=worst, level=kept[..., :3].mean(), recorded=frames._kernels["_path_ke
     assert found["other"] > 0
 
 
+def test_a_picture_of_another_size_takes_the_kernels_that_are_there(tmp_path: Path) -> None:
+    """And recording them is in no stopwatch's seconds, the first picture's rendering is."""
+    found = _run(
+        tmp_path,
+        LAMP % (0, 0, 2),
+        """
+import time
+import drjit as dr
+from dnrpipe.raytrace.recorded import Stopwatch
+def compiled(view):
+    watch, began = Stopwatch(), time.monotonic()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        Frames(engine, folder / "scene.xml", "path", 5, (view.width, view.height)).path(view, 4, 0)
+        kernels = dr.kernel_history((dr.KernelType.JIT,))
+    return watch.costs()["seconds"], time.monotonic() - began, sum(not kernel["cache_hit"] for kernel in kernels)
+larger = views[0].model_copy(update={"width": 96, "height": 64, "cx": 44.0, "cy": 35.0})
+(first, whole, at_first), (_, _, later) = compiled(views[0]), compiled(larger)
+note(first=first, whole=whole, at_first=at_first, later=later)
+""",
+        views=1,
+    )
+    assert found["at_first"] >= 1 and found["later"] == 0
+    assert 0 <= found["first"] < 0.5 * found["whole"]
+
+
 def test_many_samples_in_several_launches_are_as_little_noisy(tmp_path: Path) -> None:
     """64 samples in four launches: other random numbers in each, and the noise of 64, which is half that of 16."""
     found = _run(

@@ -88,7 +88,7 @@ def measured(scene: Path, root: Path, size: tuple[int, int], frames: int) -> dic
     """A row of the results."""
     root.mkdir(parents=True, exist_ok=True)
     views = arc(scene, root, size, frames)
-    cameras = root / "arc.json"
+    cameras = root.with_suffix(".json")
     write_cameras(cameras, views, "arc")
     named = ("--cameras", str(cameras), "-w", str(root), "--name", "arc", "--preset", "standard")
     words = ("shot", str(scene), *named, "--json")
@@ -118,13 +118,11 @@ def measured(scene: Path, root: Path, size: tuple[int, int], frames: int) -> dic
 
 def arc(scene: Path, root: Path, size: tuple[int, int], frames: int) -> list[View]:
     """The scene's own camera, moved about the point that it looks at as far away as the middle of the scene."""
-    subprocess.run(
-        [sys.executable, "-m", "dnrpipe.cli", "prepare", str(scene), "-w", str(root), "-q", "--set", "select.budget=0"],
-        check=True,
-    )
-    log = root / "logs" / "arc.log"
-    own = shot_views(look_at_shot(scene, (1,), None, log), *size)[0]
-    summary = read_summary(root / "scene")
+    looked_at = root.with_name(f"arc-{root.name}")  # the shot converts the scene itself
+    words = ("prepare", str(scene), "-w", str(looked_at), "-q", "--set", "select.budget=0")
+    subprocess.run([sys.executable, "-m", "dnrpipe.cli", *words], check=True)
+    own = shot_views(look_at_shot(scene, (1,), None, looked_at / "logs" / "arc.log"), *size)[0]
+    summary = read_summary(looked_at / "scene")
     matrix = own.matrix
     forward = -matrix[:3, 2]
     away = max(float((np.asarray(summary.bounds.center) - own.position) @ forward), 0.2 * summary.bounds.radius)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -42,8 +43,9 @@ class Worker(BundleWorker):
         self.denoise = isinstance(self.common, BakedCommon) and self.common.denoise
         self.renderer = BaseRenderer(self.engine.mi, scene, light, gloss=not self.denoise)
         self.silhouettes: dict[tuple[int, int], Frames] = {}
-        self.history, self.seen = History(self.engine.mi), list[tuple[View, int | None]]()
-        """Of the frames ``seen``, and their rays per pixel."""
+        self.history, self.seen = History(self.engine.mi), list[tuple[View, int | None, int]]()
+        """Of the frames ``seen``, with their rays per pixel and the number of the first."""
+        self.compiled: set[tuple[int, int]] = set()
         self.repaired = self.masked = 0  # pixels of the view at hand: samples left out, set to zero
 
     def __call__(self, asked: dict[str, Any]) -> BaseAnswer:
@@ -91,12 +93,12 @@ class Worker(BundleWorker):
         Those that were the last to be seen, by as many rays, are not rendered again: one frame after the other costs
         one each.
         """
-        way = [(other, samples) for other in (*earlier, view)]
+        way = [(other, samples, number) for other in (*earlier, view)]
         known = len(self.seen) if self.seen == way[: len(self.seen)] and len(self.seen) < len(way) else 0
         if not known:
             self.history.begin(number)
         self.seen = way
-        for frame, _ in way[known:-1]:
+        for frame, *_ in way[known:-1]:
             self._taken(frame, samples)
         channels = self._taken(view, samples)
         return without_grain(channels) if self.denoise else channels
@@ -114,6 +116,11 @@ class Worker(BundleWorker):
     def _traced(self, common: SampledCommon, view: View, channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         integrator, _ = self.engine.integrator(self.bundle, common.integrator, common.max_depth)
         sensor = self.engine.sensor(view)
+        if (view.width, view.height) not in self.compiled:
+            self.compiled.add((view.width, view.height))
+            began = time.monotonic(), time.process_time()
+            self.engine.frame(self.bundle, integrator, sensor, view, 1, 0)
+            Stopwatch.leave_out(*began)
         picture, _ = self.engine.frame(self.bundle, integrator, sensor, view, common.spp, common.seed)
         picture, lost = masked(picture.astype(np.float32))
         self.masked += lost

@@ -24,7 +24,8 @@ class Worker:
         settings = PilotCommon.model_validate(common)
         for config in settings.configs:
             bundles.setdefault(config.variant, []).append(config.bundle)
-        # What is compared is timed on one thread, which would stop the loader of a second variant.
+        # What is compared is timed on one thread, which would stop the loader of a second variant. On several, sums
+        # over samples have no fixed order: the last bits of a depth's figures may differ between runs.
         threads = 1 if len(settings.configs) > 1 and len(bundles) == 1 else 0
         self.masked = 0  # pixels of the task at hand that were not finite
         self.engines = {name: Engine(name, threads, list(dict.fromkeys(paths))) for name, paths in bundles.items()}

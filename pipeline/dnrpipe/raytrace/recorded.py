@@ -49,12 +49,11 @@ class Recorded:
         return self.frozen.n_recordings
 
     def __call__(self, *arguments: Any) -> Any:
-        known, started = self.n_recordings, (time.monotonic(), time.process_time())
+        known, began = self.n_recordings, (time.monotonic(), time.process_time())
         with without_collection():
             values = self.frozen(*arguments)
         if self.n_recordings > known:
-            Stopwatch.recording[0] += time.monotonic() - started[0]
-            Stopwatch.recording[1] += time.process_time() - started[1]
+            Stopwatch.leave_out(*began)
         return values
 
 
@@ -63,6 +62,12 @@ class Stopwatch:
 
     recording: ClassVar[list[float]] = [0.0, 0.0]
     """Wall-clock and processor seconds of all recordings of this process."""
+
+    @classmethod
+    def leave_out(cls, wall: float, cpu: float) -> None:
+        """What has passed since, by `time.monotonic` and `time.process_time`, was recording."""
+        cls.recording[0] += time.monotonic() - wall
+        cls.recording[1] += time.process_time() - cpu
 
     def __init__(self) -> None:
         self.started, self.known = (time.monotonic(), time.process_time()), tuple(self.recording)

@@ -20,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,7 @@ class TaskFailed(RuntimeError):
 class LocalWorker:
     """One worker process that is asked task by task. Not for several threads at once.
 
-    Linux kills it when the thread that asked first ends.
+    Linux kills it when the thread that started it ends, which is the one that asks where `start` was not called.
 
     Args: as of `task_list.run_tasks`; without a log its output goes where this process's errors go.
     """
@@ -161,6 +162,8 @@ class KeptWorker:
         self._stack = contextlib.ExitStack()
         self._worker: LocalWorker | None = None
         self._wanted: Any = None
+        self.started = 0.0
+        """When the process was, by `time.monotonic`."""
 
     def __enter__(self) -> KeptWorker:
         return self
@@ -173,10 +176,10 @@ class KeptWorker:
         wanted = (module, common, log, environment)
         if self._worker is None or not self._worker.runs or self._wanted != wanted:
             self.close()
-            self._wanted = wanted
+            self._wanted, self.started = wanted, time.monotonic()
             folder = self._stack.enter_context(temporary_folder())
             self._worker = LocalWorker(module, common, log, folder | (environment or {}))
-            with contextlib.suppress(WorkerDied):  # asked, it is started again, and says what is wrong
+            with contextlib.suppress(WorkerDied, OSError):  # asked, it is started again, and says what is wrong
                 self._worker.start()
             self._stack.callback(self._worker.close)
         return self._worker

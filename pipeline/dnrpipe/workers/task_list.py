@@ -147,7 +147,7 @@ def run_tasks(
         answering += ray_workers(module, common, log, environment or {}, place, workers, len(tasks))
 
     def serve(worker: Worker) -> None:
-        # The thread lives as long as its worker: PR_SET_PDEATHSIG follows the spawning thread.
+        # The thread lives as long as a worker that it starts: PR_SET_PDEATHSIG follows the spawning thread.
         try:
             while not stopping.is_set() and open_tasks > 0:
                 try:

@@ -102,8 +102,8 @@ class FrameTask(Task):
 class FrameAnswer(Costs):
     """Also in the header of the file, but for the seconds that writing it took.
 
-    masked: pixels that were not finite and are 0. ms: milliseconds of the parts. The seconds, not the milliseconds, leave
-    out what recording kernels took.
+    masked: pixels that were not finite and are 0. ms: milliseconds of the parts. The seconds, not the milliseconds,
+    leave out what recording kernels took.
     """
 
     way: str

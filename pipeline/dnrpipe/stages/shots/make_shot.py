@@ -172,6 +172,8 @@ def render_moving(
     folder, way = folder_of(run, shot), moving_way(plan.options, plan.chosen)
     tasks = dict(zip(moving, frame_tasks(shot.frames, folder, way, inputs, moving), strict=True))
     due = [place for place in moving if place in checked or not is_made(tasks[place].data())]
+    if due and run.kept is not None:
+        run.kept.close()  # conversion wants the memory, and each frame a process of its own
     for batch in (due[first : first + BATCH] for first in range(0, len(due), BATCH)):
         convert_frames(run, [shot.frames[place].number for place in batch])
         for place in batch:

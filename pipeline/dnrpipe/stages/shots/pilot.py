@@ -8,6 +8,7 @@ finished frames (`check`) says how far off the windows were.
 from __future__ import annotations
 
 import math
+import time
 from bisect import bisect_left
 from collections.abc import Sequence
 from contextlib import closing
@@ -33,8 +34,9 @@ FRAMES, SIZE = 2, (192, 108)
 """Frames of the pilot, and pixels of a window."""
 PLACES = ((0.2, 0.7), (0.75, 0.4))
 """Of the windows in a frame."""
-LADDER, MOST = (1, 4, 16), 64
-"""Samples per pixel of path-traced pictures; and the most that are reckoned from them (`reckoned`)."""
+LADDER, MOST = (1, 4, 8), 64
+"""Samples per pixel of path-traced pictures, at most a quarter of a reference's: else the denoiser's bias would not
+show; and the most that are reckoned from them (`reckoned`)."""
 REFERENCE = Way(name="path", spp=SPP)
 LEAD = 4
 """Frames before a frame of the pilot that it remembers."""
@@ -44,15 +46,16 @@ SAME, LEAST_LPIPS = 99.0, 1e-6
 
 @dataclass(frozen=True)
 class Measured:
-    """A way on the pilot's windows. pixel: seconds per pixel of a whole frame, files included. start: seconds until its process renders.
-    psnr: of all their pixels, dB. lpips: mean, or None where there are no weights. Windows without surfaces do not
-    count, unless none has any."""
+    """A way on the pilot's windows. pixel: seconds per pixel of a whole frame, files included. start: seconds until its
+    process renders. psnr: of all their pixels, dB. lpips: mean, or None where there are no weights. Windows without
+    surfaces do not count, unless none has any: shows."""
 
     way: Way
     pixel: float
     start: float
     psnr: float
     lpips: float | None
+    shows: bool = True
 
 
 @dataclass(frozen=True)
@@ -101,19 +104,20 @@ class Pilot:
         for turn, way in enumerate([*references, *ways]):
             seed = SEED + turn if turn < len(references) else 0
             for key, (index, place) in enumerate(self.windows):
-                lead = [] if way.name == "path" else list(self._lead(index))
-                for number, at in enumerate([*lead, index]):
-                    earlier = None if way.name == "path" else tuple(self._view(i, place) for i in lead[:number])
+                lead = [] if tracing else list(self._lead(index))
+                last = 0 if tracing else max(1, len(lead))
+                for number, at in enumerate([*lead, index] if lead or tracing else [index, index]):
+                    earlier = None if tracing else tuple(self._view(i, place) for i in lead[:number])
                     # What a frame remembers are base images. The first one readies the network all the same: later,
                     # that would cost the memory.
-                    rendered = way if at == index or number == 0 else base_of(way)
-                    keys.append(key if at == index else None)
+                    rendered = way if number in (0, last) else base_of(way)
+                    keys.append(key if number == last else None)
                     tasks.append(self._task(rendered, at, place, earlier, len(tasks), seed))
         if not known:
             keys.append(None)
             tasks.append(self._task(ways[0], self.windows[0][0], None, None if tracing else (), len(tasks), 0))
         found: dict[Way, list[_Window]] = {}
-        start, spent = None, 0.0
+        start, spent, kept = None, 0.0, self.run.kept
         label = "pilot: " + ("path tracing" if tracing else "base image and network")
         with (
             closing(frame_outcomes(self.run, renderer, tasks, "pilot")) as outcomes,
@@ -133,7 +137,8 @@ class Pilot:
                 )
                 spent = outcome.result["seconds"] + outcome.result["write_seconds"]
                 if start is None:
-                    start = max(0.0, outcome.seconds - spent)
+                    asked = outcome.seconds if kept is None else time.monotonic() - kept.started
+                    start = max(0.0, asked - spent)
                 if key is not None and task.seed >= SEED:
                     drawn.setdefault(key, []).append(shown(self.display, task.output))
                 elif key is not None:
@@ -145,7 +150,8 @@ class Pilot:
                     found.setdefault(task.way, []).append(row)
                 bar.advance(note=task.way.told)
         if not known:
-            pixel = float(np.mean([row.spent for row in found[ways[0]]])) / _pixels(tasks[0].view)
+            own = [row.spent for row in found[ways[0]] if self.windows[row.key][0] == self.windows[0][0]]
+            pixel = float(np.mean(own)) / _pixels(tasks[0].view)
             self.processes[tracing] = _Process(start or 0.0, spent / _pixels(tasks[-1].view) / pixel)
         self.references |= {key: Truth.of(pictures) for key, pictures in drawn.items()}
         self.rows |= found
@@ -180,6 +186,7 @@ class Pilot:
             start=process.start,
             psnr=decibels(float(np.mean([found["error"] for found in figures]))),
             lpips=float(np.mean(distances)) if distances else None,
+            shows=any(found["psnr"] < SAME for found in every),
         )
 
     def _lead(self, index: int) -> range:
@@ -266,4 +273,5 @@ def _on_line(low: Measured, high: Measured, spp: int) -> Measured:
         start=low.start,
         psnr=low.psnr + t * (high.psnr - low.psnr),
         lpips=lpips,
+        shows=low.shows,
     )

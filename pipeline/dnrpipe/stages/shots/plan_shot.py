@@ -18,7 +18,7 @@ from ..stage import Run
 from ..worth import worth
 from .frame_tasks import Way
 from .options import STEADY, USUAL, Option, Wanted
-from .pilot import LADDER, MOST, SAME, Measured, Pilot, reckoned
+from .pilot import LADDER, MOST, Measured, Pilot, reckoned
 from .records import ShotFrame
 from .renderers import Renderer, shipped_renderer
 
@@ -51,10 +51,10 @@ def weigh(
     pilot = Pilot(run, frames, folder, lpips)
     steady = Way(name="path", spp=STEADY, quality="balanced")
     quick = pilot.measure(tracer, [steady])
-    option, told = path_option(quick[0], shape), quick[0].lpips is not None and quick[0].psnr < SAME
+    option, told = path_option(quick[0], shape), quick[0].lpips is not None and quick[0].shows
     if told and option.reaches(*USUAL) and wanted.aimless and not _light_is_ready(run):
         run.console.say(f"baked light is not weighed: {steady.told}, are as good as it usually is, in its time")
-        return [option], None
+        return _running([option], tracing=True), None
     others = [steady.model_copy(update={"spp": spp}) for spp in LADDER if spp != STEADY]
     measured = pilot.measure(tracer, [*others, *(Way(name="path", spp=spp) for spp in LADDER)])
     quick += measured[: len(others)]
@@ -62,7 +62,7 @@ def weigh(
     options = [path_option(found, shape) for found in rungs]
     if why := _no_baked_light(run, frames, shape, rungs, wanted):
         run.console.say(f"baked light is not weighed: {why}")
-        return options, None
+        return _running(options, tracing=True), None
     rays = run.settings.base.samples
     counts = [*(n for n in FEWER if n < rays), rays]
     ways = [Way(name="base" if wanted.way == "base" else "neural", spp=n) for n in counts]
@@ -78,6 +78,8 @@ def weigh(
         ours += corrected if trust or wanted.way == "neural" else []
     options += [baked_option(found, options, shape) for found in ours]
     if _wants_more(options, wanted) and wanted.way in (None, "neural"):
+        if run.kept is not None:
+            run.kept.close()  # training on small views wants the memory
         found = worth(run, shape.still)
         last = options[-1]  # of as many rays as a training's base images
         if found.views and last.psnr is not None:
@@ -94,7 +96,18 @@ def weigh(
                     }
                 )
             )
-    return options, trust
+        return options, trust
+    return _running(options, tracing=False), trust
+
+
+def _running(options: Sequence[Option], *, tracing: bool) -> list[Option]:
+    """The options, of which the pilot's last process, which renders on, does not start anew."""
+    return [
+        option.model_copy(update={"before": 0.0, "seconds": option.seconds - option.before})
+        if (option.way.name == "path") == tracing and not option.views
+        else option
+        for option in options
+    ]
 
 
 def path_option(found: Measured, shape: Shape) -> Option:
