@@ -275,6 +275,30 @@ def test_an_inside_out_mesh_looks_like_any_other(tmp_path: Path, material: dict[
     assert means[1] == pytest.approx(means[0], rel=0.05) and means[0] > 0.02
 
 
+def test_what_is_buried_in_a_closed_mesh_takes_the_light_beside_it(tmp_path: Path) -> None:
+    """A box stands in the floor: no light is baked within it, neither on the floor nor on its own inside."""
+    box(tmp_path / "b.ply", inside_out=False)
+    plain = {"type": "twosided", "b": {"type": "diffuse", "reflectance": rgb(0.8, 0.5, 0.3)}}
+    sunk = mi.ScalarTransform4f().translate([0, 0, -0.2])
+    shape = {"type": "ply", "filename": str(tmp_path / "b.ply"), "bsdf": plain, "to_world": sunk}
+    baker = LightBaker(mi, corner_room(tmp_path, plain, plain, {"type": "constant"}, box=shape), onwards())
+    size = 64
+    texels, _, _, sides, buried = baker._texels(size)
+    row, column = texels // size, texels % size
+    x, y = ((np.stack([column, row]) + 0.5) / size - 0.05) / 0.4 * 2 - 1  # on the floor
+    floor = (column < 0.47 * size) & (row < 0.47 * size)
+    rim = 2 * 2 / (0.4 * size)
+    inside = floor & (np.abs(x) < HALF - rim) & (np.abs(y - 0.2) < HALF - rim)
+    outside = floor & ((np.abs(x) > HALF + rim) | (np.abs(y - 0.2) > HALF + rim))
+    assert inside.sum() > 20 and buried[inside, 0].all() and not buried[outside, 0].any()
+    light = baker.bake(size, 64, 0)[0].mean(axis=-1).reshape(2, -1)
+    shown = light[0, texels[outside]]
+    assert shown.min() > 0.1
+    assert light[0, texels[inside]].min() > 0.5 * shown.min() and light[0, texels[inside]].max() < 1.5 * shown.max()
+    within = ~sides[:, 1] & (row > 0.5 * size)
+    assert within.sum() > 50 and not light[1, texels[within]].any()
+
+
 @pytest.mark.parametrize("kind", ["diffuse", "dnr_principled"])
 def test_base_is_the_path_traced_picture_where_all_is_diffuse(tmp_path: Path, kind: str) -> None:
     name = "reflectance" if kind == "diffuse" else "base_color"

@@ -22,6 +22,8 @@ from dnrpipe.core.errors import UserError
 from dnrtrain.srgb import LUMINANCE
 
 Quality = Literal["high", "balanced", "fast"]
+BORDER = 2
+"""Texels by which a chart goes on beyond its border: what is looked up there takes nothing from the chart beside it."""
 GREY, BLOCK, DARKEST = 0.18, 16, 1e-8
 """The library's own exposure: mean log luminance of blocks of BLOCK² pixels goes to GREY; darker ones do not count."""
 
@@ -63,13 +65,29 @@ def denoise(
 
 
 def filled(light: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """[H, W, C] float32 with the texels outside ``valid`` [H, W] made up by pull and push.
+    """[H, W, C] float32 with the texels outside ``valid`` [H, W] made up: those next to valid ones from these, so that
+    each chart goes on beyond its border, the rest by pull and push.
 
     Gortler et al., "The Lumigraph", 1996, section 3.4.2: averages of the valid texels at coarser and coarser levels
     fill the finer ones. Valid texels stay as they are; without any, the result is 0.
     """
+    light, valid = light.astype(np.float32), valid.copy()
+    for _ in range(BORDER):
+        grown = _beside(np.concatenate([light * valid[..., None], valid[..., None]], axis=-1))
+        new = ~valid & (grown[..., -1] > 0)
+        light[new] = grown[new][:, :-1] / grown[new][:, -1:]
+        valid |= new
     weight = valid.astype(np.float32)[..., None]
     return np.where(valid[..., None], light, _pull_push(light * weight, weight)).astype(np.float32)
+
+
+def _beside(texels: np.ndarray) -> np.ndarray:
+    """Sums over 3x3 texels."""
+    for axis in (0, 1):
+        padded = np.pad(texels, [(1, 1) if i == axis else (0, 0) for i in range(3)])
+        first, middle, last = (np.moveaxis(padded, axis, 0)[k : k + texels.shape[axis]] for k in range(3))
+        texels = np.moveaxis(first + middle + last, 0, axis)
+    return texels
 
 
 def filled_map(values: np.ndarray, texels: np.ndarray, size: int) -> np.ndarray:

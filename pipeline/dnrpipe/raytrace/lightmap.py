@@ -36,9 +36,11 @@ from .lobes import (
     specular_context,
 )
 from .paths import transmittance
-from .texels import LIFT, AtlasSurface
+from .texels import ATTRIBUTE, LIFT, AtlasSurface
 
 MAX_SAMPLES = 4_000_000
+PROBES = 16
+"""Rays that find out whether a texel is buried."""
 LEAST_RHO = 1e-3
 """Texels that reflect less hold no light worth knowing."""
 
@@ -100,27 +102,59 @@ class LightBaker:
         least: mean denominator of a texel that says anything.
         """
         whole = np.zeros((2, size, size, 3), np.float32)
-        texels, place, normal, sides = self._texels(size)
+        texels, place, normal, sides, buried = self._texels(size)
         for number, side in enumerate((1, -1)):
-            wanted = sides[:, number]
+            wanted = sides[:, number] & ~buried[:, number]
             if not wanted.any():
                 continue
             guides = place[wanted], normal[wanted] * side
             total, weight = self._sums(sample, texels[wanted], size, spp, seed + number, side)
             found = weight.max(axis=1) > least * spp
             whole[number] = self._smooth(total, weight, 1e-3 * least * spp, texels[wanted], found, guides, size)
+            whole[number].reshape(-1, 3)[texels[~sides[:, number]]] = 0  # within closed meshes there is no light
         return whole
 
-    def _texels(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """`occupied`, with positions in [0, 1] of the scene's extent."""
+    def _texels(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """`occupied`, with positions in [0, 1] of the scene's extent; and whether front and back are buried in a closed
+        mesh, bool [T, 2]: nobody sees them, and they take the light of those beside them, which are looked up
+        together with them."""
         if size not in self._known:
             if self.surface.count:
                 texels, position, normal, sides = self.occupied(size)
             else:
                 texels, position, normal, sides = (np.zeros(shape, int) for shape in (0, (0, 3), (0, 3), (0, 2)))
+            sides = sides.astype(bool)
+            buried = np.stack([self._buried(position, normal * side) for side in (1, -1)], axis=1)
             low, high = (position.min(axis=0), position.max(axis=0)) if len(texels) else (0, 1)
-            self._known[size] = texels, (position - low) / np.maximum(high - low, 1e-12), normal, sides.astype(bool)
+            self._known[size] = texels, (position - low) / np.maximum(high - low, 1e-12), normal, sides, buried
         return self._known[size]
+
+    def _buried(self, position: np.ndarray, up: np.ndarray) -> np.ndarray:
+        """Whether most rays from points [T, 3] into the half-space of ``up`` meet the inside of a closed mesh, bool."""
+        import drjit as dr
+
+        mi, parts = self.mi, [np.zeros(0, bool)]
+        for start in range(0, len(position), MAX_SAMPLES // PROBES):
+            part = slice(start, start + MAX_SAMPLES // PROBES)
+            count = len(position[part])
+            sampler = mi.load_dict({"type": "independent"})
+            sampler.seed(start, count * PROBES)
+            index = dr.arange(mi.UInt32, count * PROBES) // PROBES
+            columns = (mi.Float(np.ascontiguousarray(values[part].T.ravel(), np.float32)) for values in (position, up))
+            place, normal = (
+                kind(*(dr.gather(mi.Float, values, index + axis * count) for axis in range(3)))
+                for kind, values in zip((mi.Point3f, mi.Normal3f), columns, strict=True)
+            )
+            towards = mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(sampler.next_2d()))
+            hit = self.scene.ray_intersect(mi.Ray3f(place + normal * self.lift, towards))
+            found = hit.is_valid()
+            found &= hit.shape.has_attribute(ATTRIBUTE, found)
+            uv = hit.shape.eval_attribute_3(ATTRIBUTE, hit, found)
+            front, back = self.surface.sides(mi.Point2f(uv.x, uv.y))
+            inside = found & ~dr.select(dr.dot(hit.n, towards) < 0, front, back)
+            share = dr.block_sum(dr.select(inside, mi.Float(1), 0), PROBES) / PROBES
+            parts.append(np.array(share) > 0.5)
+        return np.concatenate(parts)
 
     def _sums(
         self, sample: Any, texels: np.ndarray, size: int, spp: int, seed: int, side: int
