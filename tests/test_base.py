@@ -276,14 +276,15 @@ def test_an_inside_out_mesh_looks_like_any_other(tmp_path: Path, material: dict[
 
 
 def test_what_is_buried_in_a_closed_mesh_takes_the_light_beside_it(tmp_path: Path) -> None:
-    """A box stands in the floor: no light is baked within it, neither on the floor nor on its own inside."""
+    """A box stands in the floor: no light is within it, neither on the floor nor on its own inside; unless it is of
+    glass."""
     box(tmp_path / "b.ply", inside_out=False)
     plain = {"type": "twosided", "b": {"type": "diffuse", "reflectance": rgb(0.8, 0.5, 0.3)}}
     sunk = mi.ScalarTransform4f().translate([0, 0, -0.2])
     shape = {"type": "ply", "filename": str(tmp_path / "b.ply"), "bsdf": plain, "to_world": sunk}
     baker = LightBaker(mi, corner_room(tmp_path, plain, plain, {"type": "constant"}, box=shape), onwards())
     size = 64
-    texels, _, _, sides, buried = baker._texels(size)
+    texels, _, _, _, closed, buried = baker._texels(size)
     row, column = texels // size, texels % size
     x, y = ((np.stack([column, row]) + 0.5) / size - 0.05) / 0.4 * 2 - 1  # on the floor
     floor = (column < 0.47 * size) & (row < 0.47 * size)
@@ -295,8 +296,10 @@ def test_what_is_buried_in_a_closed_mesh_takes_the_light_beside_it(tmp_path: Pat
     shown = light[0, texels[outside]]
     assert shown.min() > 0.1
     assert light[0, texels[inside]].min() > 0.5 * shown.min() and light[0, texels[inside]].max() < 1.5 * shown.max()
-    within = ~sides[:, 1] & (row > 0.5 * size)
-    assert within.sum() > 50 and not light[1, texels[within]].any()
+    assert closed[:, 1].sum() > 50 and not closed[:, 0].any() and not light[1, texels[closed[:, 1]]].any()
+    glass = {**shape, "bsdf": {"type": "dielectric"}}
+    clear = LightBaker(mi, corner_room(tmp_path, plain, plain, {"type": "constant"}, box=glass), onwards())
+    assert not clear._texels(size)[-1].any() and not clear._texels(size)[-2].any()
 
 
 @pytest.mark.parametrize("kind", ["diffuse", "dnr_principled"])

@@ -146,16 +146,15 @@ def without_grain(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def denoised(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """base.R/G/B without grain. Baked light has none where the first surface sends it back: that part stays as it is.
+    """base.R/G/B without grain.
 
     The auxiliary images are not called clean: measured, that is better by half a decibel and more.
     """
-    diffuse = np.stack([channels[f"diffuse.{c}"] for c in "RGB"], axis=-1)
-    image = np.stack([channels[name] for name in COLOUR[:3]], axis=-1) - diffuse
+    image = np.stack([channels[name] for name in COLOUR[:3]], axis=-1)
     albedo = np.stack([channels[f"albedo.{c}"] for c in "RGB"], axis=-1)
     # Open Image Denoise wants white where there is nothing but mirrors and glass.
     mirror = (albedo.mean(axis=-1, keepdims=True) < MIRROR) & (channels["mask"][..., None] > 0.5)
     albedo = np.where(mirror, np.float32(1), albedo).clip(0, 1)
     normal = np.stack([channels[f"normal.{c}"] for c in "XYZ"], axis=-1)
-    clean = denoise(image, albedo, normal, clean=False, quality="fast") + diffuse
+    clean = denoise(image, albedo, normal, clean=False, quality="fast")
     return {name: clean[..., i] for i, name in enumerate(COLOUR[:3])}

@@ -41,6 +41,8 @@ from .texels import ATTRIBUTE, LIFT, AtlasSurface
 MAX_SAMPLES = 4_000_000
 PROBES = 16
 """Rays that find out whether a texel is buried."""
+MOST_BURIED = 0.5
+"""Share of the sides that can be seen above which none counts as buried."""
 LEAST_RHO = 1e-3
 """Texels that reflect less hold no light worth knowing."""
 
@@ -102,7 +104,7 @@ class LightBaker:
         least: mean denominator of a texel that says anything.
         """
         whole = np.zeros((2, size, size, 3), np.float32)
-        texels, place, normal, sides, buried = self._texels(size)
+        texels, place, normal, sides, closed, buried = self._texels(size)
         for number, side in enumerate((1, -1)):
             wanted = sides[:, number] & ~buried[:, number]
             if not wanted.any():
@@ -111,26 +113,33 @@ class LightBaker:
             total, weight = self._sums(sample, texels[wanted], size, spp, seed + number, side)
             found = weight.max(axis=1) > least * spp
             whole[number] = self._smooth(total, weight, 1e-3 * least * spp, texels[wanted], found, guides, size)
-            whole[number].reshape(-1, 3)[texels[~sides[:, number]]] = 0  # within closed meshes there is no light
+            whole[number].reshape(-1, 3)[texels[closed[:, number]]] = 0
         return whole
 
-    def _texels(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def _texels(self, size: int) -> tuple[np.ndarray, ...]:
         """`occupied`, with positions in [0, 1] of the scene's extent; and whether front and back are buried in a closed
-        mesh, bool [T, 2]: nobody sees them, and they take the light of those beside them, which are looked up
+        opaque mesh, bool [T, 2]: nobody sees them, and they take the light of those beside them, which are looked up
         together with them."""
         if size not in self._known:
             if self.surface.count:
-                texels, position, normal, sides = self.occupied(size)
+                texels, position, normal, sides, closed = self.occupied(size)
             else:
-                texels, position, normal, sides = (np.zeros(shape, int) for shape in (0, (0, 3), (0, 3), (0, 2)))
-            sides = sides.astype(bool)
-            buried = np.stack([self._buried(position, normal * side) for side in (1, -1)], axis=1)
+                shapes = (0, (0, 3), (0, 3), (0, 2), (0, 2))
+                texels, position, normal, sides, closed = (np.zeros(shape, int) for shape in shapes)
+            sides, closed = sides.astype(bool), closed.astype(bool)
+            buried = np.zeros_like(sides)
+            for number, side in enumerate((1, -1)):
+                seen = sides[:, number]
+                buried[seen, number] = self._buried(position[seen], normal[seen] * side)
+            if buried.sum() > MOST_BURIED * sides.sum():  # what they are in is where the camera is
+                buried[:] = closed[:] = False
             low, high = (position.min(axis=0), position.max(axis=0)) if len(texels) else (0, 1)
-            self._known[size] = texels, (position - low) / np.maximum(high - low, 1e-12), normal, sides, buried
+            self._known[size] = texels, (position - low) / np.maximum(high - low, 1e-12), normal, sides, closed, buried
         return self._known[size]
 
     def _buried(self, position: np.ndarray, up: np.ndarray) -> np.ndarray:
-        """Whether most rays from points [T, 3] into the half-space of ``up`` meet the inside of a closed mesh, bool."""
+        """Whether most rays from points [T, 3] into the half-space of ``up`` meet the inside of a closed mesh that lets
+        no light through, bool."""
         import drjit as dr
 
         mi, parts = self.mi, [np.zeros(0, bool)]
@@ -138,7 +147,7 @@ class LightBaker:
             part = slice(start, start + MAX_SAMPLES // PROBES)
             count = len(position[part])
             sampler = mi.load_dict({"type": "independent"})
-            sampler.seed(start, count * PROBES)
+            sampler.seed(dr.opaque(mi.UInt32, start), count * PROBES)
             index = dr.arange(mi.UInt32, count * PROBES) // PROBES
             columns = (mi.Float(np.ascontiguousarray(values[part].T.ravel(), np.float32)) for values in (position, up))
             place, normal = (
@@ -150,8 +159,8 @@ class LightBaker:
             found = hit.is_valid()
             found &= hit.shape.has_attribute(ATTRIBUTE, found)
             uv = hit.shape.eval_attribute_3(ATTRIBUTE, hit, found)
-            front, back = self.surface.sides(mi.Point2f(uv.x, uv.y))
-            inside = found & ~dr.select(dr.dot(hit.n, towards) < 0, front, back)
+            front, back = self.surface.sides(mi.Point2f(uv.x, uv.y), closed=True)
+            inside = found & dr.select(dr.dot(hit.n, towards) < 0, front, back)
             share = dr.block_sum(dr.select(inside, mi.Float(1), 0), PROBES) / PROBES
             parts.append(np.array(share) > 0.5)
         return np.concatenate(parts)
@@ -191,9 +200,9 @@ class LightBaker:
         ]
         return np.concatenate(parts)
 
-    def occupied(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def occupied(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Texels that a chart touches, on a grid three times as fine: (numbers, positions, normals, whether front and
-        back can be seen, bool [T, 2])."""
+        back can be seen, whether they are the inside of a closed opaque mesh, bool [T, 2] each)."""
         import drjit as dr
 
         mi, fine = self.mi, 3 * size
@@ -212,8 +221,11 @@ class LightBaker:
         row = (texels // size) * 3 + pick // 3
         place = mi.Point2f(mi.Float((column + 0.5).astype(np.float32)), mi.Float((row + 0.5).astype(np.float32))) / fine
         position, normal, _ = self.surface.points(place)
-        sides = np.stack([np.array(side) for side in self.surface.sides(place)], axis=1)
-        return texels, np.array(position).T, np.array(normal).T, sides
+        sides, closed = (
+            np.stack([np.array(side) for side in self.surface.sides(place, closed=inside)], axis=1)
+            for inside in (False, True)
+        )
+        return texels, np.array(position).T, np.array(normal).T, sides, closed
 
     def _part(self, sample: Any, texels: np.ndarray, size: int, spp: int, seed: int, side: int) -> np.ndarray:
         """As `_traced`, of texels that fit in memory."""

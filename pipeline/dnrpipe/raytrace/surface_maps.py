@@ -55,7 +55,7 @@ class SurfaceMapper(LightBaker):
         }
         if not self.surface.count:
             return found
-        texels, _, normal, sides = self.occupied(size)
+        texels, _, normal, sides, _ = self.occupied(size)
         thin = sides[:, 1]
         found["normal"] = filled_map(normal, texels, size)
         found["thin"] = np.array(bool(thin.any()))

@@ -35,7 +35,7 @@ class AtlasSurface:
         """groups: the meshes that instances repeat, each with the matrix of its place (`grouped_meshes`)."""
         meshes = [(shape, np.eye(4)) for shape in scene.shapes() if shape.is_mesh()]
         meshes += [(mi.load_dict({"type": "ply", "filename": str(path)}), matrix) for path, matrix in groups]
-        corners, places, sides = [], [], []
+        corners, places, sides, closed = [], [], [], []
         box = scene.bbox()
         extent = np.array(box.max).ravel() - np.array(box.min).ravel()
         for shape, matrix in meshes:
@@ -43,6 +43,8 @@ class AtlasSurface:
                 continue
             faces = np.array(shape.faces_buffer()).reshape(-1, 3)
             vertices = np.array(shape.vertex_positions_buffer()).reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3]
+            if np.linalg.det(matrix[:3, :3]) < 0:  # mirrored: the front stays the front
+                faces = faces[:, ::-1]
             atlas = np.array(shape.attribute_buffer(ATTRIBUTE)).reshape(-1, 3) * (1, 1, 0)  # without object numbers
             corners.append(vertices[faces])
             places.append(atlas[faces])
@@ -51,6 +53,8 @@ class AtlasSurface:
             shell = bool((np.ptp(vertices, axis=0) >= SHELL * extent).all())
             seen = np.ones(2, bool) if holes or shell else seen_sides(mi, vertices[faces])
             sides.append(np.tile(seen, (len(faces), 1)))
+            clear = bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission)
+            closed.append(np.tile(~seen & (not clear), (len(faces), 1)))
         self.mi = mi
         self.count = sum(map(len, corners))
         if not self.count:
@@ -63,7 +67,9 @@ class AtlasSurface:
         parameters.update()
         self.flat = mi.load_dict({"type": "scene", "atlas": mesh})
         self.first, self.copies, self.order = map(mi.UInt32, _copies(np.concatenate(places)))
-        self.seen = [mi.Float(side) for side in np.concatenate(sides).T.astype(np.float32)]
+        self.seen, self.closed = (
+            [mi.Float(side) for side in np.concatenate(each).T.astype(np.float32)] for each in (sides, closed)
+        )
         self.corners = mi.Float(np.concatenate(corners).astype(np.float32).ravel())
 
     def points(self, uv: Any, choice: Any = None) -> tuple[Any, Any, Any]:
@@ -91,14 +97,16 @@ class AtlasSurface:
         found &= length > 0
         return place, mi.Normal3f(normal / dr.maximum(length, 1e-30)), found
 
-    def sides(self, uv: Any) -> list[Any]:
-        """Whether the front (the side that the normal points to) and the back of the surface at (U, V) can be seen."""
+    def sides(self, uv: Any, *, closed: bool = False) -> list[Any]:
+        """Whether the front (the side that the normal points to) and the back of the surface at (U, V) can be seen;
+        with ``closed``, whether they are the inside of a closed mesh that lets no light through."""
         import drjit as dr
 
         mi = self.mi
         hit = self.flat.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(uv.x, uv.y, 1), mi.Vector3f(0, 0, -1)))
         found = hit.is_valid()
-        return [found & (dr.gather(mi.Float, seen, hit.prim_index, found) > 0.5) for seen in self.seen]
+        sides = self.closed if closed else self.seen
+        return [found & (dr.gather(mi.Float, side, hit.prim_index, found) > 0.5) for side in sides]
 
 
 def _copies(places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -20,7 +20,7 @@ from ...core.units import duration
 from ...core.workspace import digest, file_sha256
 from ...workers.processes import KeptWorker
 from ...workers.view_tasks import is_made
-from ..base_images import BASE_VERSION, base_renderer, light_plan
+from ..base_images import BASE_VERSION, DENOISE_VERSION, LIGHT_VERSION, base_renderer, light_plan
 from ..effect_plan import resolve_plan
 from ..render import write_mp4
 from ..session import Session
@@ -37,7 +37,7 @@ from .renderers import Renderer, path_tracer, shipped_renderer, trained_renderer
 
 CHECKED = 2
 """Frames of a shot that are traced to check it."""
-PLAN_VERSION = 10
+PLAN_VERSION = 11
 LIGHT_SIZES = (1024, 2048)
 """Texels of the light map's side: of few frames, of many."""
 BATCH = 8
@@ -70,7 +70,14 @@ def plan_shot(session: Session, shot: Shot, kept: KeptWorker) -> ShotPlan:
     choose_light(session, shot.frames)
     run = _run(session, kept)
     tracer, path = path_tracer(run, shot.background), folder_of(run, shot) / PLAN
-    inputs = [tracer.common.model_dump(mode="json"), run.scene_fingerprint, shot.wanted.model_dump(mode="json")]
+    inputs = [
+        BASE_VERSION,
+        LIGHT_VERSION,
+        DENOISE_VERSION,
+        tracer.common.model_dump(mode="json"),
+        run.scene_fingerprint,
+        shot.wanted.model_dump(mode="json"),
+    ]
     frames = [frame.model_dump(mode="json") for frame in shot.frames]
     fingerprint = digest([PLAN_VERSION, *inputs, frames, run.settings.model_dump(mode="json")])
     plan = read(path, ShotPlan) if path.exists() and not session.options["force"] else None
