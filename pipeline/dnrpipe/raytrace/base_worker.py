@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -45,7 +44,6 @@ class Worker(BundleWorker):
         self.silhouettes: dict[tuple[int, int], Frames] = {}
         self.history, self.seen = History(self.engine.mi), list[tuple[View, int | None, int]]()
         """Of the frames ``seen``, with their rays per pixel and the number of the first."""
-        self.compiled: set[tuple[int, int]] = set()
         self.repaired = self.masked = 0  # pixels of the view at hand: samples left out, set to zero
 
     def __call__(self, asked: dict[str, Any]) -> BaseAnswer:
@@ -116,11 +114,7 @@ class Worker(BundleWorker):
     def _traced(self, common: SampledCommon, view: View, channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         integrator, _ = self.engine.integrator(self.bundle, common.integrator, common.max_depth)
         sensor = self.engine.sensor(view)
-        if (view.width, view.height) not in self.compiled:
-            self.compiled.add((view.width, view.height))
-            began = time.monotonic(), time.process_time()
-            self.engine.frame(self.bundle, integrator, sensor, view, 1, 0)
-            Stopwatch.leave_out(*began)
+        self.engine.compile(self.bundle, integrator, sensor, view)
         picture, _ = self.engine.frame(self.bundle, integrator, sensor, view, common.spp, common.seed)
         picture, lost = masked(picture.astype(np.float32))
         self.masked += lost

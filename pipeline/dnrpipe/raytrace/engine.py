@@ -14,7 +14,7 @@ from dnrtrain.contract import View
 
 from . import plugins
 from .auxiliary import auxiliary_integrator
-from .recorded import without_collection
+from .recorded import Stopwatch, without_collection
 from .second_targets import second_targets
 from .sensors import row_of_sensors, scaled_lens, scaled_view, sensor_dict, unit_scale
 from .tasks import BundleCommon
@@ -66,6 +66,7 @@ class Engine:
         if threads > 0:  # the caller's thread works too
             dr.set_thread_count(threads - 1)
         self._integrators: dict[tuple[str, str, int, bool], tuple[Any, str]] = {}
+        self._sizes: set[tuple[int, int]] = set()
 
     def integrator(self, bundle: Path, kind: str, max_depth: int, passes: bool = False) -> tuple[Any, str]:
         """(integrator, its name for the file's header).
@@ -127,6 +128,16 @@ class Engine:
         assert total is not None and done == spp
         channels, lost = masked(total)
         return channels[..., :3].clip(0, 1), channels[..., 3:].clip(-1, 1), lost
+
+    def compile(self, bundle: Path, integrator: Any, sensor: Any, view: View) -> None:
+        """Render one sample per pixel where no picture of the size was, in no `Stopwatch`'s seconds: Mitsuba's own
+        kernels are compiled for each. Arguments: of `frame`."""
+        if (view.width, view.height) in self._sizes:
+            return
+        self._sizes.add((view.width, view.height))
+        began = time.monotonic(), time.process_time()
+        self.frame(bundle, integrator, sensor, view, 1, 0)
+        Stopwatch.leave_out(*began)
 
     def frame(
         self, bundle: Path, integrator: Any, sensor: Any, view: View, spp: int, seed: int

@@ -53,8 +53,6 @@ class Worker:
         self.frames = functools.cache(
             functools.partial(Frames, self.engine, settings.bundle, settings.integrator, settings.max_depth)
         )  # by (width, height)
-        self.compiled: set[tuple[int, int]] = set()
-        """Sizes of pictures through a lens: their kernel is Mitsuba's own, compiled for each."""
         self.background = Background(self.engine, settings.bundle) if settings.background else None
 
     @functools.cached_property
@@ -171,11 +169,7 @@ class Worker:
         if task.lens is not None:
             integrator, _ = self.engine.integrator(self.common.bundle, self.common.integrator, self.common.max_depth)
             sensor = self.engine.sensor(view, task.lens)
-            if (view.width, view.height) not in self.compiled:
-                self.compiled.add((view.width, view.height))
-                began = time.monotonic(), time.process_time()
-                self.engine.frame(self.common.bundle, integrator, sensor, view, 1, 0)
-                Stopwatch.leave_out(*began)
+            self.engine.compile(self.common.bundle, integrator, sensor, view)
             image, _ = self.engine.frame(self.common.bundle, integrator, sensor, view, spp, task.seed)
             return image.astype(np.float32)
         each = _at_once(task)

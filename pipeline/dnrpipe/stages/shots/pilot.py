@@ -105,8 +105,9 @@ class Pilot:
             seed = SEED + turn if turn < len(references) else 0
             for key, (index, place) in enumerate(self.windows):
                 lead = [] if tracing else list(self._lead(index))
-                last = 0 if tracing else max(1, len(lead))
-                for number, at in enumerate([*lead, index] if lead or tracing else [index, index]):
+                steps = [*lead, index] if lead or tracing else [index, index]
+                last = len(steps) - 1
+                for number, at in enumerate(steps):
                     earlier = None if tracing else tuple(self._view(i, place) for i in lead[:number])
                     # What a frame remembers are base images. The first one readies the network all the same: later,
                     # that would cost the memory.
