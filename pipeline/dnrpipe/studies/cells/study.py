@@ -265,6 +265,10 @@ class Study(ABC, Generic[Place]):
             **self.compared(),
             "cells": [self.line(place, task) for place, task in self.cells.items() if task.output.exists()],
         }
+        if self.device.startswith("cuda"):
+            import torch
+
+            results["machine"]["gpu"] = torch.cuda.get_device_name(self.device)
         if results["cells"]:
             write_json(self.out / "results.json", results)
             self.show(results)
