@@ -15,7 +15,7 @@ from tests.corner_room import corner_room, onwards, quad, rgb
 
 from dnrpipe.blender.bundle.ply import weld, write_ply
 from dnrpipe.raytrace.base_renderer import CENTRES, MEANS, NOISE, BaseRenderer
-from dnrpipe.raytrace.base_worker import Worker, without_grain
+from dnrpipe.raytrace.base_worker import Worker, denoised, without_grain
 from dnrpipe.raytrace.engine import Engine
 from dnrpipe.raytrace.history import History
 from dnrpipe.raytrace.lightmap import LightBaker
@@ -465,7 +465,7 @@ def test_a_denoised_base_image_has_less_error_and_keeps_its_own_beside_it(tmp_pa
     baked = LightBaker(mi, scene, onwards(), gloss=False).bake(64, 256, 0)
     renderer = BaseRenderer(mi, scene, baked, gloss=False)
     few, many = (renderer.frame(camera(0.0), samples) for samples in (2, 64))
-    raw, clean = dict(few), without_grain({name: plane.copy() for name, plane in few.items()})
+    raw, clean = dict(few), without_grain({name: plane.copy() for name, plane in few.items()}, renderer)
     full = (few["coverage"] > 0.99) & (few["base.A"] > 0.99)
     assert full.sum() > 200
 
@@ -474,6 +474,14 @@ def test_a_denoised_base_image_has_less_error_and_keeps_its_own_beside_it(tmp_pa
 
     assert error(clean, "base.G") < 0.7 * error(raw, "base.G")
     np.testing.assert_allclose(clean["fresh.G"][full], raw["base.G"][full], rtol=0.02)
+    # Baked light has no grain on the wall, so the denoiser leaves it alone.
+    lit = full & (few["diffuse.G"] > 0.99 * few["base.G"]) & (few["albedo.G"] > 0.5)
+    assert lit.sum() > 50 and not renderer.passes_light
+    changed = {
+        way: np.median(np.abs(planes["base.G"] / few["base.G"] - 1)[lit])
+        for way, planes in (("the rest", clean), ("all", denoised(few)))
+    }
+    assert changed["the rest"] < 1e-4 < 1e-3 < changed["all"], changed
     assert (clean["fresh.rays"] == 2).all() and (clean["base.A"] == raw["coverage"]).all()
     write_exr(tmp_path / "base.exr", clean, {})
     assert set(FRESH_CHANNELS) <= set(read_exr(tmp_path / "base.exr")[0])

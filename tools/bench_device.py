@@ -106,7 +106,7 @@ def frames(root: Path, sizes: list[tuple[int, ...]]) -> list[dict[str, Any]]:
         mask = channels["mask"] > 0.5
         coverage, row["silhouettes"] = timed(partial(pictures.coverage, seen, mask))
         channels |= {name: channels[name] / scale for name in ("depth.Z", *CHAIN)} | {"coverage": coverage}
-        clean, row["denoiser"] = timed(lambda: without_grain({k: v.copy() for k, v in channels.items()}))  # noqa: B023
+        clean, row["denoiser"] = timed(lambda: without_grain({k: v.copy() for k, v in channels.items()}, renderer))  # noqa: B023
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "view.exr"
             write_exr(file, clean, {})

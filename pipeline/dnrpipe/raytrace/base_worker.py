@@ -11,7 +11,7 @@ from dnrtrain.contract import FRESH_CHANNELS, View
 from dnrtrain.exr import write_exr
 
 from .base_renderer import CHAIN, BaseRenderer
-from .denoise import denoise
+from .denoise import denoise, exposure
 from .engine import BundleWorker, masked
 from .frames import Frames
 from .history import History
@@ -71,7 +71,7 @@ class Worker(BundleWorker):
         channels = self.grainy(view, samples, number)
         if isinstance(self.common, SampledCommon):
             return channels | self._traced(self.common, view, channels)
-        return without_grain(channels) if self.denoise else channels
+        return without_grain(channels, self.renderer) if self.denoise else channels
 
     def grainy(self, view: View, samples: int | None = None, number: int = 0) -> dict[str, np.ndarray]:
         """`channels` by the kernel alone: not denoised, not path-traced."""
@@ -99,7 +99,7 @@ class Worker(BundleWorker):
         for frame, *_ in way[known:-1]:
             self._taken(frame, samples)
         channels = self._taken(view, samples)
-        return without_grain(channels) if self.denoise else channels
+        return without_grain(channels, self.renderer) if self.denoise else channels
 
     def _taken(self, view: View, samples: int | None) -> dict[str, np.ndarray]:
         return self.history.take(view, self.grainy(view, samples, self.history.number))
@@ -123,11 +123,12 @@ class Worker(BundleWorker):
         return clean | {"base.A": found["base.A"]} | {f"diffuse.{c}": clean[f"base.{c}"] for c in "RGB"}
 
 
-def without_grain(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def without_grain(channels: dict[str, np.ndarray], renderer: BaseRenderer) -> dict[str, np.ndarray]:
     """The channels with a denoised base image whose alpha is the coverage, which has no grain at silhouettes.
 
-    FRESH_CHANNELS hold the frame's own with its grain: the network may take of it what a denoiser smooths away. The
-    planes are changed in place: copies of them are half a gigabyte of a 4K frame.
+    Where no surface of the renderer's scene lets light straight through, the diffuse part has no grain, and stays as it
+    is: a denoiser would blur its textures. FRESH_CHANNELS hold the frame's own with its grain: the network may take of
+    it what a denoiser smooths away. The planes are changed in place: copies of them are half a gigabyte of a 4K frame.
     """
     alpha = channels["coverage"]
     share = alpha / np.maximum(channels["base.A"], LEAST_ALPHA)
@@ -136,11 +137,11 @@ def without_grain(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
             channels[name] *= share
     own = dict(zip(FRESH_CHANNELS, (channels[name] for name in (*COLOUR[:3], "rays")), strict=True))
     image = own | channels | {"base.A": alpha}
-    return image | denoised(image)
+    return image | denoised(image, diffuse=renderer.passes_light)
 
 
-def denoised(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """base.R/G/B without grain.
+def denoised(channels: dict[str, np.ndarray], *, diffuse: bool = True) -> dict[str, np.ndarray]:
+    """base.R/G/B without grain. diffuse: whether their diffuse part has some, too.
 
     The auxiliary images are not called clean: measured, that is better by half a decibel and more.
     """
@@ -150,5 +151,10 @@ def denoised(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     mirror = (albedo.mean(axis=-1, keepdims=True) < MIRROR) & (channels["mask"][..., None] > 0.5)
     albedo = np.where(mirror, np.float32(1), albedo).clip(0, 1)
     normal = np.stack([channels[f"normal.{c}"] for c in "XYZ"], axis=-1)
-    clean = denoise(image, albedo, normal, clean=False, quality="fast")
+    if diffuse:
+        clean = denoise(image, albedo, normal, clean=False, quality="fast")
+    else:
+        smooth = np.stack([channels[f"diffuse.{c}"] for c in "RGB"], axis=-1)
+        level = exposure(image)  # what is left may be nearly black
+        clean = denoise(image - smooth, albedo, normal, clean=False, quality="fast", scale=level) + smooth
     return {name: clean[..., i] for i, name in enumerate(COLOUR[:3])}

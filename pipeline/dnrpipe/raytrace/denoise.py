@@ -36,6 +36,7 @@ def denoise(
     clean: bool = True,
     quality: Quality = "high",
     threads: int = 0,
+    scale: float | None = None,
 ) -> np.ndarray:
     """``image`` without its noise, float32, same shape.
 
@@ -47,6 +48,7 @@ def denoise(
         quality: of the network; ``high`` takes the larger one where clean auxiliary images are given (2.4x the time),
             ``fast`` a smaller one (half the time).
         threads: 0: as many as Dr.Jit uses in this process.
+        scale: exposure that the network sees the image at; None: the image's own.
 
     Raises:
         ValueError: wrong shape, or not finite; the message says where.
@@ -60,7 +62,7 @@ def denoise(
     if "normal" in images and "albedo" not in images:
         raise ValueError("normal: needs the albedo beside it; the denoiser has no network for a normal alone")
     result = noisy.copy()
-    result[..., :3] = _filtered(images, threads, quality, clean_aux=clean and len(images) > 1)
+    result[..., :3] = _filtered(images, threads, quality, clean_aux=clean and len(images) > 1, scale=scale)
     return result
 
 
@@ -159,7 +161,7 @@ def _filter(threads: int, shape: tuple[int, int], names: tuple[str, ...], qualit
     return filter_
 
 
-def _exposure(image: np.ndarray) -> float:
+def exposure(image: np.ndarray) -> float:
     """What the network's input is multiplied with: 0.18 over the geometric mean of blocks' luminance."""
     height, width = image.shape[:2]
     rows, columns = np.arange(0, height, BLOCK), np.arange(0, width, BLOCK)
@@ -169,7 +171,9 @@ def _exposure(image: np.ndarray) -> float:
     return float(GREY / np.exp2(np.log2(lit).mean())) if lit.size else 1.0
 
 
-def _filtered(images: dict[str, np.ndarray], threads: int, quality: Quality, clean_aux: bool) -> np.ndarray:
+def _filtered(
+    images: dict[str, np.ndarray], threads: int, quality: Quality, *, clean_aux: bool, scale: float | None
+) -> np.ndarray:
     """Run one filter. images: contiguous or strided float32 [H, W, 3] by OIDN's names."""
     _device(threads)  # says what is missing before the import below fails
     import mitsuba_oidn as oidn
@@ -185,6 +189,6 @@ def _filtered(images: dict[str, np.ndarray], threads: int, quality: Quality, cle
     for name, image in bound.items():
         filter_.set_image(name, image)
     filter_.set_image("output", result)
-    filter_.input_scale = _exposure(bound["color"])
+    filter_.input_scale = exposure(bound["color"]) if scale is None else scale
     filter_.execute()
     return result

@@ -94,7 +94,7 @@ class Worker:
                 channels = self._timed(ms, "history", self.history.take, view, channels)
                 rays = int(channels["rays"].max())
             if self.base is not None and self.base.denoise and mode in REMEMBERED:
-                channels = self._timed(ms, "denoiser", without_grain, channels)
+                channels = self._timed(ms, "denoiser", without_grain, channels, self.base.renderer)
             if mode in ("neural", "error"):
                 picture = self._timed(ms, "network", self._neural, view, channels)
             else:

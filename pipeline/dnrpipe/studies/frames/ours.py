@@ -122,7 +122,7 @@ class Ours:
             channels, parts["history"] = clock.time(partial(history.take, view, channels))
         channels = {**channels, "coverage": coverage}
         if self.scene.settings.base.denoise:
-            channels, parts["denoiser"] = clock.time(partial(without_grain, channels))
+            channels, parts["denoiser"] = clock.time(partial(without_grain, channels, self.renderer))
         return channels, parts
 
     def _data(self, view: View, channels: dict[str, np.ndarray]) -> Any:
