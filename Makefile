@@ -10,7 +10,7 @@ APT_DEV := chromium
 PYTEST  := $(BIN)/pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 
 # Pages with tables made from docs/results.
-RESULTS := $(addprefix docs/,ablation.md bench-select.md cost.md frames.md noise.md scaling.md shots.md)
+RESULTS := $(addprefix docs/,ablation.md bench-select.md cost.md development.md frames.md noise.md scaling.md shots.md)
 
 .DEFAULT_GOAL := help
 .PHONY: help setup system browser demo test lint types imports docs docs-check audit robustness bench bench-shots bench-effects bench-frames pretrain fidelity scenes clean

@@ -16,7 +16,9 @@ import argparse
 import json
 import math
 import os
+import shlex
 import statistics
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -47,7 +49,8 @@ def main() -> None:
     given = parser.parse_args()
     old = json.loads(given.out.read_text()) if given.out.exists() else {}
     kept = {name: old[name] for name in ("frames", "training") if name in old}
-    results = {**made_by(), "device": device_name(), **kept}
+    made = {**made_by(), "command": shlex.join(["python", "-m", "tools.bench_device", *sys.argv[1:]])}
+    results = {**made, "device": device_name(), **kept}
     if given.what == "frames":
         rows = frames(given.workspace, [tuple(int(n) for n in size.split("x")) for size in given.sizes.split(",")])
     else:
@@ -63,6 +66,19 @@ def device_name() -> str:
     import torch
 
     return torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
+
+
+def markdown(results: dict[str, Any]) -> str:
+    """Its tables: columns are what was measured."""
+    lines = [
+        f"`{results['command']}`, {results['date'][:10]}; {results['device']}, torch {results['versions']['torch']}."
+    ]
+    for name in ("frames", "training"):
+        if name in results:
+            columns = list(results[name][0])
+            lines += ["", f"| {' | '.join(columns)} |", "|" + " --- |" * len(columns)]
+            lines += [f"| {' | '.join(str(row[column]) for column in columns)} |" for row in results[name]]
+    return "\n".join(lines)
 
 
 # -- frames ------------------------------------------------------------------------------------------------------

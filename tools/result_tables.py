@@ -5,7 +5,7 @@ Kinds: results (of `dnrpipe ablate`), frames (of tools.bench_frames),
 frames-overview (its tables over all scenes), noise (of tools.bench_noise),
 frontier (of `dnrpipe frontier`), plan-check (of tools.plan_check), selection (of `dnrpipe bench-select`),
 selections (of several of its runs together: FILE,FILE), plan-equal (of tools.plan_equal),
-untrained (of tools.bench_untrained), scaling (of tools.bench_ray).
+untrained (of tools.bench_untrained), device (of tools.bench_device), scaling (of tools.bench_ray).
 
 python -m tools.result_tables [--check] docs/ablation.md docs/*.md
 """
@@ -17,6 +17,7 @@ import re
 import sys
 from pathlib import Path
 
+from tools.bench_device import markdown as device_markdown
 from tools.bench_frames.document import markdown as frames_markdown
 from tools.bench_frames.document import overview as frames_overview
 from tools.bench_noise.document import markdown as noise_markdown
@@ -35,7 +36,9 @@ from dnrpipe.studies.selectbench.bench_tables import markdown as selection_markd
 from dnrpipe.studies.selectbench.bench_tables import read_results as selection_results
 from dnrpipe.studies.selectbench.bench_tables import together as selections_markdown
 
-KINDS = "rows|results|frames(?:-overview)?|noise|frontier|plan-check|plan-equal|selections?|untrained|scaling|shots"
+KINDS = (
+    "rows|device|results|frames(?:-overview)?|noise|frontier|plan-check|plan-equal|selections?|untrained|scaling|shots"
+)
 PART = re.compile(rf"(<!-- ({KINDS})(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -62,6 +65,8 @@ def generate(text: str, folder: Path) -> str:
             body = noise_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
         elif match[2] == "frames-overview":
             body = "\n".join(frames_overview(json.loads((folder / match[3]).read_text(encoding="utf-8"))))
+        elif match[2] == "device":
+            body = device_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
         elif match[2] == "shots":
             body = shots_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
         elif match[2] == "untrained":
