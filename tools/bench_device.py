@@ -6,7 +6,7 @@ python -m tools.bench_device training WORKSPACE.dnr [--sides 128,256,800] --out 
 frames: of the workspace's first test view, with baked light and the shipped corrector; beside it path tracing. The
 workspace was prepared, and its light baked (`dnrpipe run --budget 0`). Medians of wall milliseconds.
 training: steps 1 and 2 as the preset `paper-128` has them (`paper` from 400 pixels on), float32 and, where the device
-has it, bfloat16, on the workspace's first eight candidates, enlarged: what is seen on them does not change the seconds.
+has it, bfloat16, on eight ray-traced views of the workspace, enlarged: what is seen on them does not change the seconds.
 Both add to what the file holds. Nothing else should run.
 """
 
@@ -26,6 +26,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import resolve
 from dnrpipe.core.workspace import Workspace
 from dnrpipe.studies.cells.results import made_by
@@ -48,9 +49,6 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
     old = json.loads(given.out.read_text()) if given.out.exists() else {}
-    kept = {name: old[name] for name in ("frames", "training") if name in old}
-    made = {**made_by(), "command": shlex.join(["python", "-m", "tools.bench_device", *sys.argv[1:]])}
-    results = {**made, "device": device_name(), **kept}
     if given.what == "frames":
         rows = frames(given.workspace, [tuple(int(n) for n in size.split("x")) for size in given.sizes.split(",")])
     else:
@@ -58,7 +56,8 @@ def main() -> None:
         for side in given.sides.split(","):
             rows += training(given.workspace, int(side))
             print(json.dumps(rows[-2:]), flush=True)
-    write_json(given.out, {**results, given.what: rows})
+    command = shlex.join(["python", "-m", "tools.bench_device", *sys.argv[1:]])
+    write_json(given.out, old | {given.what: {**made_by(), "command": command, "device": device_name(), "rows": rows}})
 
 
 def device_name() -> str:
@@ -70,15 +69,14 @@ def device_name() -> str:
 
 def markdown(results: dict[str, Any]) -> str:
     """Its tables: columns are what was measured."""
-    lines = [
-        f"`{results['command']}`, {results['date'][:10]}; {results['device']}, torch {results['versions']['torch']}."
-    ]
-    for name in ("frames", "training"):
-        if name in results:
-            columns = list(results[name][0])
-            lines += ["", f"| {' | '.join(columns)} |", "|" + " --- |" * len(columns)]
-            lines += [f"| {' | '.join(str(row[column]) for column in columns)} |" for row in results[name]]
-    return "\n".join(lines)
+    lines: list[str] = []
+    for made in results.values():
+        columns = list(made["rows"][0])
+        lines += [f"`{made['command']}`, {made['date'][:10]}; {made['device']}, torch {made['versions']['torch']}.", ""]
+        lines += [f"| {' | '.join(columns)} |", "|" + " --- |" * len(columns)]
+        lines += [f"| {' | '.join(str(row[column]) for column in columns)} |" for row in made["rows"]]
+        lines += [""]
+    return "\n".join(lines[:-1])
 
 
 # -- frames ------------------------------------------------------------------------------------------------------
@@ -90,7 +88,7 @@ def frames(root: Path, sizes: list[tuple[int, ...]]) -> list[dict[str, Any]]:
 
     from dnrpipe.core.scene_files import split_views
     from dnrpipe.raytrace.base_renderer import CHAIN, BaseRenderer
-    from dnrpipe.raytrace.base_worker import without_grain
+    from dnrpipe.raytrace.base_worker import denoised, without_grain
     from dnrpipe.raytrace.frames import Frames
     from dnrpipe.raytrace.light_worker import read_light
     from dnrpipe.raytrace.sensors import scaled_view
@@ -122,7 +120,8 @@ def frames(root: Path, sizes: list[tuple[int, ...]]) -> list[dict[str, Any]]:
         mask = channels["mask"] > 0.5
         coverage, row["silhouettes"] = timed(partial(pictures.coverage, seen, mask))
         channels |= {name: channels[name] / scale for name in ("depth.Z", *CHAIN)} | {"coverage": coverage}
-        clean, row["denoiser"] = timed(lambda: without_grain({k: v.copy() for k, v in channels.items()}, renderer))  # noqa: B023
+        _, row["denoiser"] = timed(partial(denoised, channels, diffuse=renderer.passes_light))
+        clean = without_grain(channels, renderer)
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "view.exr"
             write_exr(file, clean, {})
@@ -164,7 +163,11 @@ def training(root: Path, side: int) -> list[dict[str, Any]]:
     device = "cuda" if torch.cuda.is_available() else "cpu"
     preset = "paper" if side >= LARGE else "paper-128"
     settings = resolve(preset, {}, environment={})
-    names = tuple(view.name for view in split_views(Workspace.open(root))["train"][:VIEWS])
+    workspace = Workspace.open(root)
+    candidates = [view.name for view in split_views(workspace)["train"]]
+    names = tuple(name for name in candidates if workspace.raytraced("train", name).exists())[:VIEWS]
+    if len(names) < 2:
+        raise UserError(f"{root}: has fewer than two ray-traced views; run `dnrpipe raytrace-selected` first")
     drawn, traced = (
         enlarged(load_cell_views(root, "train", names, raytraced=raytraced, base="none"), side)
         for raytraced in (False, True)
@@ -180,7 +183,7 @@ def training(root: Path, side: int) -> list[dict[str, Any]]:
         with tempfile.TemporaryDirectory() as folder:
             first, second = Path(folder) / "step1", Path(folder) / "step2"
             events = run_step1(
-                drawn, None, settings.model, step1, policy="rl-paper", budget=VIEWS, checkpoints=first, **common
+                drawn, None, settings.model, step1, policy="rl-paper", budget=len(names), checkpoints=first, **common
             )
             row["step 1"] = step_ms(events)
             events = run_step2(

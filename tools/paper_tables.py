@@ -22,6 +22,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+from filelock import FileLock
+
 from dnrtrain.atomic import write_json
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
@@ -96,6 +99,13 @@ def main() -> int:
             size += ["--set", f"{key}={given.size}"]
     target, made = RESULTS / (given.results or table.results), out / "results.json"
     made.unlink(missing_ok=True)  # another table's, or of a run that this one goes on with
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    if target.exists() and (there := json.loads(target.read_text())["device"]) != device:
+        print(
+            f"{target}: of trainings on {there}; these would be on {device}: name another with --results",
+            file=sys.stderr,
+        )
+        return 2
     command = [sys.executable, "-m", "dnrpipe.cli", *table.command, *size, *more, "--out", str(out)]
     try:
         code = subprocess.run(command, check=False).returncode
@@ -103,14 +113,15 @@ def main() -> int:
         code = 130
     if made.exists():
         results = json.loads(made.read_text())
-        try:
-            if target.exists():
-                results = added(json.loads(target.read_text()), results)
-        except ValueError as error:
-            print(f"{target}: not of this table ({error}); name another with --results", file=sys.stderr)
-            return 2
         RESULTS.mkdir(parents=True, exist_ok=True)
-        write_json(target, results)
+        with FileLock(target.with_suffix(".lock")):  # several runs may add to it
+            try:
+                if target.exists():
+                    results = added(json.loads(target.read_text()), results)
+            except ValueError as error:
+                print(f"{target}: not of this table ({error}); name another with --results", file=sys.stderr)
+                return 2
+            write_json(target, results)
         print(f"{len(results['cells'])} cells: {target}")
     return code
 

@@ -126,9 +126,10 @@ class Worker(BundleWorker):
 def without_grain(channels: dict[str, np.ndarray], renderer: BaseRenderer) -> dict[str, np.ndarray]:
     """The channels with a denoised base image whose alpha is the coverage, which has no grain at silhouettes.
 
-    Where no surface of the renderer's scene lets light straight through, the diffuse part has no grain, and stays as it
-    is: a denoiser would blur its textures. FRESH_CHANNELS hold the frame's own with its grain: the network may take of
-    it what a denoiser smooths away. The planes are changed in place: copies of them are half a gigabyte of a 4K frame.
+    Where no surface of the renderer's scene lets light straight through, the diffuse part has no grain but at edges,
+    and stays as it is: a denoiser would blur its textures. FRESH_CHANNELS hold the frame's own with its grain: the
+    network may take of it what a denoiser smooths away. The planes are changed in place: copies of them are half a
+    gigabyte of a 4K frame.
     """
     alpha = channels["coverage"]
     share = alpha / np.maximum(channels["base.A"], LEAST_ALPHA)
@@ -151,10 +152,11 @@ def denoised(channels: dict[str, np.ndarray], *, diffuse: bool = True) -> dict[s
     mirror = (albedo.mean(axis=-1, keepdims=True) < MIRROR) & (channels["mask"][..., None] > 0.5)
     albedo = np.where(mirror, np.float32(1), albedo).clip(0, 1)
     normal = np.stack([channels[f"normal.{c}"] for c in "XYZ"], axis=-1)
-    if diffuse:
-        clean = denoise(image, albedo, normal, clean=False, quality="fast")
-    else:
-        smooth = np.stack([channels[f"diffuse.{c}"] for c in "RGB"], axis=-1)
-        level = exposure(image)  # what is left may be nearly black
-        clean = denoise(image - smooth, albedo, normal, clean=False, quality="fast", scale=level) + smooth
+    level = exposure(image)  # without the diffuse part it may be nearly black
+    kept = [] if diffuse else [channels[f"diffuse.{c}"] for c in "RGB"]
+    for i, plane in enumerate(kept):
+        image[..., i] -= plane
+    clean = denoise(image, albedo, normal, clean=False, quality="fast", scale=level)
+    for i, plane in enumerate(kept):
+        clean[..., i] += plane
     return {name: clean[..., i] for i, name in enumerate(COLOUR[:3])}

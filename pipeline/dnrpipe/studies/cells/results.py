@@ -106,8 +106,9 @@ def made_line(results: Mapping[str, Any]) -> str:
         state += f" (cells of {len(commits)} commits: {', '.join(commit[:12] for commit in commits)})"
     engines = [engine for engine in results.get("raster_engines", []) if engine]
     drawn = f", rasterised by {' and '.join(engines)}" if engines else ""
+    gpu = f", {box['gpu']}" if "gpu" in box else ""
     return (
         f"`{results['command']}`, {results['date'][:10]}, {state}; {box['processor']},"
-        f" {box['cores']} cores, torch {results['versions']['torch']}. Preset"
+        f" {box['cores']} cores{gpu}, torch {results['versions']['torch']}. Preset"
         f" {results['preset']}, {results['resolution']}{drawn}"
     )

@@ -45,7 +45,7 @@ from .pilot_worker import FramesTask, PilotCommon, TrainTask
 from .records import FOLDER, BasePart, FramePart, LightPart, LightPoint, Pilot, Traced, TracePart, TrainingPart
 from .seconds import trained_pixels
 
-VERSION = 7
+VERSION = 8
 RESOLUTION = 128
 VIEWS, SPP = 6, 16
 HELD_OUT, REFERENCE_SPP = 6, 64
