@@ -6,7 +6,7 @@ python -m tools.bench_device training WORKSPACE.dnr [--sides 128,256,800] --out 
 frames: of the workspace's first test view, with baked light and the shipped corrector; beside it path tracing. The
 workspace was prepared, and its light baked (`dnrpipe run --budget 0`). Medians of wall milliseconds.
 training: steps 1 and 2 as the preset `paper-128` has them (`paper` from 400 pixels on), float32 and, where the device
-has it, bfloat16, on eight ray-traced views of the workspace, enlarged: what is seen on them does not change the seconds.
+has it, bfloat16, on eight ray-traced views of the workspace, enlarged: what they show does not change the seconds.
 Both add to what the file holds. Nothing else should run.
 """
 
