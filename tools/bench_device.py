@@ -20,8 +20,6 @@ import shlex
 import statistics
 import sys
 import tempfile
-import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,7 +27,8 @@ from typing import Any
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import resolve
 from dnrpipe.core.workspace import Workspace
-from dnrpipe.studies.cells.results import made_by
+from dnrpipe.stages.trainer import torch_device
+from dnrpipe.studies.cells.results import made_by, table
 from dnrtrain.atomic import write_json
 
 VIEWS = 8
@@ -69,82 +68,51 @@ def device_name() -> str:
 
 def markdown(results: dict[str, Any]) -> str:
     """Its tables: columns are what was measured."""
-    lines: list[str] = []
+    parts = []
     for made in results.values():
-        columns = list(made["rows"][0])
-        lines += [f"`{made['command']}`, {made['date'][:10]}; {made['device']}, torch {made['versions']['torch']}.", ""]
-        lines += [f"| {' | '.join(columns)} |", "|" + " --- |" * len(columns)]
-        lines += [f"| {' | '.join(str(row[column]) for column in columns)} |" for row in made["rows"]]
-        lines += [""]
-    return "\n".join(lines[:-1])
+        rows = [[str(value) for value in row.values()] for row in made["rows"]]
+        head = f"`{made['command']}`, {made['date'][:10]}; {made['device']}, torch {made['versions']['torch']}."
+        parts.append(f"{head}\n\n{table(list(made['rows'][0]), rows)}")
+    return "\n\n".join(parts)
 
 
 # -- frames ------------------------------------------------------------------------------------------------------
 
 
 def frames(root: Path, sizes: list[tuple[int, ...]]) -> list[dict[str, Any]]:
-    """A row a size."""
-    import torch
-
+    """A row a size. The first of the repeats, which compiles, does not count."""
     from dnrpipe.core.scene_files import split_views
-    from dnrpipe.raytrace.base_renderer import CHAIN, BaseRenderer
-    from dnrpipe.raytrace.base_worker import denoised, without_grain
     from dnrpipe.raytrace.frames import Frames
-    from dnrpipe.raytrace.light_worker import read_light
-    from dnrpipe.raytrace.sensors import scaled_view
-    from dnrpipe.stages.base_images import light_path
     from dnrpipe.stages.shots.open_shot import resized
-    from dnrpipe.studies.frames.scene import open_scene
-    from dnrtrain.dataset import load_views
-    from dnrtrain.exr import write_exr
-    from dnrtrain.model import render_views
+    from dnrpipe.studies.frames.ours import NEURAL, Ours
+    from dnrpipe.studies.frames.scene import Clock, open_scene
+    from dnrtrain.precision import decide_bfloat16
     from dnrtrain.shipped import corrector
 
-    workspace = Workspace.open(root)
-    view = split_views(workspace)["test"][0]
-    scene = open_scene(root, [view], os.cpu_count() or 1)
-    scale = scene.engine.unit_scale
-    loaded = scene.engine.scenes[str(scene.bundle)]
-    gloss = not scene.settings.base.denoise
-    renderer = BaseRenderer(scene.engine.mi, loaded, read_light(light_path(workspace)), gloss=gloss)
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    network = corrector().to(device)
-    network.use_bfloat16 = network.use_bfloat16 or device == "cuda"
+    view = split_views(Workspace.open(root))["test"][0]
+    cores = os.cpu_count() or 1
+    scene, clock, device = (
+        open_scene(root, [view], cores),
+        Clock("wall", cores),
+        torch_device(resolve("draft", {}, environment={})),
+    )
+    rays = scene.settings.base.samples
+    ours = Ours(scene, (rays,))
+    ours.model = corrector().to(device)
+    ours.model.use_bfloat16 = decide_bfloat16("auto", device)
     rows = []
     for width, height in sizes:
         seen = resized(view, width, height)
-        pictures = Frames(scene.engine, scene.bundle, scene.integrator, scene.max_depth, (width, height))
-        row: dict[str, Any] = {"size": f"{width}x{height}", "variant": scene.engine.variant}
-        rays = scene.settings.base.samples
-        channels, row["base image and G-buffer"] = timed(partial(renderer.frame, scaled_view(seen, scale), rays, 0))
-        mask = channels["mask"] > 0.5
-        coverage, row["silhouettes"] = timed(partial(pictures.coverage, seen, mask))
-        channels |= {name: channels[name] / scale for name in ("depth.Z", *CHAIN)} | {"coverage": coverage}
-        _, row["denoiser"] = timed(partial(denoised, channels, diffuse=renderer.passes_light))
-        clean = without_grain(channels, renderer)
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / "view.exr"
-            write_exr(file, clean, {})
-            data = load_views(
-                [file], None, scene.frame, cameras=[seen], folder=workspace.scene, target=False, base="baked",
-                base_files=[file],
-            ).to(device)  # fmt: skip
-        _, row["network"] = timed(partial(render_views, network, data))
-        _, row[f"path tracing, {SAMPLES} samples"] = timed(partial(pictures.path, seen, SAMPLES, 1))
-        _, row[f"path tracing, {REFERENCE} samples"] = timed(partial(pictures.path, seen, REFERENCE, 1), repeats=2)
-        rows.append({"rays": rays, **row})
-        print(json.dumps(rows[-1]), flush=True)
+        pictures = scene.frames = Frames(scene.engine, scene.bundle, scene.integrator, scene.max_depth, (width, height))
+        taken = [ours.frame(seen, clock)[f"{NEURAL}, {rays} rays"]["parts"] for _ in range(1 + REPEATS)][1:]
+        row: dict[str, Any] = {"rays": rays, "size": f"{width}x{height}", "variant": scene.engine.variant}
+        row |= {name: round(statistics.median(parts[name] for parts in taken), 2) for name in taken[0]}
+        for samples, repeats in ((SAMPLES, REPEATS), (REFERENCE, 2)):
+            spent = [clock.time(partial(pictures.path, seen, samples, 1))[1] for _ in range(1 + repeats)][1:]
+            row[f"path tracing, {samples} samples"] = round(statistics.median(spent), 2)
+        rows.append(row)
+        print(json.dumps(row), flush=True)
     return rows
-
-
-def timed(function: Callable[[], Any], repeats: int = REPEATS) -> tuple[Any, float]:
-    """(result, median wall milliseconds). The first call, which compiles, does not count."""
-    result, seconds = function(), []
-    for _ in range(repeats):
-        started = time.perf_counter()
-        result = function()  # ends in memory of the CPU, so it waits for the device
-        seconds.append(time.perf_counter() - started)
-    return result, round(1000 * statistics.median(seconds), 2)
 
 
 # -- training ----------------------------------------------------------------------------------------------------
@@ -160,9 +128,9 @@ def training(root: Path, side: int) -> list[dict[str, Any]]:
     from dnrtrain.step1 import run_step1
     from dnrtrain.step2 import run_step2
 
-    device = "cuda" if torch.cuda.is_available() else "cpu"
     preset = "paper" if side >= LARGE else "paper-128"
     settings = resolve(preset, {}, environment={})
+    device = torch_device(settings)
     workspace = Workspace.open(root)
     candidates = [view.name for view in split_views(workspace)["train"]]
     names = tuple(name for name in candidates if workspace.raytraced("train", name).exists())[:VIEWS]

@@ -22,9 +22,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from filelock import FileLock
 
+from dnrpipe.core.settings import resolve
+from dnrpipe.stages.trainer import torch_device
 from dnrtrain.atomic import write_json
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
@@ -99,7 +100,7 @@ def main() -> int:
             size += ["--set", f"{key}={given.size}"]
     target, made = RESULTS / (given.results or table.results), out / "results.json"
     made.unlink(missing_ok=True)  # another table's, or of a run that this one goes on with
-    device = "cuda" if torch.cuda.is_available() else "cpu"
+    device = torch_device(resolve("paper-128", {}, environment={}))
     if target.exists() and (there := json.loads(target.read_text())["device"]) != device:
         print(
             f"{target}: of trainings on {there}; these would be on {device}: name another with --results",
