@@ -37,7 +37,8 @@ demo: setup  ## the demo scene from .blend to report, untrained and trained; pri
 	@$(BIN)/dnrpipe render -w $(DEMO)/demo.dnr --orbit 60
 	@$(BIN)/dnrpipe report -w $(DEMO)/demo.dnr
 
-test: setup browser lint types imports docs-check  ## lint, types, import rules, documentation, the quick tests
+test: setup browser  ## lint, types, import rules, documentation, the quick tests
+	@$(MAKE) --no-print-directory -j 2 lint types imports docs-check
 	$(PYTEST) -m "not robustness" --durations 40
 
 browser:

@@ -476,7 +476,7 @@ def test_a_denoised_base_image_has_less_error_and_keeps_its_own_beside_it(tmp_pa
     np.testing.assert_allclose(clean["fresh.G"][full], raw["base.G"][full], rtol=0.02)
     # Baked light has no grain on the wall, so the denoiser leaves it alone.
     lit = full & (few["diffuse.G"] > 0.99 * few["base.G"]) & (few["albedo.G"] > 0.5)
-    assert lit.sum() > 50 and not renderer.passes_light
+    assert lit.sum() > 50 and not renderer.lets_through
     changed = {
         way: np.median(np.abs(planes["base.G"][lit] / few["base.G"][lit] - 1))
         for way, planes in (("the rest", clean), ("all", denoised(few)))

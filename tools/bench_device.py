@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import shlex
 import statistics
@@ -124,6 +123,7 @@ def training(root: Path, side: int) -> list[dict[str, Any]]:
 
     from dnrpipe.core.scene_files import split_views
     from dnrpipe.studies.cells.cell import load_cell_views
+    from dnrtrain.perceptual import random_weights
     from dnrtrain.precision import decide_bfloat16
     from dnrtrain.step1 import run_step1
     from dnrtrain.step2 import run_step2
@@ -154,9 +154,8 @@ def training(root: Path, side: int) -> list[dict[str, Any]]:
                 drawn, None, settings.model, step1, policy="rl-paper", budget=len(names), checkpoints=first, **common
             )
             row["step 1"] = step_ms(events)
-            events = run_step2(
-                traced, None, first, settings.model, step2, checkpoints=second, weights=random_weights(), **common
-            )
+            common |= {"checkpoints": second, "weights": {"vgg": random_weights("vgg")}}
+            events = run_step2(traced, None, first, settings.model, step2, **common)
             row["step 2"] = step_ms(events)
         if device == "cuda":
             row["peak_gib"] = round(torch.cuda.max_memory_allocated() / 2**30, 2)
@@ -179,22 +178,6 @@ def step_ms(events: Any) -> float:
 
     ended = [event for event in events if isinstance(event, EpochEnd)]
     return round(1000 * min(event.seconds / event.steps for event in ended[1:]), 2)
-
-
-def random_weights() -> dict[str, Any]:
-    """Of the perceptual network: what they are does not change the seconds, and they may not be at hand."""
-    import torch
-
-    from dnrtrain.perceptual import weight_shapes
-
-    generator = torch.Generator().manual_seed(0)
-    shapes = weight_shapes("vgg")
-    return {
-        "vgg": {
-            name: torch.randn(shape, generator=generator) * (2.0 / max(1, math.prod(shape[1:]))) ** 0.5
-            for name, shape in shapes.items()
-        }
-    }
 
 
 if __name__ == "__main__":

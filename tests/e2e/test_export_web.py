@@ -117,6 +117,7 @@ def test_normals_turn_by_the_inverse_transpose(exported: tuple[Path, dict[str, A
     assert np.allclose(turned, abs(np.linalg.det(linear)) * np.linalg.inv(linear).T)
 
 
+@pytest.mark.robustness
 def test_a_static_server_sends_little(exported: tuple[Path, dict[str, Any]]) -> None:
     """File by file, without offline.js; one that isolates origins gets threads, and the same picture."""
     out, answer = exported

@@ -194,9 +194,8 @@ def test_novel_views(tiny: Path, tmp_path: Path) -> None:
     assert (copy / "renders" / "orbit-3" / "orbit-3.mp4").stat().st_size > 1000
 
 
-@pytest.mark.parametrize(
-    "stage", [stage if stage == "finetune" else pytest.param(stage, marks=pytest.mark.robustness) for stage in STAGES]
-)
+@pytest.mark.robustness
+@pytest.mark.parametrize("stage", STAGES)
 def test_killed_anywhere_and_run_again_gives_the_same(stage: str, tiny: Path, tmp_path: Path, demo_blend: Path) -> None:
     """SIGKILL at random moments of each stage, then the rest: every pixel, weight and metric is the same."""
     expected = contents(tiny)

@@ -77,6 +77,7 @@ def test_of_a_job(server: Server, trained: str) -> None:
     assert [(r.name, r.stage, r.purpose) for r in new] == [(name, "finetune", "evaluation") for name in names]
 
 
+@pytest.mark.robustness
 def test_without_them_the_weights_are_the_same(server: Server, trained: str) -> None:
     """Whether a run shows pictures does not matter to what it makes, nor to whether it is up to date."""
     plain, shown = copy_of(server, trained, "plain"), copy_of(server, trained, "pictured")

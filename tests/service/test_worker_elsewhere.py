@@ -205,6 +205,7 @@ def test_a_worker_stopped_in_order_gives_its_job_back(server: Server, start: Cal
         assert _states(client, job.id) == ["queued", "running", "queued", "running", "done"]
 
 
+@pytest.mark.robustness
 def test_a_job_that_was_taken_back_is_ended_there(
     server: Server, start: Callable[..., Elsewhere], tmp_path: Path
 ) -> None:

@@ -2,30 +2,16 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 import torch
 
 from dnrtrain import losses
 from dnrtrain.model import Output
-from dnrtrain.perceptual import Features, PerceptualLoss, weight_shapes
+from dnrtrain.perceptual import Features, PerceptualLoss, random_weights
 from dnrtrain.settings import LossWeights, Step2Settings
 
 TERMS = {"photometric", "ssim", "perceptual", "frequency", "total_variation", "regularisation"}
-
-
-def random_weights(network: str) -> dict[str, torch.Tensor]:
-    """Weights of the right shapes: the mechanics need no trained network."""
-    generator = torch.Generator().manual_seed(0)
-    weights: dict[str, torch.Tensor] = {}
-    for name, shape in weight_shapes(network).items():
-        if name.endswith("weight"):
-            weights[name] = (2.0 / math.prod(shape[1:])) ** 0.5 * torch.randn(shape, generator=generator)
-        else:
-            weights[name] = torch.zeros(shape) if name.endswith("bias") else torch.rand(shape, generator=generator)
-    return weights
 
 
 @pytest.fixture(scope="module")

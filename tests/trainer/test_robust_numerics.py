@@ -9,7 +9,6 @@ import pytest
 import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from test_losses import random_weights
 from torch import Tensor
 
 from dnrtrain import losses
@@ -19,7 +18,7 @@ from dnrtrain.dataset import Batch
 from dnrtrain.display import DisplayTransform
 from dnrtrain.metrics import image_metrics, psnr, ssim
 from dnrtrain.model import DNR, Output, compose
-from dnrtrain.perceptual import Lpips, PerceptualLoss
+from dnrtrain.perceptual import Lpips, PerceptualLoss, random_weights
 from dnrtrain.settings import LossWeights, ModelSettings, Step2Settings
 from dnrtrain.textures import TexturePyramid, apply_harmonics, depth_coordinate, octahedral
 

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_losses import random_weights
 
 from dnrtrain import index, weights
 from dnrtrain.index import DownloadError, download, download_from_index
+from dnrtrain.perceptual import random_weights
 from dnrtrain.weights import NumpyUnpickler, WeightsMissing, ensure_weights, load_weights
 
 

@@ -6,6 +6,7 @@ Krizhevsky 2014), defined here: torchvision is no dependency. Weights come from 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Literal
 
@@ -185,6 +186,18 @@ def weight_shapes(network: str) -> dict[str, tuple[int, ...]]:
         shapes |= {f"conv.{index}.weight": (channels, inputs, kernel, kernel), f"conv.{index}.bias": (channels,)}
         inputs = channels
     return shapes | {f"head.{j}": (1, LAYOUT[network][tap][0], 1, 1) for j, tap in enumerate(TAPS[network])}
+
+
+def random_weights(network: str) -> dict[str, Tensor]:
+    """Of the right shapes and sizes, always the same: for timings and tests, which need no trained network."""
+    generator = torch.Generator().manual_seed(0)
+    weights: dict[str, Tensor] = {}
+    for name, shape in weight_shapes(network).items():
+        if name.endswith("weight"):
+            weights[name] = (2.0 / math.prod(shape[1:])) ** 0.5 * torch.randn(shape, generator=generator)
+        else:
+            weights[name] = torch.zeros(shape) if name.endswith("bias") else torch.rand(shape, generator=generator)
+    return weights
 
 
 def build_lpips(weights: Mapping[str, Mapping[str, Tensor]]) -> dict[str, Lpips]:

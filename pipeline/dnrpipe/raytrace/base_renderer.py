@@ -60,7 +60,7 @@ class BaseRenderer:
         light: E and S of the front and of the back, float32 [2, 2, size, size, 3], row 0 at V = 0.
         gloss: see `SpecularPaths`.
 
-    ``passes_light``: a surface lets light straight through, so that also the diffuse part of a pixel has grain.
+    ``lets_through``: a surface lets light straight through, so that also the diffuse part of a pixel has grain.
     Of the last frame: ``repaired`` pixels had samples with parts that were not finite and are left out; ``masked``
     pixels were not finite all the same, and are 0.
     """
@@ -73,7 +73,7 @@ class BaseRenderer:
         self.light = light_textures(mi, light)
         self.paths = SpecularPaths(scene, gloss=gloss)
         self.tables = mi.UInt32(ORDER.ravel()), self.paths.steps
-        self.passes_light = self.paths.has_holes
+        self.lets_through = self.paths.lets_through
         prepare_emitters(mi, scene)
         # Recorded at the first call: tracing the plugins anew would take longer than the frame itself.
         self.kernel = Recorded(self._kernel, scene)

@@ -138,7 +138,7 @@ def without_grain(channels: dict[str, np.ndarray], renderer: BaseRenderer) -> di
             channels[name] *= share
     own = dict(zip(FRESH_CHANNELS, (channels[name] for name in (*COLOUR[:3], "rays")), strict=True))
     image = own | channels | {"base.A": alpha}
-    return image | denoised(image, diffuse=renderer.passes_light)
+    return image | denoised(image, diffuse=renderer.lets_through)
 
 
 def denoised(channels: dict[str, np.ndarray], *, diffuse: bool = True) -> dict[str, np.ndarray]:

@@ -65,7 +65,7 @@ class Frames:
         self.scene = engine.scenes[str(bundle)]
         prepare_emitters(self.mi, self.scene)
         self.integrator, self.name = engine.integrator(bundle, integrator, max_depth)
-        self.passing = lets_through(self.mi, self.scene)
+        self.lets_through = lets_through(self.mi, self.scene)
         self._kernels: dict[tuple[str, int], Any] = {}
         self._cover: dict[int, Any] = {}
 
@@ -103,7 +103,7 @@ class Frames:
         mask: bool [H, W], whether the ray through the pixel's centre meets a surface. Only pixels that differ from a
         neighbour are looked at (a tenth, as a rule); where surfaces let light straight through, all are, at random.
         """
-        if self.passing:
+        if self.lets_through:
             return self._mean(self._cover_kernel, view, rays, 0)[..., 0]
         if rays not in self._cover:
             self._cover[rays] = self._edge_kernel(rays)

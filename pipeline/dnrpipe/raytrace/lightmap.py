@@ -80,7 +80,7 @@ class LightBaker:
         self.mi, self.scene, self.integrator = mi, scene, integrator
         self.surface = AtlasSurface(mi, scene, groups)
         self.lift = float(LIFT * scene.bbox().bounding_sphere().radius)
-        self.passing = lets_through(mi, scene)
+        self.lets_through = lets_through(mi, scene)
         bsdfs = bsdfs_of(scene)
         self.unsplit = [b for b in bsdfs if ignores_context(b)]
         self.glossy = gloss and any(mi.has_flag(b.flags(), mi.BSDFFlags.Glossy) for b in bsdfs)
@@ -305,10 +305,10 @@ class LightBaker:
         import drjit as dr
 
         mi, scene = self.mi, self.scene
-        toward, arriving = scene.sample_emitter_direction(si, sampler.next_2d(), not self.passing, active)
+        toward, arriving = scene.sample_emitter_direction(si, sampler.next_2d(), not self.lets_through, active)
         lit = active & (toward.pdf > 0)
         value = bsdf.eval(context, si, si.to_local(toward.d), lit)
-        if self.passing:
+        if self.lets_through:
             arriving *= transmittance(mi, scene, si, toward.p, lit & (dr.max(value) > 0))
         return dr.select(lit, value * arriving, 0)
 

@@ -62,7 +62,7 @@ class SpecularPaths:
         self.hidden = [s for s in scene.shapes() if camera and s.id().startswith(unseen)]
         self.has_emitters = bool(scene.emitters())
         self.has_media = any(shape.is_medium_transition() for shape in scene.shapes())
-        self.has_holes = lets_through(mi, scene)
+        self.lets_through = lets_through(mi, scene)
         bsdfs = bsdfs_of(scene)
         flags = [bsdf.flags() for bsdf in bsdfs]
         self.unsplit = [bsdf for bsdf in bsdfs if ignores_context(bsdf)]
@@ -275,7 +275,7 @@ class SpecularPaths:
 
     def _opacity(self, bsdf: Any, si: Any, active: Any) -> Any:
         """Share of a surface's light that does not pass straight on; what the surface adds has the same weight."""
-        if not self.has_holes:
+        if not self.lets_through:
             return dr.select(active, mi.Float(1), 0)
         return dr.select(active, 1 - mean_of(bsdf.eval_null_transmission(si, active)), 0)
 

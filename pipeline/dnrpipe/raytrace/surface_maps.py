@@ -87,7 +87,7 @@ class SurfaceMapper(LightBaker):
         emitter = si.emitter(self.scene)
         emission = dr.select(found, emitter.eval(si, found), 0)
         opacity = mi.Float(1.0)
-        if self.passing:
+        if self.lets_through:
             opacity = 1 - mean_of(bsdf.eval_null_transmission(si, found))
         fine = found & dr.all(dr.isfinite(rho)) & dr.all(dr.isfinite(emission)) & dr.isfinite(opacity)
         one = mi.Float(1.0)
