@@ -131,6 +131,20 @@ def test_pieces_of_a_table_add_up_and_others_do_not() -> None:
         paper_tables.added(first, {**piece, "resolution": "256x256"})
 
 
+def test_cells_of_another_device_are_told_apart() -> None:
+    whole = json.loads((paper_tables.RESULTS / "paper-steps.json").read_text())
+    cells = {row: [cell for cell in whole["cells"] if cell["row"] == row] for row in ("paper", "vanilla")}
+    first = {**whole, "cells": cells["paper"], "device": "cuda"}
+    other = {**whole, "cells": cells["vanilla"], "device": "cpu", "command": "another"}
+    with pytest.raises(ValueError, match="device"):
+        paper_tables.added(first, other)
+    both = paper_tables.added(first, other, mixed=True)
+    assert (both["device"], both["command"]) == ("cuda", whole["command"])
+    assert {cell["device"] for cell in both["cells"] if cell["row"] == "vanilla"} == {"cpu"}
+    told = [line for line in markdown(both).splitlines() if "(trained on cpu)" in line]
+    assert told and all("DNR (Thies" in line for line in told)
+
+
 def test_the_papers_numbers_are_the_papers() -> None:
     """Implementation details of the paper: weights of the six losses, reward, "RGB absolute loss"."""
     settings = settings_of(ROWS["paper"], resolve("draft", {}, environment={}), {})

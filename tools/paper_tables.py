@@ -10,6 +10,8 @@ after `--` goes to that command and wins:
 
     python -m tools.paper_tables a -- --rows paper-table --seeds 1 --first-seed 2
     python -m tools.paper_tables a --size 256 --results paper-steps-256.json      # on a GPU
+
+Cells of another device than the results' own belong in a file of their own, or are told apart in one: ``--mixed``.
 """
 
 from __future__ import annotations
@@ -58,17 +60,25 @@ TABLES = {
 
 PLACE = ("scene", "row", "pool", "budget", "policy", "seed")
 """What tells the cells of a table apart."""
-SAME = ("schema", "preset", "resolution", "seconds", "spp", "device", "threads", "budget", "candidates")
+DEVICE = ("device", "threads")
+SAME = ("schema", "preset", "resolution", "seconds", "spp", "budget", "candidates")
 """What cells of one table have in common."""
 
 
-def added(old: dict[str, Any], new: dict[str, Any]) -> dict[str, Any]:
-    """Results with the cells of both, those of ``new`` where both have one. Raises ValueError: not of one table."""
-    for name in SAME:
+def added(old: dict[str, Any], new: dict[str, Any], *, mixed: bool = False) -> dict[str, Any]:
+    """Results with the cells of both, those of ``new`` where both have one. Raises ValueError: not of one table.
+
+    mixed: the cells may be of two devices, and each says of which; the results are called ``old``'s.
+    """
+    for name in SAME if mixed else (*SAME, *DEVICE):
         if old.get(name) != new.get(name):
             raise ValueError(f"{name} is {old.get(name)} there and {new.get(name)} here")
-    places = {_place(cell): cell for cell in (*old["cells"], *new["cells"])}
-    whole = {**new, "cells": list(places.values()), "seeds": len({cell["seed"] for cell in places.values()})}
+    cells = (*old["cells"], *new["cells"])
+    if mixed:
+        cells = tuple({"device": of["device"], **cell} for of in (old, new) for cell in of["cells"])
+    places = {_place(cell): cell for cell in cells}
+    whole = {**(old if mixed else new), "cells": list(places.values())}
+    whole["seeds"] = len({cell["seed"] for cell in places.values()})
     for name in ("scenes", "pools", "budgets", "raster_engines"):
         if name in new:
             whole[name] = list(dict.fromkeys((*old[name], *new[name])))
@@ -88,6 +98,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("paper-tables"), help="where the runs keep their cells")
     parser.add_argument("--size", type=int, help="side of the pictures, and of the neural texture (128)")
     parser.add_argument("--results", help="file name in docs/results/, instead of the table's own")
+    parser.add_argument("--mixed", action="store_true", help="add cells of this device to those of another")
     own, more = sys.argv[1:], []
     if "--" in own:
         own, more = own[: own.index("--")], own[own.index("--") + 1 :]
@@ -101,9 +112,9 @@ def main() -> int:
     target, made = RESULTS / (given.results or table.results), out / "results.json"
     made.unlink(missing_ok=True)  # another table's, or of a run that this one goes on with
     device = torch_device(resolve("paper-128", {}, environment={}))
-    if target.exists() and (there := json.loads(target.read_text())["device"]) != device:
+    if not given.mixed and target.exists() and (there := json.loads(target.read_text())["device"]) != device:
         print(
-            f"{target}: of trainings on {there}; these would be on {device}: name another with --results",
+            f"{target}: of trainings on {there}; these would be on {device}: name another with --results, or say --mixed",
             file=sys.stderr,
         )
         return 2
@@ -118,7 +129,7 @@ def main() -> int:
         with FileLock(target.with_suffix(".lock")):  # several runs may add to it
             try:
                 if target.exists():
-                    results = added(json.loads(target.read_text()), results)
+                    results = added(json.loads(target.read_text()), results, mixed=given.mixed)
             except ValueError as error:
                 print(f"{target}: not of this table ({error}); name another with --results", file=sys.stderr)
                 return 2

@@ -53,6 +53,10 @@ class Figures:
         # Published results may name rows that are no longer offered, and say of others what they were then.
         self.what: dict[str, str] = results.get("rows") or {name: row.what for name, row in ROWS.items()}
         present = dict.fromkeys(cell["row"] for cell in results["cells"])
+        for name in present:
+            devices = {cell["device"] for cell in results["cells"] if cell["row"] == name and "device" in cell}
+            if others := sorted(devices - {results.get("device")}):
+                self.what = {**self.what, name: f"{self.what[name]} (trained on {', '.join(others)})"}
         self.rows = [name for name in ROWS if name in present] + [name for name in present if name not in ROWS]
         self.cells = {(cell["scene"], cell["row"], cell["seed"]): cell for cell in results["cells"]}
         self.scenes = [name for name in results["scenes"] if any(key[0] == name for key in self.cells)]
