@@ -114,7 +114,7 @@ def main() -> int:
     device = torch_device(resolve("paper-128", {}, environment={}))
     if not given.mixed and target.exists() and (there := json.loads(target.read_text())["device"]) != device:
         print(
-            f"{target}: of trainings on {there}; these would be on {device}: name another with --results, or say --mixed",
+            f"{target}: of trainings on {there}, these would be on {device}: name another by --results, or say --mixed",
             file=sys.stderr,
         )
         return 2
