@@ -141,10 +141,10 @@ class Step1Settings(Strict):
         description="of taking a view: -loss, +loss, or the loss's decrease on probe views, the view, all candidates",
     )
     reward_scale: Literal["relative", "raw"] = Field(
-        default="relative", description="relative: loss rewards over the running mean loss; raw: the paper's"
+        default="raw", description="raw: the paper's; relative: loss rewards over the running mean loss"
     )
     q_target: Literal["double", "plain"] = Field(
-        default="double", description="double: double Q-learning, averaged target network; plain: equation 3"
+        default="plain", description="plain: equation 3; double: double Q-learning, averaged target network"
     )
     embedding: int = Field(default=64, ge=4, description="width of camera embedding and hidden vector")
     precision: Literal["auto", "float32", "bfloat16"] = Field(

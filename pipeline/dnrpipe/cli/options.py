@@ -51,7 +51,9 @@ EXECUTOR_OPTIONS = [
 common = options(
     [
         click.option("-w", "--workspace", metavar="DIR", help="The workspace folder (scene.dnr)."),
-        click.option("--preset", metavar="NAME", help="draft (default), standard or paper."),
+        click.option(
+            "--preset", metavar="NAME", help="draft (default), standard, paper, vanilla, paper-128 or vanilla-128."
+        ),
         click.option(
             "--set",
             "assignments",

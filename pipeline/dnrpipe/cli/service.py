@@ -178,7 +178,7 @@ def _is_address(url: str, *, path: bool = False) -> bool:
 @click.argument("scene")
 @click.option("--stage", "command", type=click.Choice(COMMANDS), default="run", show_default=True)
 @click.option("-w", "--workspace", metavar="NAME", help="Name on the server (default: the scene's).")
-@click.option("--preset", metavar="NAME", help="draft (default), standard, paper, paper-128 or vanilla.")
+@click.option("--preset", metavar="NAME", help="draft (default), standard, paper, vanilla, paper-128 or vanilla-128.")
 @click.option("--set", "assignments", multiple=True, metavar="KEY=VALUE", help="Any setting, e.g. select.budget=10.")
 @click.option("--force", is_flag=True, help="Do it again, reusing nothing.")
 @click.option("--priority", type=click.IntRange(-100, 100), default=0, show_default=True, help="Larger goes first.")

@@ -78,7 +78,7 @@ class JobRequest(Strict):
     workspace: Name
     scene: Annotated[str, Field(pattern=SCENE_PATTERN)] | None = None
     scene_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
-    preset: Literal["draft", "standard", "paper", "paper-128", "vanilla"] | None = None
+    preset: Literal["draft", "standard", "paper", "vanilla", "paper-128", "vanilla-128"] | None = None
     settings: dict[Annotated[str, Field(pattern=SETTING_PATTERN)], bool | int | float | str] = Field(
         default_factory=dict, max_length=64
     )
