@@ -133,6 +133,8 @@ def test_pieces_of_a_table_add_up_and_others_do_not() -> None:
     assert [(cell["row"], cell["seed"]) for cell in redone] == [("paper", 0)] * len(again)
     with pytest.raises(ValueError, match="resolution"):
         paper_tables.added(first, {**piece, "resolution": "256x256"})
+    with pytest.raises(ValueError, match="precision"):
+        paper_tables.added(first, {**piece, "precision": ["bfloat16"]})
 
 
 def test_cells_of_another_device_are_told_apart() -> None:
@@ -143,7 +145,7 @@ def test_cells_of_another_device_are_told_apart() -> None:
     with pytest.raises(ValueError, match="device"):
         paper_tables.added(first, other)
     both = paper_tables.added(first, other, mixed=True)
-    assert (both["device"], both["command"]) == ("cuda", whole["command"])
+    assert (both["device"], both["command"]) == ("cuda", f"{whole['command']}; another")
     assert {cell["device"] for cell in both["cells"] if cell["row"] == "vanilla"} == {"cpu"}
     told = [line for line in markdown(both).splitlines() if "(trained on cpu)" in line]
     assert told and all("DNR (Thies" in line for line in told)

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -61,14 +62,14 @@ TABLES = {
 PLACE = ("scene", "row", "pool", "budget", "policy", "seed")
 """What tells the cells of a table apart."""
 DEVICE = ("device", "threads")
-SAME = ("schema", "preset", "resolution", "seconds", "spp", "budget", "candidates")
+SAME = ("schema", "preset", "resolution", "seconds", "spp", "budget", "candidates", "precision")
 """What cells of one table have in common."""
 
 
 def added(old: dict[str, Any], new: dict[str, Any], *, mixed: bool = False) -> dict[str, Any]:
     """Results with the cells of both, those of ``new`` where both have one. Raises ValueError: not of one table.
 
-    mixed: the cells may be of two devices, and each says of which; the results are called ``old``'s.
+    mixed: the cells may be of two devices, and each says of which; machine, commit and date are ``old``'s.
     """
     for name in SAME if mixed else (*SAME, *DEVICE):
         if old.get(name) != new.get(name):
@@ -79,6 +80,7 @@ def added(old: dict[str, Any], new: dict[str, Any], *, mixed: bool = False) -> d
     places = {_place(cell): cell for cell in cells}
     whole = {**(old if mixed else new), "cells": list(places.values())}
     whole["seeds"] = len({cell["seed"] for cell in places.values()})
+    whole["command"] = "; ".join(dict.fromkeys(part for of in (old, new) for part in of["command"].split("; ")))
     for name in ("scenes", "pools", "budgets", "raster_engines"):
         if name in new:
             whole[name] = list(dict.fromkeys((*old[name], *new[name])))
@@ -119,9 +121,12 @@ def main() -> int:
         )
         return 2
     command = [sys.executable, "-m", "dnrpipe.cli", *table.command, *size, *more, "--out", str(out)]
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # `timeout` sends it to the run, too: both end in order
+    process = subprocess.Popen(command)
     try:
-        code = subprocess.run(command, check=False).returncode
+        code = process.wait()
     except KeyboardInterrupt:
+        process.wait()
         code = 130
     if made.exists():
         results = json.loads(made.read_text())
