@@ -55,9 +55,10 @@ def test_classic_rows_do_not_depend_on_our_model(row: Any, preset: str) -> None:
     assert settings_of(row, base, {}).select == settings_of(row, changed, {}).select
 
 
+@pytest.mark.parametrize("preset", ["draft", "paper-128"])
 @pytest.mark.parametrize("row", [r for r in CLASSIC if r.against], ids=lambda row: row.name)
-def test_a_row_differs_from_its_counterpart_in_one_thing(row: Any) -> None:
-    base = resolve("draft", {}, environment={})
+def test_a_row_differs_from_its_counterpart_in_one_thing(row: Any, preset: str) -> None:
+    base = resolve(preset, {}, environment={})
     changed = differences(settings_of(row, base, {}), settings_of(ROWS[row.against], base, {}))
     assert len({key.removesuffix("." + key.rsplit(".", 1)[1]) for key in changed}) == 1, changed
 

@@ -28,7 +28,7 @@ from dnrtrain.losses import Step2Loss
 from dnrtrain.metrics import psnr
 from dnrtrain.model import DNR, render_views
 from dnrtrain.precision import decide_bfloat16
-from dnrtrain.schedule import Averaged, guarded_step, learning_rate
+from dnrtrain.schedule import Averaged, adam, guarded_step, learning_rate
 from dnrtrain.selector.agent import Reward
 from dnrtrain.settings import LossWeights, ModelSettings, Step1Settings, Step2Settings
 from dnrtrain.step1 import run_step1
@@ -161,6 +161,17 @@ def test_learning_rate_falls_exponentially() -> None:
     assert rates[0] == 1e-3 and rates[-1] == pytest.approx(1e-4)
     assert np.allclose(np.diff(np.log(rates)), np.log(0.1) / 10)
     assert learning_rate(0, 1, 1e-3, 1e-4) == 1e-3
+
+
+def test_only_texels_of_the_surface_learn_faster() -> None:
+    """Those of the depth and normal textures are met by every view: at the networks' rate."""
+    model = DNR(ModelSettings(modalities="uv+depth+normal", texture_size=16, width=8, depth=1, base="none"), seed=0)
+    scales = {id(p): group["scale"] for group in adam([model], 1e-3, "cpu", 10.0).param_groups for p in group["params"]}
+    fast = {name for name, p in model.named_parameters() if scales[id(p)] == 10.0}
+    assert fast and all(name.startswith("aggregator.texture_uv.") for name in fast)
+    slow = {name for name in dict(model.named_parameters()) if name not in fast}
+    assert any("texture_depth" in name for name in slow) and any("texture_normal" in name for name in slow)
+    assert {scales[id(p)] for name, p in model.named_parameters() if name in slow} == {1.0}
 
 
 def test_precision_setting(monkeypatch: pytest.MonkeyPatch) -> None:
