@@ -44,7 +44,8 @@ def _learned(figures: Figures, pool: str, policy: str) -> str:
     head = [f"{title} to `{other}`" for other in others for _, title, _ in DIFFERENCES]
     return (
         f"`{policy}` minus the others, paired by scene and seed, with the {LEVEL:.0%} interval of Student's t over the"
-        " pairs, which speaks of these scenes. Its choice takes as long as tracing so many more views:\n\n"
+        " pairs, which speaks of these scenes. Its choice takes as long as tracing so many more views; a renderer that"
+        " starts from step 1's weights trains a step 1 whatever the policy, which is not taken off:\n\n"
         + table(["views", *head, "choosing, in traced views"], rows)
     )
 
