@@ -7,7 +7,8 @@ that does nothing else; those of REEL frames are reckoned from the parts that we
 references; a scene that is in the results is not measured again. Quality is over white, against the mean of two
 pictures of 64 samples, each denoised, on pairs of frames one after the other; flicker is what changes between the two
 of a pair beyond what the references change by (`tools.bench_frames.motion`). Path tracing climbs the ladder until it is
-as good.
+as good: Mitsuba's, and Blender's Cycles, which is measured against pictures of its own. A row that lacks Cycles gets it
+where FOLDER still has the shot.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from dnrpipe.blender.tasks import CyclesAnswer, CyclesTask
 from dnrpipe.core.cameras import look_at_view, shot_views
 from dnrpipe.core.console import Console
 from dnrpipe.core.images import flip_error, picture_of
@@ -41,6 +43,7 @@ from dnrpipe.stages.shots.references import compared, display_of, shown
 from dnrpipe.stages.shots.render_frames import FRAMES_FOLDER, frame_outcomes
 from dnrpipe.stages.shots.renderers import path_tracer
 from dnrpipe.stages.stage import Run
+from dnrpipe.workers.task_list import run_tasks
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import View, write_cameras
 from dnrtrain.exr import read_exr
@@ -56,6 +59,11 @@ LADDERS = {"balanced": (1, 2, 4, 8, 16), "high": (1, 2, 4, 8, 16, 32, 64)}
 """Samples by the quality of the denoiser."""
 AT_ONCE = 5
 """Rungs of a ladder that are measured before it is asked whether one of them is as good."""
+CYCLES_LADDER = ((1, 2, 4, 8, 16), (32, 64))
+"""Samples of Cycles, in parts: the second where nothing in the first is as good."""
+CYCLES_DENOISERS = {"denoised-fast": "fast", "denoised": "high"}
+"""Its denoisers (`cycles_frames.METHODS`), by what the results call them."""
+CYCLES_REFERENCE = 64
 REFERENCE, TAKES = Way(name="path", spp=64), (1, 2)
 """A reference's pictures, and their numbers; rungs are take 0."""
 SEEDS = 1 << 16
@@ -73,13 +81,21 @@ def main() -> None:
     size = parse_size(options.size)
     rows: list[dict[str, Any]] = json.loads(options.out.read_text())["rows"] if options.out.exists() else []
     for scene in options.scenes or sorted((ROOT / "blender_scenes").glob("*.blend")):
-        if any(
-            (row["scene"], row["size"], row["frames"]) == (scene.stem, options.size, options.frames) for row in rows
-        ):
-            continue
+        place = (scene.stem, options.size, options.frames)
+        row = next((row for row in rows if (row["scene"], row["size"], row["frames"]) == place), None)
         root = root_of(options.folder, scene.stem, options.size).resolve()
-        row = measured(scene.resolve(), root, size, options.frames)
-        rows.append({"machine": processor(), "size": options.size, **row})
+        if row is None:
+            row = {
+                "machine": processor(),
+                "size": options.size,
+                **measured(scene.resolve(), root, size, options.frames),
+            }
+            rows.append(row)
+            write_json(options.out, {"rows": sorted(rows, key=lambda row: row["scene"])})
+        elif "cycles" in row or row["machine"] != processor() or not (root / "beside").exists():
+            continue
+        if "cycles" not in row:
+            row["cycles"] = by_cycles(root, options.frames, row["ours"])
         write_json(options.out, {"rows": sorted(rows, key=lambda row: row["scene"])})
     print(markdown({"rows": rows}))
 
@@ -192,6 +208,58 @@ def beside(root: Path, views: Sequence[View], pairs: Sequence[tuple[int, int]]) 
     return {"ours": ours, "rungs": rungs, "pairs": len(pairs)}
 
 
+def by_cycles(root: Path, frames: int, ours: dict[str, float]) -> list[dict[str, Any]]:
+    """Rungs of Cycles on the compared frames, as those of `beside`: of what lies in the shot's workspace."""
+    workspace = Workspace.open(root)
+    run = Run(workspace, resolve_settings(workspace, {}, None), Console(quiet=True), "render", "bench")
+    lpips, display = lpips_of(run), display_of(run)
+    pairs = [(i - 1, i) for i in places(frames)]
+    numbers = sorted({number for pair in pairs for number in pair})
+    files = {n: folder_of_rung(root, REFERENCE.spp, REFERENCE.quality, TAKES[0]) / f"{n:05d}.exr" for n in numbers}
+    views = {n: View.model_validate(read_exr(path)[1]["view"]) for n, path in files.items()}
+    surfaces = {n: surface_of(views[n], path) for n, path in files.items()}
+    folder = root / "beside" / "cycles"
+
+    def rendered(samples: Sequence[int], methods: Sequence[str], seed: int) -> CyclesAnswer:
+        task = CyclesTask(
+            scene_dir=workspace.scene,
+            views=tuple(views.values()),
+            samples=tuple(samples),
+            methods=tuple(methods),
+            seed=seed,
+            background=True,
+            folder=folder / str(seed),
+            output=folder / str(seed) / "frames.json",
+        )
+        task.folder.mkdir(parents=True, exist_ok=True)
+        worker = "dnrpipe.blender.passes.cycles_frames"
+        (outcome,) = run_tasks(worker, {"threads": 0}, [task.data()], workers=1, log=run.log)
+        if outcome.result is None:
+            raise SystemExit(f"Cycles: {outcome.error}")
+        return CyclesAnswer.model_validate(outcome.result)
+
+    def pictures(name: str, seed: int) -> dict[int, Any]:
+        return {n: shown(display, folder / str(seed) / name / f"{view.name}.exr") for n, view in views.items()}
+
+    for take in TAKES:
+        rendered([CYCLES_REFERENCE], ["denoised"], take)
+    takes = [pictures(f"{CYCLES_REFERENCE} spp denoised", take) for take in TAKES]
+    truth = {n: sum(take[n] for take in takes) / len(takes) for n in numbers}
+    rungs: list[dict[str, Any]] = []
+    for ladder in CYCLES_LADDER:
+        answer = rendered(ladder, list(CYCLES_DENOISERS), 0)
+        for spp in ladder:
+            for method, denoiser in CYCLES_DENOISERS.items():
+                name = f"{spp} spp {method}"
+                found = quality(pictures(name, 0), truth, surfaces, pairs, lpips)
+                rungs.append(
+                    {"spp": spp, "quality": denoiser, "frame": float(np.median(answer.seconds[name])), **found}
+                )
+        if any(as_good(rung, ours, ("psnr", "lpips")) for rung in rungs):
+            break
+    return rungs
+
+
 def places(frames: int) -> tuple[int, int]:
     """Of the frames that are compared; with each of them goes the one before."""
     return frames // 3, frames - 1
@@ -248,7 +316,8 @@ def frame_seconds(root: Path) -> list[float]:
 
 
 def equal_rung(row: dict[str, Any], names: Sequence[str]) -> dict[str, Any] | None:
-    """The cheapest path tracing that is as good as ours by each of the figures; None: not by its last rung.
+    """The cheapest path tracing that is as good as ours by each of the figures, Mitsuba's or Cycles'; None: not by the
+    last rung of either.
 
     A shot that is path-traced is as good as the rung that it is, whose frames take what the shot's do: there are more
     of those, and seconds of few frames vary by up to a fifth.
@@ -260,6 +329,7 @@ def equal_rung(row: dict[str, Any], names: Sequence[str]) -> dict[str, Any] | No
         for rung, it_is in zip(row["rungs"], same, strict=True)
         if it_is or as_good(rung, row["ours"], names)
     ]
+    enough += [{**rung, "cycles": True} for rung in row.get("cycles", []) if as_good(rung, row["ours"], names)]
     return min(enough, key=lambda rung: rung["frame"], default=None)
 
 
@@ -296,7 +366,8 @@ def _table(machine: str, rows: Sequence[dict[str, Any]]) -> str:
             cells += [f"not by {last['spp']} spp", f"> {last['frame']:.2f}", f"{last['flicker']:.4f}"]
             cells += [f"{ours:.0f}", f"> {REEL * last['frame']:.0f}", f"< {ours / (REEL * last['frame']):.2f}"]
         else:
-            cells += [f"{rung['spp']} spp, {rung['quality']}", f"{rung['frame']:.2f}", f"{rung['flicker']:.4f}"]
+            tracer = "Cycles, " if "cycles" in rung else ""
+            cells += [f"{tracer}{rung['spp']} spp, {rung['quality']}", f"{rung['frame']:.2f}", f"{rung['flicker']:.4f}"]
             cells += [f"{ours:.0f}", f"{REEL * rung['frame']:.0f}", f"{ours / (REEL * rung['frame']):.2f}"]
         cells += [break_even(row, name) for name in ("psnr", "lpips")]
         lines.append(f"| {' | '.join(cells)} |")

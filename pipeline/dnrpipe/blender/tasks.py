@@ -11,6 +11,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal, TypedDict
 
+from pydantic import Field
+
 from dnrpipe.core.scene_records import Census, SceneRecord
 from dnrpipe.raytrace.tasks import Task
 from dnrtrain.contract import View
@@ -235,9 +237,11 @@ class CyclesCommon(Task):
 
 
 class CyclesTask(Task):
-    """Render the views at each number of samples per pixel, and a reference of ``reference_spp``.
+    """Render the views at each number of samples per pixel, and a reference of ``reference_spp``, if any.
 
     Args:
+        methods: of `cycles_frames.METHODS`; none: all.
+        background: the world stands behind everything, else nothing.
         folder: for the pictures: ``NAME/VIEW.exr``, linear Rec.709, premultiplied RGBA.
         output: for the answer, as JSON.
     """
@@ -245,13 +249,18 @@ class CyclesTask(Task):
     scene_dir: Path
     views: tuple[View, ...]
     samples: tuple[int, ...]
-    reference_spp: int
+    methods: tuple[str, ...] = ()
+    seed: int = 1
+    reference_spp: int | None = None
+    background: bool = False
     folder: Path
     output: Path
 
 
 class CyclesAnswer(Task):
-    """ms: processor time over the threads, milliseconds per view, by name, such as ``4 spp raw``."""
+    """By name, such as ``4 spp raw``, for each view: ``ms``, processor time over the threads in milliseconds, and
+    ``seconds`` of the wall clock."""
 
     threads: int
     ms: dict[str, list[float]]
+    seconds: dict[str, list[float]] = Field(default_factory=dict)

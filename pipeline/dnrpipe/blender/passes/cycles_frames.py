@@ -1,8 +1,8 @@
 """Worker that renders views by Cycles as the file has it, at a few samples, raw and with Blender's denoiser.
 
-For `dnrpipe frontier`: Cycles is what the artist would render with. Bounces, clamping and caustics stay as in the file;
-adaptive sampling and time limits are off, so that samples are what they say. Persistent data keeps the BVH between
-frames, and each way of rendering is warmed by a frame that is thrown away.
+For `dnrpipe frontier` and `tools.bench_shots`: Cycles is what the artist would render with. Bounces, clamping and
+caustics stay as in the file; adaptive sampling and time limits are off, so that samples are what they say. Persistent
+data keeps the BVH between frames, and each way of rendering is warmed by a frame that is thrown away.
 """
 
 from __future__ import annotations
@@ -47,28 +47,32 @@ class Worker:
         common = PassesCommon(scene_dir=task.scene_dir, raster_engine="cycles", threads=self.threads, **samples)
         draw = make_renderer("raster", common)
         scene = bpy.context.scene
+        scene.render.film_transparent = not task.background
         ms: dict[str, list[float]] = {}
+        seconds: dict[str, list[float]] = {}
         for spp in task.samples:
-            for method, denoiser in METHODS.items():
-                _sampling(scene, spp, 1, denoiser)
+            for method in task.methods or METHODS:
+                _sampling(scene, spp, task.seed, METHODS[method])
                 name = f"{spp} spp {method}"
-                ms[name] = self._frames(draw, task.views, task.folder / name)
-        _sampling(scene, task.reference_spp, 2, None)
-        self._frames(draw, task.views, task.folder / REFERENCE, warm=False)
-        return CyclesAnswer(threads=self.threads, ms=ms)
+                ms[name], seconds[name] = self._frames(draw, task.views, task.folder / name)
+        if task.reference_spp is not None:
+            _sampling(scene, task.reference_spp, task.seed + 1, None)
+            self._frames(draw, task.views, task.folder / REFERENCE, warm=False)
+        return CyclesAnswer(threads=self.threads, ms=ms, seconds=seconds)
 
     def _frames(
         self, draw: Callable[[View, Path], None], views: Sequence[View], folder: Path, warm: bool = True
-    ) -> list[float]:
+    ) -> tuple[list[float], list[float]]:
         folder.mkdir(parents=True, exist_ok=True)
         if warm:
             draw(views[0], folder / f"{views[0].name}.exr")
-        found = []
+        ms, seconds = [], []
         for view in views:
-            cpu = time.process_time()
+            wall, cpu = time.monotonic(), time.process_time()
             draw(view, folder / f"{view.name}.exr")
-            found.append(1000 * (time.process_time() - cpu) / self.threads)
-        return found
+            ms.append(1000 * (time.process_time() - cpu) / self.threads)
+            seconds.append(time.monotonic() - wall)
+        return ms, seconds
 
 
 def _sampling(scene: bpy.types.Scene, samples: int, seed: int, denoiser: tuple[str, str] | None) -> None:

@@ -181,11 +181,11 @@ def _gains(figures: Figures) -> str:
 
 
 def _paper(figures: Figures) -> str:
-    """The paper's table: each mechanism taken away, against row `paper`; DNR, which has none of them, against that and
-    against DNRSelect without its selector."""
+    """The paper's table: each mechanism taken away, against row `paper`, and DNR, which has none of them; against DNR
+    DNRSelect without its selector, and DNR trained longer."""
     of_paper = [row for row in figures.rows if row in ROWS and ROWS[row].family != "dnr" and row != "paper"]
     pairs = [(row, "paper") for row in of_paper]
-    pairs += [(row, "vanilla") for row in of_paper if row == "paper-random"]
+    pairs += [(row, "vanilla") for row in of_paper if row in ("paper-random", "vanilla-long") and "vanilla" in of_paper]
     rows = [line for row, other in pairs for line in _claims(figures, row, other)]
     if not rows:
         return ""
