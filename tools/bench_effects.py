@@ -34,8 +34,7 @@ def bench(scene: Path, folder: Path, spp: int) -> dict[str, Any]:
     """One scene: converts it, runs the pilot, compares."""
     workspace = Workspace.create(folder / f"{scene.stem}.dnr", Source(path=str(scene), sha256=file_sha256(scene)))
     settings = resolve_settings(workspace, {"cameras": {"train": 8, "val": 0, "test": 0}}, None)
-    console = Console(quiet=True)
-    run = Run(workspace, settings, console, id="bench")
+    run = Run(workspace, settings, Console(quiet=True), id="bench")
     scene_and_views(run)
     started = time.monotonic()
     plan = resolve_plan(run)
@@ -48,7 +47,7 @@ def bench(scene: Path, folder: Path, spp: int) -> dict[str, Any]:
     tasks = [
         {"kind": "compare", "with_effect": pair, "without_effect": config, "views": views, "spp": spp} for pair in pairs
     ]
-    answer, lean = run_pilots(tasks, choice, console, scene.stem, run.log)
+    answer, lean = run_pilots(tasks, choice, run, scene.stem, run.log)
     return {
         "scene": scene.stem,
         "integrator": plan.integrator,
