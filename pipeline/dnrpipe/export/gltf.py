@@ -24,6 +24,7 @@ from ..core.console import Console
 from ..core.errors import UserError
 from ..core.scene_files import read_frame
 from ..core.workspace import Workspace
+from ..stages.base_images import light_path
 from .meshes import BundleMesh, read_meshes
 
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -38,7 +39,7 @@ def export_gltf(workspace: Workspace, out: Path, console: Console, *, light: boo
         raise UserError(f"--out {out}: name a file that ends in .glb")
     meshes = read_meshes(workspace.scene)
     picture = None
-    if light and (workspace.root / "base" / "light.npz").is_file():
+    if light and light_path(workspace).is_file():
         picture = light_picture(workspace, console)
     elif light:
         console.warn("no baked light in this workspace (model.base is not baked): the meshes are written without")
