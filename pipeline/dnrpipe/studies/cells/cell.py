@@ -100,7 +100,6 @@ class Worker(FileWorker):
     def _train(self, task: CellTask) -> Training:
         """Step 2 in the cell's own folder."""
         settings, coarse = task.settings, task.coarse_cost
-        pace = None
         if task.seconds is not None:
             pace = self._pace(task)
             spent = STEP1_SHARE * task.seconds if task.full_step1 else self._clock(coarse) if coarse else 0.0
@@ -116,7 +115,6 @@ class Worker(FileWorker):
         cost = training_cost(task.folder)
         return Training(
             epochs=settings.finetune.step2.epochs,
-            seconds_per_epoch=pace,
             step1=coarse,
             step2=cost,
             seconds=cost.seconds + (coarse.seconds if coarse else 0.0),
