@@ -59,7 +59,6 @@ AT_ONCE = 5
 REFERENCE, TAKES = Way(name="path", spp=64), (1, 2)
 """A reference's pictures, and their numbers; rungs are take 0."""
 SEEDS = 1 << 16
-FIGURES = ("psnr", "ssim", "lpips", "flip", "flicker")
 
 
 def main() -> None:
@@ -214,7 +213,7 @@ def quality(
     pairs: Sequence[tuple[int, int]],
     lpips: Any,
 ) -> dict[str, float]:
-    """FIGURES, means over the frames; flicker over the pairs."""
+    """psnr, ssim, lpips and flip, means over the frames; flicker over the pairs."""
     rows = [
         {
             **compared(picture, truth[n], lpips),
