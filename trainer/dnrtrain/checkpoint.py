@@ -26,7 +26,7 @@ from torch import Tensor
 
 from . import records
 from .atomic import atomic_path
-from .contract import ContractError, DamagedFile
+from .contract import ContractError, DamagedFile, one_line
 from .model import DNR
 from .records import ModelRecord, Progress
 from .settings import ModelSettings
@@ -173,7 +173,7 @@ def load_model(folder: Path, device: str | torch.device = "cpu") -> DNR:
         model = DNR(settings, seed=0)
         model.load_state_dict(saved[0])
     except (ValidationError, RuntimeError, KeyError, ValueError) as error:
-        reason = " ".join(str(error).split())[:200]
+        reason = one_line(error)[:200]
         raise ContractError(f"{folder}: model does not fit this version ({reason}); train it again") from None
     model.use_bfloat16 = record.bfloat16
     return model.to(device).eval()

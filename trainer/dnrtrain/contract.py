@@ -79,6 +79,11 @@ NPZ_ERRORS = (
 parser on an array's header; an array without one is bytes, which lack an array's methods."""
 
 
+def one_line(text: object) -> str:
+    """A text or an error's message in one line; runs of white space become one space."""
+    return " ".join(str(text).split())
+
+
 class ContractError(ValueError):
     """Input that breaks the data contract; the message names what, where and what to do, in one line."""
 
@@ -93,7 +98,7 @@ class DamagedFile(ContractError):
     """
 
     def __init__(self, path: Path | str, reason: str) -> None:
-        self.path, self.reason = Path(path), " ".join(reason.split())
+        self.path, self.reason = Path(path), one_line(reason)
         super().__init__(f"{path}: damaged ({self.reason}); delete it and run its stage again")
 
 

@@ -42,7 +42,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .atomic import atomic_path
-from .contract import FRESH_CHANNELS, ContractError, SceneFrame, View
+from .contract import FRESH_CHANNELS, ContractError, SceneFrame, View, one_line
 from .correction import correct, guide_maps
 from .dataset import Batch, in_camera_space
 from .display import ALPHA_FLOOR, DisplayTransform
@@ -129,9 +129,7 @@ def export_onnx(path: Path, model: DNR, frame: SceneFrame, folder: Path, extra: 
                 dynamic_axes=axes,
             )
         except torch.onnx.errors.OnnxExporterError as error:
-            raise ContractError(
-                f"{path}: torch cannot export this model ({' '.join(str(error).split())[:200]})"
-            ) from None
+            raise ContractError(f"{path}: torch cannot export this model ({one_line(error)[:200]})") from None
     import onnx
 
     proto = onnx.load_from_string(buffer.getvalue())
