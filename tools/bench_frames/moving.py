@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from dnrpipe.core.cameras import framing, look_at_view, orbit_views
+from dnrpipe.core.images import rgba
 from dnrpipe.raytrace.base_renderer import CHAIN, BaseRenderer
 from dnrpipe.raytrace.engine import masked
 from dnrpipe.raytrace.history import History
@@ -182,7 +183,7 @@ class Rivals:
             pictures = {f"{spp} spp {method}": (image, ms)}
             for patience in PATIENCE:
                 channels_, more = gathered[spp, patience]
-                one = np.stack([channels_[f"base.{c}"] for c in "RGBA"], axis=-1)
+                one = rgba(channels_, "base.")
                 pictures[f"{spp} spp {method}, gathered x{patience}"] = (one, ms + more)
             for name, (noisy, spent) in pictures.items():
                 smooth, denoiser_ms = clock.time(partial(denoised, noisy, guide, chosen, rays))

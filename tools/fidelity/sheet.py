@@ -9,10 +9,10 @@ from typing import Any, TypeAlias
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from dnrpipe.core.images import read_rgba
 from dnrtrain.atomic import atomic_path
 
 from .measure import display, mean
-from .ours import picture
 
 COLUMNS = 3
 SIDE = 96
@@ -52,7 +52,7 @@ def write_sheet(records: Sequence[dict[str, Any]], target: Path) -> None:
 def triptych(record: dict[str, Any]) -> tuple[Image.Image, Image.Image, Image.Image]:
     """Cycles, ours and their absolute difference times GAIN, display space over white."""
     cycles, ours = (
-        display(mean([picture(Path(path)) for path in record["pictures"][who]])) for who in ("cycles", "ours")
+        display(mean([read_rgba(Path(path)) for path in record["pictures"][who]])) for who in ("cycles", "ours")
     )
     return to_image(cycles), to_image(ours), to_image(np.abs(cycles - ours) * GAIN)
 

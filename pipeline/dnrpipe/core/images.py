@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from dnrtrain.atomic import atomic_path
+from dnrtrain.exr import read_exr
 
 if TYPE_CHECKING:
     from dnrtrain.display import DisplayTransform
@@ -24,6 +26,16 @@ def flip_error(truth: np.ndarray, prediction: np.ndarray) -> tuple[float, np.nda
         np.ascontiguousarray(truth, np.float32), np.ascontiguousarray(prediction, np.float32), "LDR"
     )
     return float(mean), np.asarray(heat)
+
+
+def rgba(channels: Mapping[str, np.ndarray], prefix: str = "") -> np.ndarray:
+    """The channels ``prefix`` + R, G, B, A, each [H, W], as [H, W, 4]."""
+    return np.stack([channels[prefix + c] for c in "RGBA"], axis=-1)
+
+
+def read_rgba(path: Path) -> np.ndarray:
+    """`rgba` of an EXR, linear premultiplied, float32 [H, W, 4]. Raises DamagedFile."""
+    return rgba(read_exr(path)[0])
 
 
 def over_white(display: DisplayTransform, image: np.ndarray) -> Any:
