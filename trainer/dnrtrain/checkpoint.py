@@ -151,6 +151,20 @@ def read_record(folder: Path) -> ModelRecord | None:
         return None
 
 
+def finished_record(folder: Path) -> ModelRecord:
+    """Of a training that has just finished."""
+    record = read_record(folder)
+    assert record is not None
+    return record
+
+
+def step_seconds(record: ModelRecord, warm: int = 1) -> tuple[float, float]:
+    """(wall, processor) seconds of an optimiser step, without the first ``warm`` epochs where there are more."""
+    epochs = record.history[warm:] or record.history
+    steps = sum(epoch.steps for epoch in epochs)
+    return sum(epoch.seconds for epoch in epochs) / steps, sum(epoch.cpu_seconds for epoch in epochs) / steps
+
+
 def load_model(folder: Path, device: str | torch.device = "cpu") -> DNR:
     """A finished stage's renderer, ready for inference.
 

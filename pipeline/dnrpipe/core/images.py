@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +26,12 @@ def flip_error(truth: np.ndarray, prediction: np.ndarray) -> tuple[float, np.nda
         np.ascontiguousarray(truth, np.float32), np.ascontiguousarray(prediction, np.float32), "LDR"
     )
     return float(mean), np.asarray(heat)
+
+
+def mean_known(values: Iterable[float | None]) -> float | None:
+    """The mean of the figures that are known; None where none is."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
 
 
 def rgba(channels: Mapping[str, np.ndarray], prefix: str = "") -> np.ndarray:

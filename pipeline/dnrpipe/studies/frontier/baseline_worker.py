@@ -18,7 +18,7 @@ from dnrtrain.exr import read_exr
 from dnrtrain.perceptual import build_lpips
 
 from ...blender.tasks import CyclesAnswer
-from ...core.images import over_white, read_rgba
+from ...core.images import mean_known, over_white, read_rgba
 from ...core.scene_files import read_frame, read_record, split_views
 from ...core.workspace import Workspace
 from ...stages.trainer import perceptual_weights
@@ -109,7 +109,4 @@ class Judge:
     def means(self, pictures: list[Any]) -> dict[str, Any]:
         """Means over the views of the metrics that cells have; None where no view has one."""
         rows = [view_metrics(one, *known, self.lpips) for one, known in zip(pictures, self.known, strict=True)]
-        return {
-            key: float(np.mean(values)) if (values := [row[key] for row in rows if row[key] is not None]) else None
-            for key in rows[0]
-        }
+        return {key: mean_known(row[key] for row in rows) for key in rows[0]}
