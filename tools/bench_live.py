@@ -31,7 +31,7 @@ from dnrpipe.core.workspace import SUFFIX
 from dnrpipe.service.guard import SUBPROTOCOL
 from dnrpipe.service.models import NAME_PATTERN
 from dnrpipe.service.routes_live import unpack
-from dnrtrain.contract import one_line
+from dnrtrain.text import one_line
 
 WARM_FRAMES = 40
 """Frames before the measurement: they compile kernels and let the pace settle."""

@@ -18,7 +18,7 @@ from dnrpipe.raytrace.variants import choose_variant
 from dnrpipe.stages.prepare import convert_scene
 from dnrpipe.stages.stage import Run
 from dnrpipe.workers.task_list import TaskResult, run_tasks
-from dnrtrain.contract import one_line
+from dnrtrain.text import one_line
 
 from .reference_settings import PATH_DEPTH
 

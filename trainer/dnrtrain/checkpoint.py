@@ -26,10 +26,11 @@ from torch import Tensor
 
 from . import records
 from .atomic import atomic_path
-from .contract import ContractError, DamagedFile, one_line
+from .contract import ContractError, DamagedFile
 from .model import DNR
 from .records import ModelRecord, Progress
 from .settings import ModelSettings
+from .text import one_line
 
 HEADER = "dnrtrain"
 CHECKSUM = "sha256"

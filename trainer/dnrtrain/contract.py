@@ -52,6 +52,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, field_validator
 
 from .atomic import write_json
+from .text import one_line
 
 RASTER_CHANNELS = ("R", "G", "B", "A")
 RAW_CHANNELS = ("raw.R", "raw.G", "raw.B", "A")
@@ -77,11 +78,6 @@ NPZ_ERRORS = (
 )
 """What reading a damaged npz file may raise: numpy passes zip's and deflate's own errors through, and those of Python's
 parser on an array's header; an array without one is bytes, which lack an array's methods."""
-
-
-def one_line(text: object) -> str:
-    """A text or an error's message in one line; runs of white space become one space."""
-    return " ".join(str(text).split())
 
 
 class ContractError(ValueError):

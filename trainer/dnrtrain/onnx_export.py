@@ -42,12 +42,13 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from .atomic import atomic_path
-from .contract import FRESH_CHANNELS, ContractError, SceneFrame, View, one_line
+from .contract import FRESH_CHANNELS, ContractError, SceneFrame, View
 from .correction import correct, guide_maps
 from .dataset import Batch, in_camera_space
 from .display import ALPHA_FLOOR, DisplayTransform
 from .model import DNR, compose
 from .settings import ModelSettings
+from .text import one_line
 from .textures import SH_COUNT, SH_FIRST_CHANNEL, TexturePyramid, depth_coordinate, octahedral, spherical_harmonics
 
 OPSET = 18

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Literal
 
 from dnrtrain.atomic import write_json, write_text
-from dnrtrain.contract import one_line
+from dnrtrain.text import one_line
 
 from ..core.console import Console
 from ..core.workspace import locked

@@ -14,7 +14,7 @@ from fastapi.responses import JSONResponse
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
-from dnrtrain.contract import one_line
+from dnrtrain.text import one_line
 
 from .. import __version__
 from ..core.errors import UserError

@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
-from dnrtrain.contract import one_line
+from dnrtrain.text import one_line
 
 from ..core.errors import UserError
 from ..workers.processes import LocalWorker, TaskFailed, WorkerDied

@@ -21,7 +21,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from dnrtrain.contract import one_line
+from dnrtrain.text import one_line
 
 from ..core.errors import UserError
 from ..core.workspace import SUFFIX, Workspace

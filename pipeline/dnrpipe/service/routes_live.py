@@ -23,7 +23,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, HTTPException, Path, WebSocket, WebSocketDisconnect
 from pydantic import ValidationError
 
-from dnrtrain.contract import one_line
+from dnrtrain.text import one_line
 
 from ..core.errors import UserError
 from .guard import SUBPROTOCOL

@@ -23,7 +23,7 @@ from typing import Any, Protocol
 
 from filelock import FileLock, Timeout
 
-from dnrtrain.contract import one_line
+from dnrtrain.text import one_line
 
 from ..core.errors import UserError
 from ..core.event_stream import VARIABLE

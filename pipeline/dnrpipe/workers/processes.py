@@ -25,7 +25,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from dnrtrain.contract import one_line
+from dnrtrain.text import one_line
 
 from ..core.errors import UserError
 

@@ -21,7 +21,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from dnrtrain.contract import one_line
+from dnrtrain.text import one_line
 
 from .. import __version__
 from ..core.errors import UserError

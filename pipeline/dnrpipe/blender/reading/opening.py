@@ -13,7 +13,7 @@ from pathlib import Path
 import bpy
 
 from dnrpipe.core.errors import NothingVisible, UserError
-from dnrtrain.contract import one_line
+from dnrtrain.text import one_line
 
 from ..findings import first_of
 from .missing import missing_files, missing_warnings, strict_refusal

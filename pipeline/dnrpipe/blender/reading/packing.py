@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 
 from dnrtrain.atomic import atomic_path
-from dnrtrain.contract import one_line
+from dnrtrain.text import one_line
 
 from ..findings import printable
 from .missing import SHAPELESS_IMAGES, image_files, is_file
