@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from dnrpipe.core.machine import processor
+from dnrpipe.studies.cells.results import number
 from dnrpipe.studies.frames.ours import BASE, NEURAL
 from dnrpipe.studies.frames.pareto_front import frontier
 from dnrtrain.atomic import atomic_path, write_json
 
 from . import equal_time, moving_tables
-from .moving_tables import number
 
 PACKAGES = ("mitsuba", "drjit", "mitsuba-oidn", "torch", "numpy")
 
