@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from dnrpipe.core.images import read_rgba
+from dnrpipe.core.images import eight_bit, read_rgba
 from dnrtrain.atomic import atomic_path
 
 from .measure import display, mean
@@ -59,7 +59,7 @@ def triptych(record: dict[str, Any]) -> tuple[Image.Image, Image.Image, Image.Im
 
 def to_image(values: np.ndarray) -> Image.Image:
     """Display values [H, W, 3] in [0, 1] as an 8-bit picture."""
-    return Image.fromarray((np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint8))
+    return Image.fromarray(eight_bit(values))
 
 
 def _label(draw: ImageDraw.ImageDraw, record: dict[str, Any], font: Font, width: int) -> str:

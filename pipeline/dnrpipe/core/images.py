@@ -57,10 +57,14 @@ def picture_of(tensor: Any) -> np.ndarray:
     return tensor.float().clamp(0, 1).permute(1, 2, 0).cpu().numpy()
 
 
+def eight_bit(image: np.ndarray) -> np.ndarray:
+    """Values, clipped to [0, 1], as uint8 of the same shape: 1 is 255."""
+    return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
 def write_png(path: Path, image: np.ndarray) -> None:
     """Write display-space [H, W, 3] in [0, 1] as 8-bit PNG, atomically."""
     from PIL import Image
 
-    data = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
     with atomic_path(path) as temporary:
-        Image.fromarray(data).save(temporary)
+        Image.fromarray(eight_bit(image)).save(temporary)

@@ -24,7 +24,7 @@ import numpy as np
 from PIL import Image
 
 from dnrpipe.core.errors import UserError
-from dnrpipe.core.images import flip_error, over_white, picture_of, rgba
+from dnrpipe.core.images import eight_bit, flip_error, over_white, picture_of, rgba
 from dnrpipe.core.settings import Settings
 from dnrpipe.raytrace.base_worker import Worker as BaseWorker
 from dnrpipe.raytrace.base_worker import without_grain
@@ -180,7 +180,7 @@ class Worker:
 
 def encode(picture: np.ndarray, fine: bool) -> tuple[bytes, str]:
     """(bytes, media type) of display RGB [H, W, 3] in [0, 1]: JPEG in a hurry, else WebP of high quality."""
-    image = Image.fromarray((np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8))
+    image = Image.fromarray(eight_bit(picture))
     buffer = io.BytesIO()
     if fine:
         image.save(buffer, "WEBP", quality=95, method=1)
