@@ -11,7 +11,6 @@ the ratio without the passes. CPU seconds of rendering, kernels compiled before.
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import sys
 import tempfile
@@ -26,6 +25,7 @@ from dnrpipe.stages.effect_plan import resolve_plan, run_pilots
 from dnrpipe.stages.prepare import scene_and_views
 from dnrpipe.stages.session import resolve_settings
 from dnrpipe.stages.stage import Run
+from dnrtrain.atomic import write_json
 
 EVERYTHING = {"integrator": "volpath", "max_depth": 32, "passes": True}
 
@@ -88,7 +88,7 @@ def main(arguments: list[str] | None = None) -> int:
     mean = statistics.geometric_mean(row["ratio"] for row in rows)
     print(f"geometric mean {mean:.2f}x, arithmetic mean {statistics.fmean(row['ratio'] for row in rows):.2f}x")
     if options.json:
-        options.json.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+        write_json(options.json, rows)
     return 0
 
 
