@@ -40,8 +40,8 @@ def render_novel(
     name: str,
     frames: str,
     movie: str,
-    untrained: bool = False,
-    alone: bool = False,
+    untrained: bool,
+    alone: bool,
 ) -> dict[str, Any]:
     """Render the views into ``renders/<name>/``.
 
