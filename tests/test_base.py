@@ -14,6 +14,7 @@ import pytest
 from tests.corner_room import corner_room, onwards, quad, rgb
 
 from dnrpipe.blender.bundle.ply import weld, write_ply
+from dnrpipe.core.images import rgba
 from dnrpipe.raytrace.base_renderer import CENTRES, MEANS, NOISE, BaseRenderer
 from dnrpipe.raytrace.base_worker import Worker, denoised, without_grain
 from dnrpipe.raytrace.engine import Engine
@@ -64,7 +65,7 @@ def rendered(scene: Any, light: np.ndarray, view: View, samples: int = 4) -> dic
 
 
 def colour(channels: dict[str, np.ndarray]) -> np.ndarray:
-    return np.stack([channels[f"base.{c}"] for c in "RGBA"], axis=-1)
+    return rgba(channels, "base.")
 
 
 NAN = float("nan")

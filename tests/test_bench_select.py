@@ -227,11 +227,11 @@ def test_every_pool_has_its_own_rival_and_differences_are_paired() -> None:
                 values[scene, "path", 10, policy, seed] = offset + path + extra
     figures = Figures(results(values))
     assert figures.best_simple("dome", 10) == "kmedoids" and figures.best_simple("path", 10) == "farthest"
-    found = figures.against("exchange", "simple", ["dome", "path"], 10, "psnr")
+    found = figures.against("exchange", "simple", ["dome", "path"], 10)
     assert found is not None and found.scenes == {"a": 1.5, "b": 1.75} and found.mean == 1.625
-    own = figures.against("kmedoids", "simple", ["dome", "path"], 10, "psnr")
+    own = figures.against("kmedoids", "simple", ["dome", "path"], 10)
     assert own is not None and own.mean == -0.5  # 0 where it is itself the best
-    assert figures.against("kmedoids", "simple", ["dome"], 10, "psnr") is None
+    assert figures.against("kmedoids", "simple", ["dome"], 10) is None
     assert figures.means("dome", 10, "exchange", "psnr") == [29.0, 29.25]
     text = markdown(results(values))
     line = next(line for line in text.split("### `dome`, 10 views")[1].splitlines() if "`exchange`" in line)
@@ -276,7 +276,7 @@ def test_one_scene_in_several_pools_is_still_one_unit_per_seed() -> None:
         for policy, gain in zip(("random", "farthest"), gains, strict=True)
         for seed in range(2)
     }
-    found = Figures(results(values)).against("farthest", "random", ["dome", "path"], 5, "psnr")
+    found = Figures(results(values)).against("farthest", "random", ["dome", "path"], 5)
     assert found is not None and (found.mean, found.half) == (2.0, 0.0)
 
 

@@ -14,11 +14,11 @@ from tests.scene_records import sphere_summary
 
 from dnrpipe.core.cameras import make_cameras
 from dnrpipe.core.errors import UserError
+from dnrpipe.core.images import read_rgba
 from dnrpipe.core.settings import CameraSettings
 from dnrpipe.raytrace.denoise import denoise, filled
 from dnrpipe.raytrace.variants import choose_variant
 from dnrpipe.workers.task_list import TaskResult, run_tasks
-from dnrtrain.exr import read_exr
 
 SUMMARY = sphere_summary((0.0, 0.0, 0.0), 1.2)
 BUNDLE = """<scene version="3.0.0">
@@ -54,7 +54,7 @@ def renders(tmp_path_factory: pytest.TempPathFactory) -> tuple[np.ndarray, np.nd
         "dnrpipe.raytrace.tracer", common, tasks, workers=1, log=folder / "log", environment=choice.environment
     )
     assert all(o.result for o in outcomes if isinstance(o, TaskResult))
-    noisy, clean = (np.stack([read_exr(folder / f"{spp}.exr")[0][c] for c in "RGBA"], axis=-1) for spp in (4, 2048))
+    noisy, clean = (read_rgba(folder / f"{spp}.exr") for spp in (4, 2048))
     return noisy, clean
 
 

@@ -6,12 +6,16 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from dnrpipe.cli import cli, explain
 from dnrpipe.core.errors import UserError
+from dnrpipe.core.workspace import Source, Workspace
 from dnrpipe.export import web
 from dnrpipe.export.browser import require_chromium
+from dnrpipe.export.surface import read_baked_light
+from dnrpipe.stages.base_images import light_path
 
 COMMANDS = ("export-nerf", "export-onnx", "export-gltf", "export-web")
 
@@ -60,6 +64,19 @@ def test_what_npm_delivers_is_checked(tmp_path: Path, monkeypatch: pytest.Monkey
     with pytest.raises(UserError, match=words):
         web.runtime()
     assert not (tmp_path / "cache").exists()
+
+
+def test_a_truncated_light_map_is_one_line(tmp_path: Path) -> None:
+    workspace = Workspace.create(tmp_path / "w.dnr", Source(path="s.blend", sha256="0"))
+    with pytest.raises(UserError, match="it comes with `dnrpipe raytrace-selected`"):
+        read_baked_light(workspace)
+    path = light_path(workspace)
+    path.parent.mkdir()
+    np.savez(path, light=np.zeros((2, 2, 8, 8, 3), np.float32), fingerprint="f")
+    assert read_baked_light(workspace).shape == (2, 2, 8, 8, 3)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(UserError, match=r"light\.npz: no baked light \(.*delete it and run the stage again"):
+        read_baked_light(workspace)
 
 
 def test_what_the_check_of_the_page_needs(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,7 @@ bpy = pytest.importorskip("bpy")
 
 from dnrpipe.blender.reading.opening import open_scene  # noqa: E402
 from dnrpipe.core.cameras import make_cameras  # noqa: E402
+from dnrpipe.core.images import read_rgba  # noqa: E402
 from dnrpipe.core.scene_files import read_census, read_summary  # noqa: E402
 from dnrpipe.core.settings import CameraSettings  # noqa: E402
 from dnrpipe.raytrace.variants import choose_variant  # noqa: E402
@@ -74,9 +75,7 @@ def traced(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Traced]:
         task |= {"spp": SPP, "max_depth": DEPTH, "seed": 5, "integrator": "volpath" if name == "volume" else "path"}
         common = {"bundle": str(folder / "scene.xml"), "variant": choice.variant, "threads": 1}
         (numbers,) = outcomes("dnrpipe.raytrace.tracer", common, [task], log, environment=choice.environment)
-        channels, _ = read_exr(folder / "traced.exr")
-        image = np.stack([channels[c] for c in "RGBA"], axis=-1)
-        found[name] = Traced(folder, view, image, numbers)
+        found[name] = Traced(folder, view, read_rgba(folder / "traced.exr"), numbers)
     return found
 
 

@@ -11,6 +11,7 @@ import pytest
 from tests.scene_records import sphere_summary
 
 from dnrpipe.core.cameras import make_cameras
+from dnrpipe.core.images import read_rgba
 from dnrpipe.core.settings import CameraSettings
 from dnrpipe.raytrace.grouped import launch_sizes
 from dnrpipe.raytrace.pictures import repair
@@ -66,17 +67,12 @@ def _run(folder: Path, tasks: list[dict], module: str = "pass_worker") -> list[d
     return [o.result for o in results if o.result]
 
 
-def _picture(path: Path) -> np.ndarray:
-    channels, _ = read_exr(path)
-    return np.stack([channels[c] for c in "RGBA"], axis=-1)
-
-
 def test_passes_cut_by_a_restart_equal_passes_in_one_go(folder: Path) -> None:
     """The same bits; seconds and passes add up; the file says what it is."""
     _run(folder, [_task(folder, "a"), _task(folder, "a", add=40), _task(folder, "a", add=0)])
     _run(folder, [_task(folder, "b")])
     first, last = _run(folder, [_task(folder, "b", add=40), _task(folder, "b", add=0)])
-    assert np.array_equal(_picture(folder / "a.exr"), _picture(folder / "b.exr"))
+    assert np.array_equal(read_rgba(folder / "a.exr"), read_rgba(folder / "b.exr"))
     assert first["spp"] == last["spp"] == 64
     _, metadata = read_exr(folder / "b.exr")
     assert (metadata["spp"], metadata["passes"], metadata["ended_by"]) == (64, 2, "target")
@@ -122,16 +118,16 @@ def test_the_noise_of_a_rendered_view_is_estimated_without_bias(folder: Path) ->
     _run(folder, references, "tracer")
     from dnrpipe.raytrace.statistics import display
 
-    truth = display(_picture(folder / "long-0.exr"))
+    truth = display(read_rgba(folder / "long-0.exr"))
     level = np.sqrt(np.mean(truth**2))
     estimated = np.array([result["noise"] ** 2 for result in results[:16]])
-    squares = [np.mean((display(_picture(folder / f"{seed}.exr")) - truth) ** 2) for seed in range(16)]
+    squares = [np.mean((display(read_rgba(folder / f"{seed}.exr")) - truth) ** 2) for seed in range(16)]
     true = np.array(squares) / level**2
     difference = estimated - true
     assert abs(difference.mean()) < 3.5 * difference.std(ddof=1) / 4
     assert estimated.mean() == pytest.approx(true.mean(), rel=0.08)
     for name in ("shifted", "lens"):
-        error = display(_picture(folder / f"{name}.exr")) - display(_picture(folder / f"long-{name}.exr"))
+        error = display(read_rgba(folder / f"{name}.exr")) - display(read_rgba(folder / f"long-{name}.exr"))
         noise = read_exr(folder / f"{name}.exr")[1]["noise_rmse"]
         assert np.sqrt(np.mean(error**2)) < 1.3 * noise
 

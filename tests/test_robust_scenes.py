@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dnrpipe.core.images import read_rgba
+
 bpy = pytest.importorskip("bpy")
 
 from dnrpipe.core.cameras import depth_range, make_cameras  # noqa: E402
 from dnrpipe.core.scene_files import read_summary  # noqa: E402
 from dnrpipe.core.settings import CameraSettings  # noqa: E402
 from dnrpipe.workers.task_list import TaskResult, run_tasks  # noqa: E402
-from dnrtrain.exr import read_exr  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
@@ -102,8 +103,7 @@ def made(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureReques
         if outcome.result is None:
             found[name] = Made(f"ray tracing: {outcome.error}")
             continue
-        channels, _ = read_exr(folders[name] / "traced.exr")
-        found[name] = Made(None, np.stack([channels[c] for c in "RGBA"], -1), outcome.result, said[name])
+        found[name] = Made(None, read_rgba(folders[name] / "traced.exr"), outcome.result, said[name])
     return found
 
 

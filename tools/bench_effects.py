@@ -11,7 +11,6 @@ the ratio without the passes. CPU seconds of rendering, kernels compiled before.
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import sys
 import tempfile
@@ -26,6 +25,7 @@ from dnrpipe.stages.effect_plan import resolve_plan, run_pilots
 from dnrpipe.stages.prepare import scene_and_views
 from dnrpipe.stages.session import resolve_settings
 from dnrpipe.stages.stage import Run
+from dnrtrain.atomic import write_json
 
 EVERYTHING = {"integrator": "volpath", "max_depth": 32, "passes": True}
 
@@ -34,8 +34,7 @@ def bench(scene: Path, folder: Path, spp: int) -> dict[str, Any]:
     """One scene: converts it, runs the pilot, compares."""
     workspace = Workspace.create(folder / f"{scene.stem}.dnr", Source(path=str(scene), sha256=file_sha256(scene)))
     settings = resolve_settings(workspace, {"cameras": {"train": 8, "val": 0, "test": 0}}, None)
-    console = Console(quiet=True)
-    run = Run(workspace, settings, console, id="bench")
+    run = Run(workspace, settings, Console(quiet=True), id="bench")
     scene_and_views(run)
     started = time.monotonic()
     plan = resolve_plan(run)
@@ -48,7 +47,7 @@ def bench(scene: Path, folder: Path, spp: int) -> dict[str, Any]:
     tasks = [
         {"kind": "compare", "with_effect": pair, "without_effect": config, "views": views, "spp": spp} for pair in pairs
     ]
-    answer, lean = run_pilots(tasks, choice, console, scene.stem, run.log)
+    answer, lean = run_pilots(tasks, choice, run, scene.stem, run.log)
     return {
         "scene": scene.stem,
         "integrator": plan.integrator,
@@ -89,7 +88,7 @@ def main(arguments: list[str] | None = None) -> int:
     mean = statistics.geometric_mean(row["ratio"] for row in rows)
     print(f"geometric mean {mean:.2f}x, arithmetic mean {statistics.fmean(row['ratio'] for row in rows):.2f}x")
     if options.json:
-        options.json.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+        write_json(options.json, rows)
     return 0
 
 

@@ -31,6 +31,7 @@ from dnrpipe.core.workspace import SUFFIX
 from dnrpipe.service.guard import SUBPROTOCOL
 from dnrpipe.service.models import NAME_PATTERN
 from dnrpipe.service.routes_live import unpack
+from dnrtrain.text import one_line
 
 WARM_FRAMES = 40
 """Frames before the measurement: they compile kernels and let the pace settle."""
@@ -60,7 +61,7 @@ def bench(workspace: str, server: str | None, *, size: int, seconds: float, cons
             socket = stack.enter_context(connect(url, subprotocols=[SUBPROTOCOL], max_size=None))  # type: ignore[list-item]
             return _orbit(socket, size, seconds, console) | {"workspace": name, "size": size}
         except (WebSocketException, OSError) as error:
-            raise UserError(f"{url}: {' '.join(str(error).split())}") from None
+            raise UserError(f"{url}: {one_line(error)}") from None
 
 
 def lines(result: dict[str, Any]) -> list[str]:

@@ -67,7 +67,6 @@ CYCLES_REFERENCE = 64
 REFERENCE, TAKES = Way(name="path", spp=64), (1, 2)
 """A reference's pictures, and their numbers; rungs are take 0."""
 SEEDS = 1 << 16
-FIGURES = ("psnr", "ssim", "lpips", "flip", "flicker")
 
 
 def main() -> None:
@@ -282,7 +281,7 @@ def quality(
     pairs: Sequence[tuple[int, int]],
     lpips: Any,
 ) -> dict[str, float]:
-    """FIGURES, means over the frames; flicker over the pairs."""
+    """psnr, ssim, lpips and flip, means over the frames; flicker over the pairs."""
     rows = [
         {
             **compared(picture, truth[n], lpips),

@@ -19,38 +19,25 @@ VIEWS, EPOCHS, WARM = 6, 9, 2
 
 def step_ms(root: Path) -> tuple[float, float]:
     """(wall, processor) milliseconds of an optimiser step of the workspace's step 2, first epochs left out."""
-    from dnrpipe.core.scene_files import read_frame, split_views
+    from dnrpipe.core.scene_files import split_views
     from dnrpipe.core.workspace import Workspace
     from dnrpipe.stages.session import resolve_settings
-    from dnrtrain.checkpoint import read_record
-    from dnrtrain.dataset import load_views
+    from dnrpipe.stages.trainer import perceptual_weights
+    from dnrpipe.studies.cells.cell import load_cell_views
+    from dnrtrain.checkpoint import finished_record, step_seconds
     from dnrtrain.step2 import run_step2
-    from dnrtrain.weights import WeightsMissing, load_weights
 
     workspace = Workspace.open(root)
     settings = resolve_settings(workspace, {}, None)
     pictures = next((f for f in sorted((root / "raytraced").glob("train*")) if any(f.glob("*.exr"))), None)
-    views = [
-        view
+    names = tuple(
+        view.name
         for view in split_views(workspace)["train"]
         if pictures and (pictures / f"{view.name}.exr").exists() and (root / "base/train" / f"{view.name}.exr").exists()
-    ][:VIEWS]
-    if not views or pictures is None:
+    )[:VIEWS]
+    if not names or pictures is None:
         raise SystemExit(f"{root}: has no ray-traced training views with base images; run `dnrpipe run` first")
-    base = [root / "base" / "train" / f"{view.name}.exr" for view in views]
-    data = load_views(
-        base,
-        [pictures / f"{view.name}.exr" for view in views],
-        read_frame(workspace),
-        cameras=views,
-        folder=workspace.scene,
-        base=settings.model.base,
-        base_files=base,
-    )
-    try:
-        weights = load_weights()
-    except WeightsMissing:
-        weights = None
+    data = load_cell_views(root, "train", names, raytraced=True, base=settings.model.base, targets=pictures.name)
     step2 = settings.finetune.step2.model_copy(update={"epochs": EPOCHS, "start": "fresh", "validation_views": 0})
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -64,14 +51,11 @@ def step_ms(root: Path) -> tuple[float, float]:
             device="cpu",
             checkpoints=folder,
             fingerprint="bench",
-            weights=weights,
+            weights=perceptual_weights(None),
         ):
             pass
-        record = read_record(folder)
-    assert record is not None  # training has just finished
-    entries = record.history[WARM:]
-    steps = sum(entry.steps for entry in entries)
-    return tuple(1000 * sum(getattr(entry, clock) for entry in entries) / steps for clock in ("seconds", "cpu_seconds"))  # type: ignore[return-value]
+        wall, processor = step_seconds(finished_record(folder), WARM)
+    return 1000 * wall, 1000 * processor
 
 
 def main() -> int:

@@ -15,7 +15,9 @@ from __future__ import annotations
 import json
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from tools.bench_device import markdown as device_markdown
 from tools.bench_frames.document import markdown as frames_markdown
@@ -57,38 +59,36 @@ def generate(text: str, folder: Path) -> str:
     """``text`` with every marked part made anew. Raises UserError for results that cannot be read."""
 
     def part(match: re.Match[str]) -> str:
-        if match[2] == "rows":
+        kind, file = match[2], match[3]
+        if kind == "rows":
             body = rows_table()
-        elif match[2] == "results":
-            body = markdown(read_results(folder / match[3])).rstrip()
-        elif match[2] == "noise":
-            body = noise_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
-        elif match[2] == "frames-overview":
-            body = "\n".join(frames_overview(json.loads((folder / match[3]).read_text(encoding="utf-8"))))
-        elif match[2] == "device":
-            body = device_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
-        elif match[2] == "shots":
-            body = shots_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
-        elif match[2] == "untrained":
-            body = untrained_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
-        elif match[2] == "scaling":
-            body = scaling_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
-        elif match[2] == "frontier":
-            body = lowered(frontier_markdown(read_frontier(folder / match[3])))
-        elif match[2] == "selection":
-            body = lowered(selection_markdown(selection_results(folder / match[3]), pictures=False))
-        elif match[2] == "selections":
-            runs = [selection_results(folder / name) for name in match[3].split(",")]
-            body = lowered(selections_markdown(runs))
-        elif match[2] == "plan-equal":
-            body = equal_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
-        elif match[2] == "plan-check":
-            body = check_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8")))
+        elif kind == "results":
+            body = markdown(read_results(folder / file)).rstrip()
+        elif kind == "frontier":
+            body = lowered(frontier_markdown(read_frontier(folder / file)))
+        elif kind == "selection":
+            body = lowered(selection_markdown(selection_results(folder / file), pictures=False))
+        elif kind == "selections":
+            body = lowered(selections_markdown([selection_results(folder / name) for name in file.split(",")]))
         else:
-            body = lowered(frames_markdown(json.loads((folder / match[3]).read_text(encoding="utf-8"))))
+            body = OF_JSON[kind](json.loads((folder / file).read_text(encoding="utf-8")))
         return f"{match[1]}{body}\n{match[4]}"
 
     return PART.sub(part, text)
+
+
+OF_JSON: dict[str, Callable[[Any], str]] = {
+    "frames": lambda found: lowered(frames_markdown(found)),
+    "frames-overview": lambda found: "\n".join(frames_overview(found)),
+    "noise": noise_markdown,
+    "device": device_markdown,
+    "shots": shots_markdown,
+    "untrained": untrained_markdown,
+    "scaling": scaling_markdown,
+    "plan-equal": equal_markdown,
+    "plan-check": check_markdown,
+}
+"""Kinds that are made of a JSON file alone."""
 
 
 def lowered(text: str) -> str:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from dnrpipe.core.images import eight_bit
 from dnrpipe.stages.shots.render_frames import PICTURES_FOLDER
 
 from .bench_shots import OUT, REFERENCE, TAKES, folder_of_rung, places, root_of
@@ -113,7 +114,7 @@ def _pixels(path: Path) -> np.ndarray:
 
 
 def _fitted(image: np.ndarray, way: Image.Resampling = Image.Resampling.LANCZOS) -> Image.Image:
-    picture = Image.fromarray((image * 255 + 0.5).astype(np.uint8))
+    picture = Image.fromarray(eight_bit(image))
     return picture.resize((WIDTH, WIDTH * image.shape[0] // image.shape[1]), way)
 
 

@@ -15,6 +15,8 @@ sys.path.insert(0, str(Path(__file__).parent))  # importlib mode keeps helpers o
 import synthetic
 
 from dnrtrain.dataset import ViewSet, load_views
+from dnrtrain.perceptual import PerceptualLoss, random_weights
+from dnrtrain.settings import Step2Settings
 
 TRAIN, TEST, SIDE = 10, 4, 32
 
@@ -33,6 +35,12 @@ def _one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def perceptual() -> PerceptualLoss:
+    """On random weights."""
+    return PerceptualLoss(random_weights("vgg"), Step2Settings().perceptual_weights)
 
 
 def make_scene(folder: Path, train: int, test: int, side: int) -> Scene:

@@ -14,11 +14,6 @@ from dnrtrain.settings import LossWeights, Step2Settings
 TERMS = {"photometric", "ssim", "perceptual", "frequency", "total_variation", "regularisation"}
 
 
-@pytest.fixture(scope="module")
-def perceptual() -> PerceptualLoss:
-    return PerceptualLoss(random_weights("vgg"), Step2Settings().perceptual_weights)
-
-
 def images(side: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     return torch.rand(1, 3, side, side, generator=generator), torch.rand(1, 3, side, side, generator=generator)

@@ -59,11 +59,6 @@ quick = settings(deadline=None, max_examples=60, derandomize=True)
 
 
 @pytest.fixture(scope="module")
-def perceptual() -> PerceptualLoss:
-    return PerceptualLoss(random_weights("vgg"), Step2Settings().perceptual_weights)
-
-
-@pytest.fixture(scope="module")
 def lpips() -> Lpips:
     return Lpips("alex", random_weights("alex"))
 

@@ -13,6 +13,7 @@ from typing import Any
 from dnrpipe.cli import set_thread_waiting
 from dnrpipe.core.errors import UserError
 from dnrpipe.raytrace.variants import choose_variant
+from dnrtrain.atomic import write_json
 
 
 def main() -> int:
@@ -62,7 +63,7 @@ def _one(options: argparse.Namespace) -> int:
     except UserError as error:
         print(error, file=sys.stderr)
         return 2
-    options.only_result.write_text(json.dumps(result))
+    write_json(options.only_result, result)
     return 0
 
 

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from dnrpipe.studies.frames.baselines import METHODS, Baseline, make_baselines, render_baselines
+from dnrpipe.core.images import mean_known
+from dnrpipe.stages.trainer import perceptual_weights
+from dnrpipe.studies.frames.baselines import METHODS, Baseline, Ran, make_baselines, render_baselines
 from dnrpipe.studies.frames.ours import Ours
 from dnrpipe.studies.frames.pareto_front import frontier
 from dnrpipe.studies.frames.scene import BenchScene, Clock, open_scene
 from dnrtrain.metrics import image_metrics
 from dnrtrain.perceptual import build_lpips
-from dnrtrain.weights import WeightsMissing, load_weights
 
 from .equal_time import upfront
 from .moving import measure
@@ -42,18 +43,6 @@ class Options:
     moving: int = 24
     moving_spp: int = 512
     rays: tuple[int, ...] = ()
-
-
-@dataclass
-class Ran:
-    """One renderer's frames: milliseconds of the parts and display pictures, view by view."""
-
-    parts: dict[str, list[float]] = field(default_factory=dict)
-    pictures: list[Any] = field(default_factory=list)
-
-    def ms(self) -> float:
-        """Median over the views of the sum of the parts."""
-        return float(np.median(np.sum(list(self.parts.values()), axis=0)))
 
 
 def bench(root: Path, options: Options, tell: Callable[[str], None]) -> dict[str, Any]:
@@ -154,22 +143,18 @@ def _figures(
 
 def _lpips() -> dict[str, Any]:
     """quick: by AlexNet, slow: by VGG; None where the weights are missing. See `dnrtrain.metrics.image_metrics`."""
-    try:
-        found = build_lpips(load_weights())
-    except WeightsMissing:
+    weights = perceptual_weights(None)
+    if weights is None:
         return {"quick": None, "slow": None}
+    found = build_lpips(weights)
     return {"quick": {"alex": found["alex"]}, "slow": {"vgg": found["vgg"]}}
 
 
-def _quality(pictures: list[Any], truth: list[Any], masks: list[Any], lpips: Any) -> dict[str, float | None]:
+def _quality(pictures: list[Any], truth: list[Any], masks: list[Any], lpips: Any) -> dict[str, float]:
     """Means over the views of `dnrtrain.metrics.image_metrics`; keys without a value are left out."""
     found = [
         image_metrics(picture.float(), target, mask, lpips)
         for picture, target, mask in zip(pictures, truth, masks, strict=True)
     ]
-    result = {}
-    for key in found[0]:
-        values = [row[key] for row in found if row[key] is not None]
-        if values:
-            result[key] = float(np.mean(values))  # pyright: ignore[reportCallIssue, reportArgumentType]
-    return result
+    means = {key: mean_known(row[key] for row in found) for key in found[0]}
+    return {key: mean for key, mean in means.items() if mean is not None}

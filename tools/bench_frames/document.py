@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from dnrpipe.core.machine import processor
+from dnrpipe.studies.cells.results import number
 from dnrpipe.studies.frames.ours import BASE, NEURAL
 from dnrpipe.studies.frames.pareto_front import frontier
-from dnrtrain.atomic import atomic_path, write_json
+from dnrtrain.atomic import write_json, write_text
 
 from . import equal_time, moving_tables
-from .moving_tables import number
 
 PACKAGES = ("mitsuba", "drjit", "mitsuba-oidn", "torch", "numpy")
 
@@ -30,8 +30,7 @@ def write(results: list[dict[str, Any]], path: Path) -> None:
         scene.setdefault("made", made)  # scenes that were measured before keep theirs
     record = {"made": made, "scenes": results}
     write_json(path, record)
-    with atomic_path(path.with_suffix(".md")) as temporary:
-        temporary.write_text(markdown(record), encoding="utf-8")
+    write_text(path.with_suffix(".md"), markdown(record))
 
 
 def _made() -> dict[str, Any]:

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from dnrpipe.core.cameras import framing, look_at_view, orbit_views
+from dnrpipe.core.images import mean_known, rgba
 from dnrpipe.raytrace.base_renderer import CHAIN, BaseRenderer
 from dnrpipe.raytrace.engine import masked
 from dnrpipe.raytrace.history import History
@@ -134,7 +135,8 @@ def _figures(
 ) -> dict[str, float]:
     masks = {i: torch.from_numpy(surface.mask).float()[None, None] for i, surface in surfaces.items()}
     rows = [image_metrics(picture.float(), truth[i], masks[i], lpips) for i, picture in shown.items()]
-    quality = {key: float(np.mean([row[key] for row in rows])) for key in rows[0] if rows[0][key] is not None}  # pyright: ignore
+    means = {key: mean_known(row[key] for row in rows) for key in rows[0]}
+    quality = {key: mean for key, mean in means.items() if mean is not None}
     pairs = []
     for i in last:
         pair = (i - 1, i)
@@ -182,7 +184,7 @@ class Rivals:
             pictures = {f"{spp} spp {method}": (image, ms)}
             for patience in PATIENCE:
                 channels_, more = gathered[spp, patience]
-                one = np.stack([channels_[f"base.{c}"] for c in "RGBA"], axis=-1)
+                one = rgba(channels_, "base.")
                 pictures[f"{spp} spp {method}, gathered x{patience}"] = (one, ms + more)
             for name, (noisy, spent) in pictures.items():
                 smooth, denoiser_ms = clock.time(partial(denoised, noisy, guide, chosen, rays))

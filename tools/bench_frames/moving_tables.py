@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from dnrpipe.studies.cells.results import number
 from dnrpipe.studies.frames.ours import BASE, NEURAL, REMEMBERS
 
 from . import equal_time
@@ -83,8 +84,3 @@ def _as_standing(scene: Mapping[str, Any]) -> dict[str, Any]:
     ours = [name for name in rows if name.startswith(NEURAL) and name.endswith(REMEMBERS)]
     kept = {key: scene[key] for key in ("scene", "upfront") if key in scene}
     return {**kept, "rows": rows, "standing": ours}
-
-
-def number(value: float | None, digits: int) -> str:
-    """A table's cell."""
-    return "-" if value is None else f"{value:.{digits}f}"

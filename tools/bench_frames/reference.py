@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from dnrpipe.core.images import rgba
 from dnrpipe.core.workspace import digest
 from dnrpipe.raytrace.denoise import denoise
 from dnrpipe.stages.raytrace import view_seed
@@ -77,7 +78,7 @@ def _halves(scene: BenchScene, view: View, split: str, spp: int, path: Path) -> 
         path.parent.mkdir(parents=True, exist_ok=True)
         write_exr(path, channels, {"fingerprint": fingerprint, "spp": spp})
     channels, _ = read_exr(path)
-    return [np.stack([channels[f"{half}.{c}"] for c in "RGBA"], axis=-1) for half in HALVES]
+    return [rgba(channels, f"{half}.") for half in HALVES]
 
 
 def _noise(scene: BenchScene, pair: list[np.ndarray]) -> float:

@@ -29,6 +29,8 @@ from pathlib import Path
 
 from tools.faults.workspaces import contents, finished_units, forget, torn
 
+from dnrtrain.atomic import write_json
+
 REPO = Path(__file__).resolve().parents[2]
 SCENE = REPO / "blender_scenes" / "hard" / "emissive_only.blend"
 SETTINGS = {
@@ -398,7 +400,7 @@ def main() -> int:
                 said = "survived" if not last.problems else "; ".join(last.problems)
                 print(f"{last.kind}, {last.stage}: {said}", file=sys.stderr, flush=True)
                 if options.json:
-                    options.json.write_text(json.dumps([asdict(result) for result in results], indent=1) + "\n")
+                    write_json(options.json, [asdict(result) for result in results])
     print(table(results))
     return 1 if any(result.problems for result in results) else 0
 

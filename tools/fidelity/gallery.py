@@ -18,6 +18,7 @@ import numpy as np
 from PIL import Image
 
 from dnrpipe.core.console import Console
+from dnrpipe.core.images import read_rgba
 from dnrpipe.core.workspace import file_sha256
 from dnrpipe.workers.task_list import run_tasks
 from dnrtrain.atomic import atomic_path, write_json, write_text
@@ -73,7 +74,7 @@ def show(blend: Path, options: argparse.Namespace, console: Console) -> dict[str
             ours.trace(workspace, outputs, size=size, spp=options.spp)
     except ours.FidelityError as error:
         return {**record, "error": str(error)}
-    pictures = [ours.picture(path) for path in expected], [ours.picture(path) for path in outputs]
+    pictures = [read_rgba(path) for path in expected], [read_rgba(path) for path in outputs]
     measured = compare(*pictures)
     shown = [display(mean(each)) for each in pictures]
     write_triptych(shown[0], shown[1], options.docs / "images" / "scenes" / f"{blend.stem}.jpg")

@@ -8,8 +8,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 import dnrpipe
 from dnrpipe.core.cameras import make_cameras, view_lenses
 from dnrpipe.core.console import Console
@@ -20,7 +18,7 @@ from dnrpipe.raytrace.variants import choose_variant
 from dnrpipe.stages.prepare import convert_scene
 from dnrpipe.stages.stage import Run
 from dnrpipe.workers.task_list import TaskResult, run_tasks
-from dnrtrain.exr import read_exr
+from dnrtrain.text import one_line
 
 from .reference_settings import PATH_DEPTH
 
@@ -37,7 +35,7 @@ def convert(blend: Path, root: Path, *, quiet: bool = True) -> Workspace:
     try:
         convert_scene(Run(workspace, resolve(None, {}), Console(quiet=quiet)))
     except Exception as error:
-        raise FidelityError(f"{blend.stem}: {' '.join(str(error).split())}") from error
+        raise FidelityError(f"{blend.stem}: {one_line(error)}") from error
     return workspace
 
 
@@ -84,12 +82,6 @@ def _finish(outcomes: Iterable[TaskResult]) -> list[TaskResult]:
 def has_media(xml: Path) -> bool:
     """Whether a bundle holds participating media, the only thing that ``path`` leaves out."""
     return "<medium" in xml.read_text(encoding="utf-8")
-
-
-def picture(path: Path) -> np.ndarray:
-    """Linear premultiplied RGBA, float32 [H, W, 4]."""
-    channels, _ = read_exr(path)
-    return np.stack([channels[name] for name in "RGBA"], axis=-1)
 
 
 def findings(workspace: Workspace) -> list[dict[str, Any]]:

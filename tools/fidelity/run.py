@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from dnrpipe.core.console import Console
+from dnrpipe.core.images import read_rgba
 from dnrpipe.raytrace.variants import choose_variant
 from dnrpipe.workers.task_list import run_tasks
 from dnrtrain.atomic import write_json
@@ -104,7 +105,7 @@ def measure_case(case: Case, plan: Plan, broken: str | None) -> dict[str, Any]:
     if broken:
         return record
     folder = plan.reference(case)
-    expected = [ours.picture(folder / f"{seed}.exr") for seed in range(SEEDS)]
+    expected = [read_rgba(folder / f"{seed}.exr") for seed in range(SEEDS)]
     try:
         workspace = _conversion(case, folder, plan)
         pictures = _traces(case, plan, workspace.scene / "scene.xml", workspace)
@@ -168,7 +169,7 @@ def _traces(case: Case, plan: Plan, bundle: Path, workspace: Any) -> list[Path]:
 
 
 def _compare(expected: Sequence[Any], outputs: Sequence[Path]) -> Measured:
-    return compare(expected, [ours.picture(path) for path in outputs])
+    return compare(expected, [read_rgba(path) for path in outputs])
 
 
 def _digest(content: Any) -> str:

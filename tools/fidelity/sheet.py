@@ -9,10 +9,10 @@ from typing import Any, TypeAlias
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from dnrpipe.core.images import eight_bit, read_rgba
 from dnrtrain.atomic import atomic_path
 
 from .measure import display, mean
-from .ours import picture
 
 COLUMNS = 3
 SIDE = 96
@@ -52,14 +52,14 @@ def write_sheet(records: Sequence[dict[str, Any]], target: Path) -> None:
 def triptych(record: dict[str, Any]) -> tuple[Image.Image, Image.Image, Image.Image]:
     """Cycles, ours and their absolute difference times GAIN, display space over white."""
     cycles, ours = (
-        display(mean([picture(Path(path)) for path in record["pictures"][who]])) for who in ("cycles", "ours")
+        display(mean([read_rgba(Path(path)) for path in record["pictures"][who]])) for who in ("cycles", "ours")
     )
     return to_image(cycles), to_image(ours), to_image(np.abs(cycles - ours) * GAIN)
 
 
 def to_image(values: np.ndarray) -> Image.Image:
     """Display values [H, W, 3] in [0, 1] as an 8-bit picture."""
-    return Image.fromarray((np.clip(values, 0, 1) * 255 + 0.5).astype(np.uint8))
+    return Image.fromarray(eight_bit(values))
 
 
 def _label(draw: ImageDraw.ImageDraw, record: dict[str, Any], font: Font, width: int) -> str:

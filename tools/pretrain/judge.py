@@ -9,7 +9,6 @@ FOLDER keeps the scenes' workspaces. Without scenes: the example scenes of the r
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,7 @@ from dnrpipe.stages.stage import Run
 from dnrpipe.stages.trainer import load
 from dnrpipe.stages.trust import measure_trust
 from dnrpipe.studies.cells.measure import base_pictures
+from dnrtrain.atomic import write_json
 from dnrtrain.metrics import psnr
 from dnrtrain.model import render_views
 from dnrtrain.shipped import WEIGHTS, corrector
@@ -47,7 +47,7 @@ def main() -> None:
     for path in options.scenes or sorted(SCENES.glob("*.blend")):
         rows += judged(path, options.folder / f"{path.stem}.dnr", options.weights, options.views)
         if options.out:
-            options.out.write_text(json.dumps(rows, indent=1) + "\n")
+            write_json(options.out, rows)
     for weights in options.weights:
         own = [row for row in rows if row["weights"] == str(weights)]
         means = [float(np.mean([np.mean(row[name]) for row in own])) for name in ("base", "corrected", "trusted")]

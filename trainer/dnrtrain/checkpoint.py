@@ -30,6 +30,7 @@ from .contract import ContractError, DamagedFile
 from .model import DNR
 from .records import ModelRecord, Progress
 from .settings import ModelSettings
+from .text import one_line
 
 HEADER = "dnrtrain"
 CHECKSUM = "sha256"
@@ -151,6 +152,20 @@ def read_record(folder: Path) -> ModelRecord | None:
         return None
 
 
+def finished_record(folder: Path) -> ModelRecord:
+    """Of a training that has just finished."""
+    record = read_record(folder)
+    assert record is not None
+    return record
+
+
+def step_seconds(record: ModelRecord, warm: int = 1) -> tuple[float, float]:
+    """(wall, processor) seconds of an optimiser step, without the first ``warm`` epochs where there are more."""
+    epochs = record.history[warm:] or record.history
+    steps = sum(epoch.steps for epoch in epochs)
+    return sum(epoch.seconds for epoch in epochs) / steps, sum(epoch.cpu_seconds for epoch in epochs) / steps
+
+
 def load_model(folder: Path, device: str | torch.device = "cpu") -> DNR:
     """A finished stage's renderer, ready for inference.
 
@@ -173,7 +188,7 @@ def load_model(folder: Path, device: str | torch.device = "cpu") -> DNR:
         model = DNR(settings, seed=0)
         model.load_state_dict(saved[0])
     except (ValidationError, RuntimeError, KeyError, ValueError) as error:
-        reason = " ".join(str(error).split())[:200]
+        reason = one_line(error)[:200]
         raise ContractError(f"{folder}: model does not fit this version ({reason}); train it again") from None
     model.use_bfloat16 = record.bfloat16
     return model.to(device).eval()

@@ -52,6 +52,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, field_validator
 
 from .atomic import write_json
+from .text import one_line
 
 RASTER_CHANNELS = ("R", "G", "B", "A")
 RAW_CHANNELS = ("raw.R", "raw.G", "raw.B", "A")
@@ -93,7 +94,7 @@ class DamagedFile(ContractError):
     """
 
     def __init__(self, path: Path | str, reason: str) -> None:
-        self.path, self.reason = Path(path), " ".join(reason.split())
+        self.path, self.reason = Path(path), one_line(reason)
         super().__init__(f"{path}: damaged ({self.reason}); delete it and run its stage again")
 
 

@@ -48,6 +48,7 @@ from .dataset import Batch, in_camera_space
 from .display import ALPHA_FLOOR, DisplayTransform
 from .model import DNR, compose
 from .settings import ModelSettings
+from .text import one_line
 from .textures import SH_COUNT, SH_FIRST_CHANNEL, TexturePyramid, depth_coordinate, octahedral, spherical_harmonics
 
 OPSET = 18
@@ -129,9 +130,7 @@ def export_onnx(path: Path, model: DNR, frame: SceneFrame, folder: Path, extra: 
                 dynamic_axes=axes,
             )
         except torch.onnx.errors.OnnxExporterError as error:
-            raise ContractError(
-                f"{path}: torch cannot export this model ({' '.join(str(error).split())[:200]})"
-            ) from None
+            raise ContractError(f"{path}: torch cannot export this model ({one_line(error)[:200]})") from None
     import onnx
 
     proto = onnx.load_from_string(buffer.getvalue())

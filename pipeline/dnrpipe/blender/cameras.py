@@ -58,14 +58,14 @@ def _alone(scene: bpy.types.Scene, cameras: Sequence[Any]) -> Iterator[Any]:
         bpy.data.scenes.remove(helper)
 
 
-def camera_animation(scene: bpy.types.Scene, max_frames: int = MAX_FRAMES) -> list[SceneCamera]:
-    """The active camera over the frame range, at most ``max_frames`` frames; [] when it does not move.
+def camera_animation(scene: bpy.types.Scene) -> list[SceneCamera]:
+    """The active camera over the frame range, at most `MAX_FRAMES` frames; [] when it does not move.
 
     Follows camera markers.
     """
     if not _may_move(scene):
         return []
-    step = max(1, math.ceil((scene.frame_end - scene.frame_start + 1) / max_frames))
+    step = max(1, math.ceil((scene.frame_end - scene.frame_start + 1) / MAX_FRAMES))
     frames = range(scene.frame_start, scene.frame_end + 1, step)
     found = _over_frames(scene, frames, lambda frame: camera_at(scene, frame))
     seeing = [camera for _, _, camera in found if camera is not None]

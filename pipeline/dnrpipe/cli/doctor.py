@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import UserError
-from ..core.machine import forget_all
+from ..core.machine import forget_all, memory_bytes
 
 APT_LINE = (
     "apt-get install -y libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1"
@@ -55,10 +55,9 @@ def _row(name: str, state: str, text: str) -> dict[str, Any]:
 
 
 def _machine() -> dict[str, Any]:
-    memory = ""
-    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
-        memory = f", {os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB memory"
-    return _row("machine", "ok", f"{os.cpu_count()} cores{memory}")
+    memory = memory_bytes()
+    told = "" if memory is None else f", {memory / 2**30:.0f} GiB memory"
+    return _row("machine", "ok", f"{os.cpu_count()} cores{told}")
 
 
 def _disk() -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -12,7 +11,9 @@ import click
 
 from ..core.console import Console, clock
 from ..core.errors import UserError
-from .options import common, open_session
+from .options import WORKSPACE, common, open_session, print_json
+
+JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
 
 @click.command()
@@ -32,7 +33,10 @@ def inspect(scene: Path, as_json: bool) -> None:
     from ..stages.inspect_scene import describe, inspect_scene
 
     found = inspect_scene(scene)
-    click.echo(json.dumps(found.data(), indent=2) if as_json else describe(found))
+    if as_json:
+        print_json(found.data())
+    else:
+        click.echo(describe(found))
 
 
 @click.command()
@@ -69,8 +73,8 @@ def effects(
 
 
 @click.command()
-@click.option("-w", "--workspace", metavar="DIR", help="The workspace folder (scene.dnr).")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@WORKSPACE
+@JSON
 def status(workspace: str | None, as_json: bool) -> None:
     """Show what is done, partial, stale or missing, and the next command.
 
@@ -86,7 +90,7 @@ def status(workspace: str | None, as_json: bool) -> None:
     found = Workspace.open(find_workspace(workspace))
     rows = status_of(found, resolve_settings(found, {}, None))
     if as_json:
-        click.echo(json.dumps({"workspace": str(found.root), "stages": [asdict(row) for row in rows]}, indent=2))
+        print_json({"workspace": str(found.root), "stages": [asdict(row) for row in rows]})
         return
     click.echo(f"{found.root}  (from {found.manifest.source.path})")
     for row in rows:
@@ -100,7 +104,7 @@ def status(workspace: str | None, as_json: bool) -> None:
 @click.argument("workspace", required=False)
 @click.option("-w", "--workspace", "named", metavar="DIR", help="The workspace folder (scene.dnr).")
 @click.option("--repair", is_flag=True, help="Throw away what is damaged; the stages named make it again.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@JSON
 def verify(workspace: str | None, named: str | None, repair: bool, as_json: bool) -> None:
     """Read every file of a workspace and compare it with what was written.
 
@@ -128,7 +132,7 @@ def verify(workspace: str | None, named: str | None, repair: bool, as_json: bool
         due = discard_damaged(found, faults) if repair else []
     if as_json:
         rows = [{"file": str(f.path), "reason": f.reason, "stage": f.stage, "leftover": f.leftover} for f in faults]
-        click.echo(json.dumps({"workspace": str(root), "checked": checked, "faults": rows, "due": due}, indent=2))
+        print_json({"workspace": str(root), "checked": checked, "faults": rows, "due": due})
     else:
         for fault in faults:
             click.echo(f"{fault.path}: {fault.reason}")
@@ -144,8 +148,8 @@ def verify(workspace: str | None, named: str | None, repair: bool, as_json: bool
 
 
 @click.command()
-@click.option("-w", "--workspace", metavar="DIR", help="The workspace folder (scene.dnr).")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@WORKSPACE
+@JSON
 def costs(workspace: str | None, as_json: bool) -> None:
     """Sum the ledger: where the time went.
 
@@ -166,7 +170,7 @@ def costs(workspace: str | None, as_json: bool) -> None:
         truncated_records=found.ledger.truncated_records(),
     )
     if as_json:
-        click.echo(json.dumps(summary.model_dump(), indent=2))
+        print_json(summary.model_dump())
         return
 
     def columns(part: CostSum) -> str:
@@ -185,7 +189,7 @@ def costs(workspace: str | None, as_json: bool) -> None:
 
 
 @click.command()
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@JSON
 def doctor(as_json: bool) -> None:
     """Check this machine: Blender, EEVEE, Mitsuba variants, torch, weights, disk.
 
@@ -198,7 +202,7 @@ def doctor(as_json: bool) -> None:
 
     checks = examine()
     if as_json:
-        click.echo(json.dumps(checks, indent=2))
+        print_json(checks)
     else:
         for check in checks:
             click.echo(f"{check['state']:5} {check['name']:18} {check['text']}")
@@ -208,7 +212,7 @@ def doctor(as_json: bool) -> None:
 
 @click.command()
 @click.option("--offline", is_flag=True, help="Only check what is cached.")
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@JSON
 def weights(offline: bool, as_json: bool) -> None:
     """Fetch the VGG16, AlexNet and LPIPS weights into the cache (~/.cache/dnrpipe or DNRPIPE_CACHE).
 
@@ -225,6 +229,7 @@ def weights(offline: bool, as_json: bool) -> None:
         found = ensure_weights(offline=offline)
     except WeightsMissing as error:
         raise UserError(str(error)) from None
-    click.echo(
-        json.dumps(found, indent=2, default=str) if as_json else "\n".join(f"{k}: {v}" for k, v in found.items())
-    )
+    if as_json:
+        print_json(found)
+    else:
+        click.echo("\n".join(f"{k}: {v}" for k, v in found.items()))

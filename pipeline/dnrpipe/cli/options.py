@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import reduce
@@ -38,6 +39,7 @@ class Budget(click.ParamType):
             self.fail(f"'{value}' is neither a number of views nor auto", param, ctx)
 
 
+WORKSPACE = click.option("-w", "--workspace", metavar="DIR", help="The workspace folder (scene.dnr).")
 OUTPUT_OPTIONS = [
     click.option("--json", "as_json", is_flag=True, help="Print one JSON value; messages to stderr."),
     click.option("-q", "--quiet", is_flag=True, help="Warnings and errors only."),
@@ -50,7 +52,7 @@ EXECUTOR_OPTIONS = [
 """What `executor_assignments` reads."""
 common = options(
     [
-        click.option("-w", "--workspace", metavar="DIR", help="The workspace folder (scene.dnr)."),
+        WORKSPACE,
         click.option(
             "--preset", metavar="NAME", help="draft (default), standard, paper, vanilla, paper-128 or vanilla-128."
         ),
@@ -94,6 +96,11 @@ SELECT_OPTIONS = [
         help="How to choose them; rl-paper trains for it, the others take seconds.",
     ),
 ]
+
+
+def print_json(value: Any) -> None:
+    """The command's JSON answer."""
+    click.echo(json.dumps(value, indent=2))
 
 
 def open_session(

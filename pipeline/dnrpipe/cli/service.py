@@ -18,7 +18,7 @@ import click
 
 from ..core.console import Bar, Console
 from ..core.errors import UserError
-from .options import EXECUTOR_OPTIONS, executor_assignments
+from .options import EXECUTOR_OPTIONS, executor_assignments, print_json
 from .options import options as with_options
 
 if TYPE_CHECKING:
@@ -281,7 +281,7 @@ def jobs(states: tuple[str, ...], search: str, limit: int, as_json: bool, **serv
     with _client(**server) as client:
         found = list(islice(client.jobs(states, search), limit))  # type: ignore[arg-type]
     if as_json:
-        click.echo(json.dumps([job.model_dump(mode="json") for job in found], indent=2))
+        print_json([job.model_dump(mode="json") for job in found])
         return
     for job in found:
         what = f"{job.id:>6}  {job.state:9}  {job.request.command:17}  {job.request.workspace:20}"
@@ -353,7 +353,7 @@ def _act(wish: Callable[[Client], Job], as_json: bool, **server: Any) -> None:
     with _client(**server) as client:
         job = wish(client)
     if as_json:
-        click.echo(json.dumps(job.model_dump(mode="json"), indent=2))
+        print_json(job.model_dump(mode="json"))
     else:
         wanted = job.state == "running" and job.cancel_requested
         click.echo(f"job {job.id}: {'running, will be cancelled' if wanted else job.state}")

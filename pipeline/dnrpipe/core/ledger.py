@@ -208,9 +208,9 @@ def _whole(record: CostRecord) -> CostRecord:
     return record.model_copy(update={"seconds": record.seconds + earlier, "cpu_seconds": record.cpu_seconds + cpu})
 
 
-def latest_epochs(records: Sequence[CostRecord], stage: str) -> list[CostRecord]:
-    """The last record of each epoch of a training stage: what it costs once, repeated runs left out."""
-    return list({r.name: r for r in records if r.stage == stage and r.unit == "epoch"}.values())
+def latest_epochs(records: Sequence[CostRecord]) -> list[CostRecord]:
+    """The last record of each epoch of step 1: what it costs once, repeated runs left out."""
+    return list({r.name: r for r in records if r.stage == "select" and r.unit == "epoch"}.values())
 
 
 def selection_cost(records: Sequence[CostRecord]) -> CostSum:
@@ -218,7 +218,7 @@ def selection_cost(records: Sequence[CostRecord]) -> CostSum:
     chosen = [r for r in records if r.stage == "select" and r.unit != "overhead" and not r.cache_hit]
     if chosen and chosen[-1].unit != "epoch":
         return total(chosen[-1:])
-    return total(latest_epochs(records, "select"))
+    return total(latest_epochs(records))
 
 
 def upfront_work(

@@ -74,6 +74,13 @@ def processor() -> str:
     return f"{name}, {vectors}" if vectors else name
 
 
+def memory_bytes() -> int | None:
+    """The machine's memory; None where the system does not say."""
+    if not hasattr(os, "sysconf") or "SC_PHYS_PAGES" not in os.sysconf_names:
+        return None
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
 def _path(name: str) -> Path:
     return cache_root() / "machine" / f"{name}.json"
 

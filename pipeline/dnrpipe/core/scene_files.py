@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +12,7 @@ from dnrtrain.records import Model, Selection, read
 
 from .errors import UserError
 from .scene_records import Census, Conversion, RasterChoice, SceneSummary
-from .workspace import Workspace, digest, file_sha256
+from .workspace import Workspace, digest, sha256_now
 
 SCENE_VERSION = 9  # raise when the conversion or the G-buffer scene changes what it writes
 
@@ -68,22 +67,10 @@ def scene_fingerprint(workspace: Workspace) -> str:
         recorded, bake_size = summary.external, summary.bake_size
     except (UserError, DamagedFile):
         recorded, bake_size = {}, None
-    current = {name: _sha256_now(Path(name)) if Path(name).is_file() else sha for name, sha in recorded.items()}
+    current = {name: sha256_now(Path(name)) if Path(name).is_file() else sha for name, sha in recorded.items()}
     # Without their folders: moving a scene with its textures changes nothing.
     files = sorted((Path(name).name, sha) for name, sha in current.items())
     return digest([SCENE_VERSION, workspace.manifest.source.sha256, files, bake_size])
-
-
-def _sha256_now(path: Path) -> str:
-    """Hash of the file as it is; one command asks many times, so it is read again only when it changed."""
-    stat = path.stat()
-    return _sha256_cached(path, stat.st_mtime_ns, stat.st_size)
-
-
-@functools.lru_cache(maxsize=1024)
-def _sha256_cached(path: Path, modified_ns: int, size: int) -> str:
-    del modified_ns, size  # part of the key only
-    return file_sha256(path)
 
 
 def split_views(workspace: Workspace) -> dict[str, list[View]]:

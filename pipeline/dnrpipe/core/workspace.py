@@ -16,6 +16,7 @@ scene.dnr/
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import os
@@ -250,3 +251,15 @@ def file_sha256(path: Path) -> str:
     """SHA-256 of a file's bytes, read in pieces."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def sha256_now(path: Path) -> str:
+    """`file_sha256` of the file as it is; one command asks many times, so it is read again only when it changed."""
+    stat = path.stat()
+    return _sha256_cached(path, stat.st_mtime_ns, stat.st_size)
+
+
+@functools.lru_cache(maxsize=16384)
+def _sha256_cached(path: Path, modified_ns: int, size: int) -> str:
+    del modified_ns, size  # part of the key only
+    return file_sha256(path)

@@ -22,8 +22,10 @@ from dnrtrain.atomic import atomic_path
 from .. import __version__
 from ..core.console import Console
 from ..core.errors import UserError
+from ..core.images import eight_bit
 from ..core.scene_files import read_frame
 from ..core.workspace import Workspace
+from ..stages.base_images import light_path
 from .meshes import BundleMesh, read_meshes
 
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -38,7 +40,7 @@ def export_gltf(workspace: Workspace, out: Path, console: Console, *, light: boo
         raise UserError(f"--out {out}: name a file that ends in .glb")
     meshes = read_meshes(workspace.scene)
     picture = None
-    if light and (workspace.root / "base" / "light.npz").is_file():
+    if light and light_path(workspace).is_file():
         picture = light_picture(workspace, console)
     elif light:
         console.warn("no baked light in this workspace (model.base is not baked): the meshes are written without")
@@ -63,7 +65,7 @@ def light_picture(workspace: Workspace, console: Console) -> np.ndarray:
 
     radiance = torch.from_numpy(surface_maps(workspace, console).radiance[0, ..., :3].copy()).permute(2, 0, 1)
     shown = DisplayTransform(read_frame(workspace), workspace.scene)(radiance).permute(1, 2, 0).numpy()
-    return (shown[::-1] * 255 + 0.5).astype(np.uint8)
+    return eight_bit(shown[::-1])
 
 
 def glb(meshes: Sequence[BundleMesh], picture: np.ndarray | None) -> bytes:

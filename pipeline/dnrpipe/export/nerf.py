@@ -28,6 +28,7 @@ from dnrtrain.exr import read_exr
 
 from ..core.console import Console
 from ..core.errors import UserError
+from ..core.images import eight_bit
 from ..core.scene_files import read_frame, read_selection, split_views
 from ..core.workspace import Workspace
 from .folder import claim, finish
@@ -92,7 +93,7 @@ def write_rgba(path: Path, image: Path, display: DisplayTransform) -> None:
     alpha = torch.from_numpy(channels["A"]).clamp(0.0, 1.0)
     rgba = torch.cat([_shown(channels, alpha, display) * (alpha > 0), alpha[None]]).permute(1, 2, 0).numpy()
     with atomic_path(path) as temporary:
-        Image.fromarray((rgba * 255 + 0.5).astype(np.uint8), "RGBA").save(temporary)
+        Image.fromarray(eight_bit(rgba), "RGBA").save(temporary)
 
 
 def _shown(channels: dict[str, np.ndarray], alpha: torch.Tensor, display: DisplayTransform) -> torch.Tensor:
@@ -188,7 +189,7 @@ def _points(workspace: Workspace, views: Sequence[View], display: DisplayTransfo
         inside = (surface["mask"] > 0.5) & (image["A"] > 0.5)
         points.append(np.stack([surface[f"position.{c}"][inside] for c in "XYZ"], axis=1))
         shown = _shown(image, torch.from_numpy(image["A"]), display).permute(1, 2, 0).numpy()
-        colours.append((shown[inside] * 255 + 0.5).astype(np.uint8))
+        colours.append(eight_bit(shown[inside]))
     place, colour = np.concatenate(points), np.concatenate(colours)
     if len(place) > POINTS:
         kept = np.random.default_rng(0).choice(len(place), POINTS, replace=False)

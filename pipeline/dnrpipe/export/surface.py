@@ -13,7 +13,9 @@ import torch.nn.functional as F
 from ..core.console import Console
 from ..core.errors import UserError
 from ..core.workspace import Workspace
+from ..raytrace.light_worker import read_light
 from ..raytrace.variants import choose_variant
+from ..stages.base_images import light_path
 from ..workers.view_tasks import only_answer
 
 SAMPLES = 16
@@ -69,15 +71,11 @@ def surface_maps(workspace: Workspace, console: Console) -> SurfaceMaps:
 
 
 def read_baked_light(workspace: Workspace) -> np.ndarray:
-    """``base/light.npz``, float32 [2, 2, n, n, 3]. Raises UserError: this workspace has none."""
-    path = workspace.root / "base" / "light.npz"
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            light = np.asarray(data["light"], np.float32)
-    except (OSError, ValueError, KeyError, EOFError):
-        raise UserError(
-            f"{path}: no baked light; it comes with `dnrpipe raytrace-selected` where model.base is baked"
-        ) from None
+    """``base/light.npz``, float32 [2, 2, n, n, 3]. Raises UserError: this workspace has none, or it is damaged."""
+    path = light_path(workspace)
+    if not path.is_file():
+        raise UserError(f"{path}: no baked light; it comes with `dnrpipe raytrace-selected` where model.base is baked")
+    light = read_light(path)
     if light.ndim != 5 or light.shape[:2] != (2, 2) or light.shape[2] != light.shape[3]:
         raise UserError(f"{path}: was baked by an older dnrpipe; run `dnrpipe raytrace-selected` again")
     return light

@@ -23,18 +23,17 @@ from pathlib import Path
 from typing import Literal
 
 from dnrtrain.atomic import write_json, write_text
+from dnrtrain.text import one_line
 
 from ..core.console import Console
 from ..core.workspace import locked
-from ..workers.processes import die_with_parent, how_ended
+from ..workers.processes import die_with_parent, how_ended, last_error
 from .page import page
 from .plan import TAKES_NO_FORCE, Fleet, FleetJob
 from .records import FleetRow, FleetSummary, read_rows
 
 GRACE = 20.0
 """Seconds between SIGTERM and SIGKILL, in which a command stops its workers and writes what it has."""
-TAIL = 20_000
-ERROR = "dnrpipe: error: "
 
 
 def run_fleet(fleet: Fleet, *, jobs: int, environment: dict[str, str], force: bool, console: Console) -> FleetSummary:
@@ -65,7 +64,7 @@ def run_fleet(fleet: Fleet, *, jobs: int, environment: dict[str, str], force: bo
             try:
                 row = _run(job, environment, force, fleet.out, running, stopping)
             except Exception as error:  # a full disk, a log that cannot be written: this scene's, not the fleet's
-                reason = " ".join(str(error).split())
+                reason = one_line(error)
                 row = FleetRow(name=job.name, scene=str(job.scene), state="failed", error=reason, seconds=0, log="")
             ended.put(row)
 
@@ -160,11 +159,8 @@ def _facts(workspace: Path, out: Path) -> dict[str, object]:
 
 def _reason(log: Path, code: int) -> str:
     """The command's own error line, or how it ended."""
-    with log.open("rb") as file:
-        file.seek(max(0, log.stat().st_size - TAIL))
-        lines = file.read().decode("utf-8", "replace").splitlines()
-    errors = [line.removeprefix(ERROR) for line in lines if line.startswith(ERROR)]
-    return errors[-1] if errors else f"the command {how_ended(code)}; see {log}"
+    error = last_error(log)
+    return f"the command {how_ended(code)}; see {log}" if error is None else error
 
 
 def _end(running: set[subprocess.Popen[bytes]]) -> None:

@@ -63,18 +63,18 @@ class Worker(BundleWorker):
         write_exr(task.output, {name: plane for name, plane in channels.items() if name not in CHAIN}, header)
         return answer
 
-    def channels(self, view: View, samples: int | None = None, number: int = 0) -> dict[str, np.ndarray]:
+    def channels(self, view: View, samples: int | None = None) -> dict[str, np.ndarray]:
         """Base image and G-buffer of a view in scene units: linear Rec.709, float32 [H, W] each.
 
-        samples: rays per pixel, if not the workspace's. number: see `BaseRenderer.frame`.
+        samples: rays per pixel, if not the workspace's.
         """
-        channels = self.grainy(view, samples, number)
+        channels = self.grainy(view, samples)
         if isinstance(self.common, SampledCommon):
             return channels | self._traced(self.common, view, channels)
         return without_grain(channels, self.renderer) if self.denoise else channels
 
     def grainy(self, view: View, samples: int | None = None, number: int = 0) -> dict[str, np.ndarray]:
-        """`channels` by the kernel alone: not denoised, not path-traced."""
+        """`channels` by the kernel alone: not denoised, not path-traced. number: see `BaseRenderer.frame`."""
         renderer, scaled = self.renderer, scaled_view(view, self.engine.unit_scale)
         channels = renderer.frame(scaled, samples or self.common.samples, number)
         self.repaired, self.masked = self.repaired + renderer.repaired, self.masked + renderer.masked

@@ -55,7 +55,7 @@ class SpecularPaths:
         caustics: False: rays end at sharp lobes (`paths.is_sharp`).
     """
 
-    def __init__(self, scene: Any, *, camera: bool = True, gloss: bool = True, caustics: bool = True) -> None:
+    def __init__(self, scene: Any, *, gloss: bool, camera: bool = True, caustics: bool = True) -> None:
         self.camera, self.caustics = camera, caustics
         self.steps = mi.Float(steps(NUMBERS * (MAX_VERTICES + 1)))
         unseen = (LAMP_PREFIX, UNSEEN_PREFIX)

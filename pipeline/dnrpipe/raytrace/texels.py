@@ -31,7 +31,7 @@ class AtlasSurface:
     Copies that share a place of the atlas lie on top of each other there: any of them may answer.
     """
 
-    def __init__(self, mi: Any, scene: Any, groups: Sequence[tuple[Path, np.ndarray]] = ()) -> None:
+    def __init__(self, mi: Any, scene: Any, groups: Sequence[tuple[Path, np.ndarray]]) -> None:
         """groups: the meshes that instances repeat, each with the matrix of its place (`grouped_meshes`)."""
         meshes = [(shape, np.eye(4)) for shape in scene.shapes() if shape.is_mesh()]
         meshes += [(mi.load_dict({"type": "ply", "filename": str(path)}), matrix) for path, matrix in groups]
@@ -97,7 +97,7 @@ class AtlasSurface:
         found &= length > 0
         return place, mi.Normal3f(normal / dr.maximum(length, 1e-30)), found
 
-    def sides(self, uv: Any, *, closed: bool = False) -> list[Any]:
+    def sides(self, uv: Any, *, closed: bool) -> list[Any]:
         """Whether the front (the side that the normal points to) and the back of the surface at (U, V) can be seen;
         with ``closed``, whether they are the inside of a closed mesh that lets no light through."""
         import drjit as dr

@@ -35,7 +35,7 @@ def integrator_settings(mi: Any, scene: Any, kind: str) -> dict[str, Any]:
     return dict(OWN.get(kind, {"type": kind}))
 
 
-def camera_integrator(mi: Any, scene: Any, max_depth: int, kind: str = "path") -> tuple[Any, str]:
+def camera_integrator(mi: Any, scene: Any, max_depth: int, kind: str) -> tuple[Any, str]:
     """(integrator, its name for the file's metadata): ``kind``, or ``kind+glow`` where surfaces glow.
 
     kind: see `integrator_settings`. Roulette starts at a fixed depth: with the same seed, a path cut at one depth is

@@ -89,7 +89,7 @@ def collect(root: Path, *, made_at: datetime | None = None) -> ReportData:
     Raises UserError: not a workspace, or one of its files is damaged; names the file and the remedy.
     """
     root = Path(root).resolve()
-    manifest = _read_json(root / "manifest.json", "prepare")
+    manifest = _read_json(root / "manifest.json")
     if manifest is None:
         raise UserError(f"{root}: not a dnrpipe workspace; make one with `dnrpipe prepare SCENE`")
     known = outline(root)
@@ -129,15 +129,15 @@ def collect(root: Path, *, made_at: datetime | None = None) -> ReportData:
     )
 
 
-def _read_json(path: Path, command: str) -> dict[str, Any] | None:
+def _read_json(path: Path) -> dict[str, Any] | None:
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return None
     except ValueError as error:
-        raise UserError(f"{path}: damaged JSON ({error}); run `dnrpipe {command}` again") from None
+        raise UserError(f"{path}: damaged JSON ({error}); run `dnrpipe prepare` again") from None
     if not isinstance(value, dict):
-        raise UserError(f"{path}: not a JSON object; run `dnrpipe {command}` again")
+        raise UserError(f"{path}: not a JSON object; run `dnrpipe prepare` again")
     return value
 
 
@@ -165,7 +165,7 @@ def _read_views(root: Path, split: str) -> list[View]:
     path = root / "cameras" / f"{split}.json"
     if not path.exists():
         return []
-    if (_read_json(path, "prepare") or {}).get("frames") == []:  # a split may be empty (no validation views)
+    if (_read_json(path) or {}).get("frames") == []:  # a split may be empty (no validation views)
         return []
     try:
         return read_cameras(path)

@@ -14,6 +14,8 @@ from fastapi.responses import JSONResponse
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
+from dnrtrain.text import one_line
+
 from .. import __version__
 from ..core.errors import UserError
 from . import routes_jobs, routes_leases, routes_live, routes_server, routes_workspaces
@@ -114,4 +116,4 @@ async def _answer(_: Request, error: Exception) -> JSONResponse:
     if isinstance(error, RequestValidationError):
         return JSONResponse({"detail": first_fault(error)}, 422)
     status = next(status for kind, status in _STATUS.items() if isinstance(error, kind))
-    return JSONResponse({"detail": " ".join(str(error).split())}, status)
+    return JSONResponse({"detail": one_line(error)}, status)

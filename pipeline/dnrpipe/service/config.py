@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from pydantic import BaseModel, Field
 
+from ..core.machine import memory_bytes
 from .models import Limits
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
@@ -58,9 +58,8 @@ def default_devices() -> tuple[str, ...]:
 
 def default_memory_mb() -> int | None:
     """Four fifths of the machine's memory, MiB; None where the system does not say."""
-    if not hasattr(os, "sysconf") or "SC_PHYS_PAGES" not in os.sysconf_names:
-        return None
-    return int(0.8 * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**20)
+    memory = memory_bytes()
+    return None if memory is None else int(0.8 * memory / 2**20)
 
 
 def tightest(job: Limits, server: Limits) -> Limits:

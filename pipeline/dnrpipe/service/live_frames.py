@@ -17,7 +17,6 @@ from __future__ import annotations
 import base64
 import functools
 import io
-import time
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +24,14 @@ import numpy as np
 from PIL import Image
 
 from dnrpipe.core.errors import UserError
-from dnrpipe.core.images import flip_error, over_white, picture_of
+from dnrpipe.core.images import eight_bit, flip_error, over_white, picture_of, rgba
 from dnrpipe.core.settings import Settings
 from dnrpipe.raytrace.base_worker import Worker as BaseWorker
 from dnrpipe.raytrace.base_worker import without_grain
 from dnrpipe.raytrace.engine import Engine, masked, masked_channels
 from dnrpipe.raytrace.frames import Frames
 from dnrpipe.raytrace.history import History
+from dnrpipe.raytrace.recorded import timed
 from dnrpipe.stages.trainer import torch_device
 from dnrtrain.checkpoint import load_model
 from dnrtrain.contract import RASTER_CHANNELS, SceneFrame, View, require_channels
@@ -84,25 +84,25 @@ class Worker:
         ms: dict[str, float] = {}
         spp, rays, self.repaired = None, None, 0
         if mode == "nearest":
-            picture = self._timed(ms, "file", self._file, Path(task["file"]))
+            picture = timed(ms, "file", self._file, Path(task["file"]))
         elif mode == "reference":
-            picture, spp = self._timed(ms, "path tracing", self._reference, view, int(task["spp"]))
+            picture, spp = timed(ms, "path tracing", self._reference, view, int(task["spp"]))
         else:
             self._begin(view, bool(task["fine"]))
-            channels = self._timed(ms, "base image" if self.base else "G-buffer", self._channels, view, task["samples"])
+            channels = timed(ms, "base image" if self.base else "G-buffer", self._channels, view, task["samples"])
             if self.history is not None and mode in REMEMBERED:
-                channels = self._timed(ms, "history", self.history.take, view, channels)
+                channels = timed(ms, "history", self.history.take, view, channels)
                 rays = int(channels["rays"].max())
             if self.base is not None and self.base.denoise and mode in REMEMBERED:
-                channels = self._timed(ms, "denoiser", without_grain, channels, self.base.renderer)
+                channels = timed(ms, "denoiser", without_grain, channels, self.base.renderer)
             if mode in ("neural", "error"):
-                picture = self._timed(ms, "network", self._neural, view, channels)
+                picture = timed(ms, "network", self._neural, view, channels)
             else:
-                picture = self._timed(ms, "colours", self._shown, mode, channels)
+                picture = timed(ms, "colours", self._shown, mode, channels)
             if mode == "error":
-                truth, spp = self._timed(ms, "path tracing", self._reference, view, int(task["spp"]))
-                picture = self._timed(ms, "FLIP", flip_error, truth, picture)[1]
-        data, kind = self._timed(ms, "encoding", encode, picture, bool(task["fine"]))
+                truth, spp = timed(ms, "path tracing", self._reference, view, int(task["spp"]))
+                picture = timed(ms, "FLIP", flip_error, truth, picture)[1]
+        data, kind = timed(ms, "encoding", encode, picture, bool(task["fine"]))
         return {
             "picture": base64.b64encode(data).decode("ascii"),
             "type": kind,
@@ -113,13 +113,6 @@ class Worker:
             "width": picture.shape[1],
             "height": picture.shape[0],
         }
-
-    @staticmethod
-    def _timed(ms: dict[str, float], name: str, function: Any, *arguments: Any) -> Any:
-        started = time.perf_counter()
-        result = function(*arguments)
-        ms[name] = 1000 * (time.perf_counter() - started)
-        return result
 
     def _begin(self, view: View, fine: bool) -> None:
         """Begin the history anew where a camera comes to rest: what moved is good enough to move on, not to stay."""
@@ -150,7 +143,7 @@ class Worker:
         """A channel as a picture over white, float32 [H, W, 3] in [0, 1]."""
         mask = channels["mask"][..., None] > 0.5
         if mode == "base":
-            return self._over_white(np.stack([channels[f"base.{c}"] for c in "RGBA"], axis=-1))
+            return self._over_white(rgba(channels, "base."))
         if mode == "albedo":
             values = np.clip(np.stack([channels[f"albedo.{c}"] for c in "RGB"], axis=-1), 0, 1) ** (1 / 2.2)
         elif mode == "normal":
@@ -178,16 +171,16 @@ class Worker:
     def _file(self, path: Path) -> np.ndarray:
         channels, _ = read_exr(path)
         require_channels(path, channels, RASTER_CHANNELS, "run `dnrpipe raytrace-selected`")
-        return self._over_white(np.stack([channels[c] for c in "RGBA"], axis=-1))
+        return self._over_white(rgba(channels))
 
-    def _over_white(self, rgba: np.ndarray) -> np.ndarray:
+    def _over_white(self, image: np.ndarray) -> np.ndarray:
         """Linear premultiplied RGBA [H, W, 4] -> display RGB over white, float32 [H, W, 3]."""
-        return over_white(self.display, rgba)[0].permute(1, 2, 0).numpy()
+        return over_white(self.display, image)[0].permute(1, 2, 0).numpy()
 
 
 def encode(picture: np.ndarray, fine: bool) -> tuple[bytes, str]:
     """(bytes, media type) of display RGB [H, W, 3] in [0, 1]: JPEG in a hurry, else WebP of high quality."""
-    image = Image.fromarray((np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8))
+    image = Image.fromarray(eight_bit(picture))
     buffer = io.BytesIO()
     if fine:
         image.save(buffer, "WEBP", quality=95, method=1)

@@ -13,6 +13,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
+from dnrtrain.text import one_line
+
 from ..core.errors import UserError
 from ..workers.processes import LocalWorker, TaskFailed, WorkerDied
 from ..workers.task_list import MAX_ATTEMPTS
@@ -153,7 +155,7 @@ class LiveSession:
             try:
                 return began, self._worker.ask(task, FRAME_SECONDS)
             except (TaskFailed, WorkerDied, OSError, ValueError) as error:
-                reason = " ".join(str(error).split())
+                reason = one_line(error)
         raise UserError(f"the frame failed: {reason}; see {self.scene.root.name}/logs/live.log")
 
     async def close(self) -> None:

@@ -21,6 +21,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from dnrtrain.text import one_line
+
 from ..core.errors import UserError
 from ..core.workspace import SUFFIX, Workspace
 from . import archive
@@ -82,7 +84,7 @@ class RemoteWorker:
                 except UserError as error:
                     if _is_unwanted(error):
                         raise
-                    self.say(f"job {lease.job.id}: given up ({_line(error)})")
+                    self.say(f"job {lease.job.id}: given up ({one_line(error)})")
                 finally:
                     self._forget(lease)
 
@@ -103,14 +105,14 @@ class RemoteWorker:
             self._fetch(client, lease, workspace)
         except (UserError, OSError) as error:  # half a workspace is nothing to send back
             _raise_if_over(error)
-            client.end(lease, End(state="failed", error=f"it could not be fetched: {_line(error)}"))
+            client.end(lease, End(state="failed", error=f"it could not be fetched: {one_line(error)}"))
             return
         before = archive.stamps(workspace)
         try:
             end = run_job(job, root, self.config.device, limits, report, lambda: self.stopping)
         except (UserError, OSError) as error:
             _raise_if_over(error)
-            end = End(state="failed", error=_line(error))
+            end = End(state="failed", error=one_line(error))
         report.flush()
         try:
             _move_source(workspace, root.folder, Path(lease.root))
@@ -119,7 +121,7 @@ class RemoteWorker:
             client.send_result(lease, workspace, changed, before.keys() - after.keys(), report.cancelled)
         except (UserError, OSError) as error:
             _raise_if_over(error)
-            end = End(state="failed", exit_code=end.exit_code, error=f"what it made was not taken: {_line(error)}")
+            end = End(state="failed", exit_code=end.exit_code, error=f"what it made was not taken: {one_line(error)}")
         client.end(lease, end)
 
     def _fetch(self, client: LeaseClient, lease: Lease, workspace: Path) -> None:
@@ -264,7 +266,3 @@ def _raise_if_over(error: Exception) -> None:
     """Raise what leaves nobody to tell how the job ended."""
     if isinstance(error, LeaseGone | Unreachable) or _is_unwanted(error):
         raise error
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())

@@ -20,16 +20,13 @@ MOVIES = (".mp4", ".webp")
 def results(workspace: Path) -> list[Result]:
     """Newest first. Links are left out."""
     found = []
-    for folder in _folders(workspace / "renders"):
-        movies = [path for path in sorted(folder.iterdir()) if path.suffix in MOVIES]
-        found += [_result("movie", path, path.relative_to(workspace).as_posix()) for path in movies]
-        if any(folder.glob("frame_*")):
-            found.append(_result("frames", folder, f"renders/{folder.name}.zip"))
-    for folder in _folders(workspace / "shots"):
-        movies = [path for path in sorted(folder.iterdir()) if path.suffix in MOVIES]
-        found += [_result("movie", path, path.relative_to(workspace).as_posix()) for path in movies]
-        if any((folder / "frames").glob("*.exr")):
-            found.append(_result("frames", folder / "frames", f"shots/{folder.name}/frames.zip"))
+    for kind in ("renders", "shots"):
+        for folder in _folders(workspace / kind):
+            movies = [path for path in sorted(folder.iterdir()) if path.suffix in MOVIES]
+            found += [_result("movie", path, path.relative_to(workspace).as_posix()) for path in movies]
+            frames, pattern = (folder, "frame_*") if kind == "renders" else (folder / "frames", "*.exr")
+            if any(frames.glob(pattern)):
+                found.append(_result("frames", frames, f"{frames.relative_to(workspace).as_posix()}.zip"))
     for place in EXPORTED.values():
         path = workspace / place
         if path.is_file() and not path.is_symlink():

@@ -23,6 +23,8 @@ from typing import Annotated, Any
 from fastapi import APIRouter, HTTPException, Path, WebSocket, WebSocketDisconnect
 from pydantic import ValidationError
 
+from dnrtrain.text import one_line
+
 from ..core.errors import UserError
 from .guard import SUBPROTOCOL
 from .live_pool import MOST_RAYS, MOST_SPP, LiveSession
@@ -68,7 +70,7 @@ async def live(socket: WebSocket, name: Annotated[str, Path(pattern=NAME_PATTERN
     except (UserError, HTTPException) as error:
         detail = str(error.detail) if isinstance(error, HTTPException) else str(error)
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):
-            await socket.send_json({"kind": "problem", "detail": " ".join(detail.split())})
+            await socket.send_json({"kind": "problem", "detail": one_line(detail)})
             await socket.close(REFUSED)
 
 

@@ -23,10 +23,12 @@ from typing import Any, Protocol
 
 from filelock import FileLock, Timeout
 
+from dnrtrain.text import one_line
+
 from ..core.errors import UserError
 from ..core.event_stream import VARIABLE
 from ..core.workspace import LOCK_FILES
-from ..workers.processes import die_with_parent, how_ended
+from ..workers.processes import die_with_parent, how_ended, last_error
 from ..workers.task_list import TIMEOUT_VARIABLE
 from .config import ServerConfig, tightest
 from .models import End, Job, Limits
@@ -78,7 +80,7 @@ class Worker:
                     job, self.root, self.device, limits, report, lambda: self.stopping, executor=self.config.executor
                 )
             except (UserError, OSError) as error:  # the job cannot start; the worker goes on
-                end = End(state="failed", error=" ".join(str(error).split()))
+                end = End(state="failed", error=one_line(error))
             self.queue.end(job.id, end)
 
     def stop(self, *_: Any) -> None:
@@ -288,12 +290,8 @@ def end_group(process: subprocess.Popen[Any], *, grace: float = GRACE) -> None:
 
 def _reason(log: Path, code: int) -> str:
     """The command's own error line, or its exit code."""
-    with log.open("rb") as file:
-        file.seek(max(0, log.stat().st_size - 20_000))
-        lines = file.read().decode("utf-8", "replace").splitlines()
-    errors = [line for line in lines if line.startswith("dnrpipe: error:")]
-    if errors:
-        return errors[-1].removeprefix("dnrpipe: error: ")
+    if (error := last_error(log)) is not None:
+        return error
     if code == INTERRUPTED:
         return "interrupted from outside; retry to go on where it stopped"
     return f"the command {how_ended(code)}; see its log"

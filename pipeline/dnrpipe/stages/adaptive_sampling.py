@@ -26,7 +26,7 @@ def sample_adaptively(
     *,
     workers: int,
     book: Book,
-    environment: dict[str, str] | None = None,
+    environment: dict[str, str] | None,
 ) -> None:
     """Trace the views whose files are missing or out of date; one ledger record each, when its file is written.
 

@@ -15,7 +15,7 @@ from dnrtrain.records import write
 
 from ..core.cameras import spread
 from ..core.errors import UserError
-from ..core.images import flip_error, picture_of, write_png
+from ..core.images import flip_error, mean_known, picture_of, write_png
 from ..core.scene_files import read_selection, split_views
 from ..core.settings import Settings
 from ..core.units import duration
@@ -202,12 +202,8 @@ def _timed_render(render: Any, device: str) -> tuple[float, Any]:
 
 def _mean(rows: list[ViewMetrics]) -> dict[str, float | None]:
     """The mean of each figure, over the views that have it."""
-    result: dict[str, float | None] = {}
-    for name in ViewMetrics.model_fields:
-        if name != "name":
-            values = [value for row in rows if (value := getattr(row, name)) is not None]
-            result[name] = float(np.mean(values)) if values else None
-    return result
+    names = [name for name in ViewMetrics.model_fields if name != "name"]
+    return {name: mean_known(getattr(row, name) for row in rows) for name in names}
 
 
 def _finite(value: float) -> float | None:

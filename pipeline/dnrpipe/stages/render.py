@@ -16,7 +16,7 @@ from dnrtrain.atomic import atomic_path, write_json
 from dnrtrain.contract import View, write_cameras
 
 from ..core.errors import UserError
-from ..core.images import picture_of, write_png
+from ..core.images import eight_bit, picture_of, write_png
 from ..core.scene_files import read_frame
 from ..core.workspace import digest, file_sha256
 from .base_images import RENDERED, base_views
@@ -40,8 +40,8 @@ def render_novel(
     name: str,
     frames: str,
     movie: str,
-    untrained: bool = False,
-    alone: bool = False,
+    untrained: bool,
+    alone: bool,
 ) -> dict[str, Any]:
     """Render the views into ``renders/<name>/``.
 
@@ -98,7 +98,7 @@ def render_novel(
             picture = picture_of(output.rgb[0])
             seconds.append(time.perf_counter() - started)
             if movie != "none":
-                pictures.append((picture * 255 + 0.5).astype(np.uint8))
+                pictures.append(eight_bit(picture))
             if frames in ("png", "both"):
                 write_png(folder / f"frame_{view.name}.png", picture)
             if frames in ("exr", "both"):

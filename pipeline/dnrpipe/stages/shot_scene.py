@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from dnrtrain.atomic import write_json
@@ -46,25 +46,17 @@ def scene_at(workspace: Workspace, frame: int) -> Path:
     return workspace.root / "frames" / f"frame{frame:05d}"
 
 
-def convert_frames(run: Run, frames: Sequence[int], done: Callable[[int, Path], object] = lambda *_: None) -> None:
+def convert_frames(run: Run, frames: Sequence[int]) -> None:
     """Convert the scene at these frames, those that are missing or out of date, each into `scene_at`.
 
     Only what path tracing needs. Baked textures of the conversion serve again where they hold: a value that does not
     depend on the surface's place is not baked again for an object that moves.
 
-    Args:
-        done: called with each frame and its folder, as they come, those that were there already first.
-
     Raises UserError: nothing is visible at a frame, or the scene file is gone.
     """
     workspace = run.workspace
     prints = {frame: digest([FRAME_VERSION, run.scene_fingerprint, frame]) for frame in frames}
-    todo = []
-    for frame in frames:
-        if _is_made(scene_at(workspace, frame), prints[frame]):
-            done(frame, scene_at(workspace, frame))
-        else:
-            todo.append(frame)
+    todo = [frame for frame in frames if not _is_made(scene_at(workspace, frame), prints[frame])]
     if not todo:
         return
     started = time.monotonic()
@@ -91,7 +83,6 @@ def convert_frames(run: Run, frames: Sequence[int], done: Callable[[int, Path], 
                 _fresh(folder).rename(folder)
                 write_json(folder / "prepared.json", Conversion(fingerprint=prints[frame], files={}).data())
                 bar.advance()
-                done(frame, folder)
             for frame, pending in waiting:
                 refused += bake(run, source, _fresh(scene_at(workspace, frame)) / "geometry.npz", pending)
             todo = [frame for frame, _ in waiting]

@@ -19,6 +19,7 @@ from ..core.console import Console
 from ..core.errors import UserError
 from ..core.scene_files import read_conversion, read_frame, read_json, read_selection
 from ..core.workspace import Workspace, file_sha256
+from .base_images import light_path
 from .pipeline import STAGES, discard, owner_of
 
 
@@ -69,7 +70,7 @@ def repair(workspace: Workspace, faults: list[Fault]) -> list[str]:
     due = set()
     for fault in faults:
         owner = owner_of(fault.path, workspace)
-        if fault.leftover or fault.path == workspace.root / "base" / "light.npz":
+        if fault.leftover or fault.path == light_path(workspace):
             fault.path.unlink(missing_ok=True)
         elif owner is not None:
             discard(fault.path, owner, workspace)
@@ -93,8 +94,7 @@ def _checks(workspace: Workspace) -> Iterator[tuple[Path, Callable[[Path], objec
     for folder in ("evaluation", "renders", "shots"):
         yield from ((path, read_json) for path in sorted((root / folder).rglob("[!.]*.json")))
         yield from ((path, _picture) for path in sorted((root / folder).rglob("[!.]*.png")))
-    light = root / "base" / "light.npz"
-    if light.exists():
+    if (light := light_path(workspace)).exists():
         yield light, _archive
     if workspace.ledger.path.exists():
         yield workspace.ledger.path, lambda path: _ledger(workspace, path)

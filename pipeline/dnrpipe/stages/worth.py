@@ -87,7 +87,7 @@ def worth(run: Run, candidates: int) -> Worth:
 def trial(run: Run, before: DNR, training: ViewSet, held_out: ViewSet) -> tuple[float, float]:
     """(dB gained over the shipped corrector, as far as it is trusted, on the held-out views, seconds of an optimiser
     step)."""
-    from dnrtrain.checkpoint import load_model, read_record
+    from dnrtrain.checkpoint import finished_record, load_model, step_seconds
     from dnrtrain.step2 import run_step2
 
     settings = run.settings
@@ -107,10 +107,7 @@ def trial(run: Run, before: DNR, training: ViewSet, held_out: ViewSet) -> tuple[
         )
         for _ in events:
             pass
-        record = read_record(folder)
-        assert record is not None
-        later = record.history[1:]  # the first epoch warms up
-        step = sum(epoch.seconds for epoch in later) / sum(epoch.steps for epoch in later)
+        step, _ = step_seconds(finished_record(folder))
         after = load_model(folder).cpu()
         return mean_psnr(after, held_out)[1] - mean_psnr(before, held_out)[1], step
 

@@ -25,7 +25,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from dnrtrain.text import one_line
+
 from ..core.errors import UserError
+
+TAIL = 20_000
+"""Bytes at the end of a log in which `last_error` looks."""
+ERROR = "dnrpipe: error: "
 
 
 class WorkerDied(RuntimeError):
@@ -217,6 +223,15 @@ def how_ended(code: int | None) -> str:
     return f"was killed by {names.get(-code, f'signal {-code}')}"
 
 
+def last_error(log: Path) -> str | None:
+    """The last error line that a command wrote to its log, without ``dnrpipe: error:``; None where there is none."""
+    with log.open("rb") as file:
+        file.seek(max(0, log.stat().st_size - TAIL))
+        lines = file.read().decode("utf-8", "replace").splitlines()
+    errors = [line.removeprefix(ERROR) for line in lines if line.startswith(ERROR)]
+    return errors[-1] if errors else None
+
+
 def die_with_parent(parent: int) -> None:
     """Ask Linux to kill this process when the thread that started it dies; elsewhere stdin's end serves.
 
@@ -261,7 +276,7 @@ class Answerer:
             import traceback
 
             traceback.print_exc()
-            reason = " ".join(str(error).split()) or type(error).__name__
+            reason = one_line(error) or type(error).__name__
             if isinstance(error, MemoryError):
                 reason = f"out of memory ({reason})"
             # Bad input and a full disk stay what they are; anything else gets its second try.

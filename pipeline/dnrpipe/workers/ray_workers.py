@@ -21,6 +21,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from dnrtrain.text import one_line
+
 from .. import __version__
 from ..core.errors import UserError
 from ..core.machine import cache_root
@@ -116,7 +118,7 @@ def connect(executor: ExecutorSettings) -> None:
         else:
             ray.init(address=executor.address, **quiet)
     except (ray.exceptions.RayError, ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
-        reason = " ".join(str(error).split())
+        reason = one_line(error)
         raise UserError(f"executor.address={executor.address}: cannot join this Ray cluster ({reason})") from None
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, before)  # Ray takes it for itself
@@ -124,7 +126,7 @@ def connect(executor: ExecutorSettings) -> None:
     try:
         refuse_other_versions(executor)
     except (ray.exceptions.RayError, TimeoutError) as error:
-        reason = " ".join(str(error).split())[-300:]
+        reason = one_line(error)[-300:]
         raise UserError(f"executor.address={executor.address}: a node does not run dnrpipe ({reason})") from None
 
 
@@ -333,7 +335,7 @@ def _reason(error: Exception) -> str:
 
     if isinstance(error, ray.exceptions.OutOfMemoryError):
         return "worker was ended for want of memory on its node"
-    text = " ".join(str(error).split())
+    text = one_line(error)
     return "worker crashed" if "SYSTEM_ERROR" in text else f"worker ended: {text[:200]}"
 
 

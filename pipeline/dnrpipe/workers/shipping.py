@@ -12,7 +12,6 @@ of workers there: it is unpacked into the node's cache, and mirrors hold hard li
 from __future__ import annotations
 
 import contextlib
-import functools
 import hashlib
 import io
 import os
@@ -30,7 +29,7 @@ from filelock import FileLock, Timeout
 
 from dnrtrain.atomic import atomic_path
 
-from ..core.workspace import file_sha256
+from ..core.workspace import sha256_now
 
 LEFT_BEHIND = ("logs", "preview", "renders", "report", "evaluation", "samples")
 """Folders of a workspace of which no task reads all."""
@@ -124,15 +123,8 @@ def members(path: Path) -> list[tuple[str, Path]]:
 def _digest(path: Path) -> str:
     whole = hashlib.sha256()
     for name, file in members(path):
-        stat = file.stat()
-        whole.update(f"{name}\0{_sha256(file, stat.st_mtime_ns, stat.st_size)}\0".encode())
+        whole.update(f"{name}\0{sha256_now(file)}\0".encode())
     return whole.hexdigest()[:32]
-
-
-@functools.lru_cache(maxsize=16384)
-def _sha256(path: Path, modified_ns: int, size: int) -> str:
-    del modified_ns, size  # part of the key only
-    return file_sha256(path)
 
 
 # -- a worker elsewhere ------------------------------------------------------------------------------------

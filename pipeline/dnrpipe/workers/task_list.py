@@ -18,6 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dnrtrain.text import one_line
+
 from ..core.errors import UserError
 from ..core.units import parse_seconds
 from .placement import HERE, Placement, Worker, WorkerLost
@@ -166,7 +168,7 @@ def run_tasks(
                         continue
                     answer = {"error": f"{loss}, as were those that had it before", "retry": False, "died": True}
                 except Exception as death:  # cannot be started, truncated answer, no room for what it reads
-                    answer = {"error": " ".join(str(death).split()), "retry": True, "died": True}
+                    answer = {"error": one_line(death), "retry": True, "died": True}
                 if stopping.is_set():
                     return
                 seconds, node = time.monotonic() - started, answer.get("node", "")

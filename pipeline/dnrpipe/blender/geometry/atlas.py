@@ -34,16 +34,16 @@ MEASURE_SIZE = 512
 BELOW_ONE = float(np.nextafter(np.float32(1), np.float32(0)))
 
 
-def build_atlas(meshes: Sequence[FrozenMesh], *, smart_limit: int = SMART_LIMIT) -> AtlasFacts:
+def build_atlas(meshes: Sequence[FrozenMesh]) -> AtlasFacts:
     """Fill ``mesh.atlas`` of every mesh and measure the atlas.
 
     Smart UV project, islands scaled to texel densities (see `texel_density`) and packed; planar charts on
-    shelves (see `charts`) when the scene has more than ``smart_limit`` triangles or very many meshes.
+    shelves (see `charts`) when the scene has more than `SMART_LIMIT` triangles or very many meshes.
     """
     started = time.perf_counter()
     total = sum(mesh.triangles for mesh in meshes)
     density = texel_density(meshes)
-    simple = total <= smart_limit and len(meshes) <= SMART_MESHES and count_pieces(meshes) <= SMART_PIECES
+    simple = total <= SMART_LIMIT and len(meshes) <= SMART_MESHES and count_pieces(meshes) <= SMART_PIECES
     (_smart_atlas if simple else chart_atlas)(meshes, density)
     _fit(meshes)
     numbers = measure_atlas(meshes)

@@ -13,6 +13,7 @@ from pathlib import Path
 import bpy
 
 from dnrpipe.core.errors import NothingVisible, UserError
+from dnrtrain.text import one_line
 
 from ..findings import first_of
 from .missing import missing_files, missing_warnings, strict_refusal
@@ -90,7 +91,7 @@ def open_blend(path: Path) -> list[str]:
         with _heard() as said:
             bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False, use_scripts=False)
     except RuntimeError as error:
-        reason = " ".join(str(error).removeprefix("Error: ").split())
+        reason = one_line(str(error).removeprefix("Error: "))
         if "Big Endian" in reason:
             unread = f"which Blender {_version(bpy.app.version)} no longer reads; save it from Blender 4.5 or older"
             raise UserError(f"{path}: saved on a big-endian machine, {unread}") from None
@@ -157,7 +158,7 @@ def _import(path: Path, suffix: str) -> None:
     try:
         IMPORTERS[suffix](str(path))
     except (RuntimeError, ValueError, KeyError, IndexError, OSError) as error:  # the glTF importer is Python
-        reason = " ".join(str(error).removeprefix("Error: ").split())[:200]
+        reason = one_line(str(error).removeprefix("Error: "))[:200]
         raise UserError(f"{path}: cannot be imported as {suffix[1:].upper()} ({reason})") from None
     if not bpy.context.scene.objects:
         raise UserError(f"{path}: nothing was imported from it; is it a valid {suffix[1:].upper()} file?")

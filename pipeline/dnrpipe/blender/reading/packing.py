@@ -8,6 +8,7 @@ from typing import Any
 import bpy
 
 from dnrtrain.atomic import atomic_path
+from dnrtrain.text import one_line
 
 from ..findings import printable
 from .missing import SHAPELESS_IMAGES, image_files, is_file
@@ -46,7 +47,7 @@ def _pack(block: Any, label: str) -> list[str]:
     try:
         block.pack()
     except RuntimeError as error:
-        return [f"{label} could not be packed: {' '.join(str(error).split())}"]
+        return [f"{label} could not be packed: {one_line(error)}"]
     return []
 
 
@@ -70,7 +71,7 @@ def _pack_libraries() -> list[str]:
         bpy.ops.file.pack_libraries()
         reason = ""
     except RuntimeError as error:
-        reason = f" ({' '.join(str(error).split())})"
+        reason = f" ({one_line(error)})"
     left = [library.name for library in wanted if not library.packed_file]
     left += [f"{name} (another library names it by an absolute path)" for name in fixed if name not in left]
     return [f"linked libraries stay outside the workspace: {', '.join(left)}{reason}"] if left else []

@@ -24,9 +24,9 @@ def is_white(value: Value) -> bool:
     return isinstance(value, Constant) and bool(np.allclose(value.mean, 1.0, atol=1e-3))
 
 
-def below(value: Value, limit: float) -> bool:
-    """Whether the value is a constant below ``limit``."""
-    return isinstance(value, Constant) and value.scalar < limit
+def is_smooth(roughness: Value) -> bool:
+    """Whether the roughness is a constant below `SMOOTH`."""
+    return isinstance(roughness, Constant) and roughness.scalar < SMOOTH
 
 
 def squared(value: Value) -> Value:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..bundle import xmltree
-from .algebra import SMOOTH, below, squared
+from .algebra import is_smooth, squared
 from .normals import NormalShaders
 from .sockets import Scope
 from .surface import Surface
@@ -50,7 +50,7 @@ class InterfaceShaders(NormalShaders):
 
         distribution: of the microfacets, as Blender names them; MULTI_GGX keeps what one scattering loses.
         """
-        smooth = below(roughness, SMOOTH)
+        smooth = is_smooth(roughness)
         if smooth:
             element = xmltree.plugin("bsdf", "dielectric")
         else:

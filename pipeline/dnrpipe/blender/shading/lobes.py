@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..bundle import xmltree
-from .algebra import SMOOTH, below, squared
+from .algebra import is_smooth, squared
 from .calibration import metal_gain
 from .normals import NormalShaders
 from .sockets import Scope, find_input
@@ -36,7 +36,7 @@ class LobeShaders(NormalShaders):
         roughness = self._scalar(node, scope, "Roughness")
         anisotropy = self._number(node, scope, 0.0, "Anisotropy")
         colour = self._colour(node, scope, "Color")
-        if below(roughness, SMOOTH):
+        if is_smooth(roughness):
             element = xmltree.plugin("bsdf", "conductor")
         else:
             element = xmltree.plugin("bsdf", "roughconductor")
@@ -76,7 +76,7 @@ class LobeShaders(NormalShaders):
             xmltree.number(element, "metallic", 1.0)
             self._put_colour(element, "specular_tint", self._colour(node, scope, "Edge Tint"))
             return self._bent(element, node, scope)
-        smooth = below(roughness, SMOOTH)
+        smooth = is_smooth(roughness)
         element = xmltree.plugin("bsdf", "conductor" if smooth else "roughconductor")
         if not smooth:
             xmltree.text(element, "distribution", "ggx")

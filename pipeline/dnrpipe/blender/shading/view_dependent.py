@@ -14,6 +14,8 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 
+from dnrpipe.raytrace.plugins.energy import fresnel
+
 from ..bundle import xmltree
 from .textures import Placement, Textured, Value, constant
 
@@ -31,28 +33,16 @@ def table(front: np.ndarray, back: np.ndarray) -> Textured:
     return Textured(rows.reshape(2, COSINES, -1), False, PLACEMENT)
 
 
-def dielectric_fresnel(cosine: np.ndarray, eta: float) -> np.ndarray:
-    """Unpolarised reflectance of a dielectric interface; 1 under total reflection.
-
-    eta: index beyond the surface over index on the side of the view.
-    """
-    g2 = eta * eta - 1 + cosine * cosine
-    g = np.sqrt(np.maximum(g2, 0))
-    parallel = (g - cosine) / np.maximum(g + cosine, 1e-9)
-    ratio = (cosine * (g + cosine) - 1) / np.maximum(cosine * (g - cosine) + 1, 1e-9)
-    return np.where(g2 > 0, 0.5 * parallel**2 * (1 + ratio**2), 1.0)
-
-
 def fresnel_node(ior: float) -> Textured:
     """Fresnel node: dielectric Fresnel of ``ior``, of 1 / ior from behind."""
     eta = max(ior, 1e-5)
-    return table(dielectric_fresnel(COSINE, eta), dielectric_fresnel(COSINE, 1 / eta))
+    return table(fresnel(COSINE, eta), fresnel(COSINE, 1 / eta))
 
 
 def layer_weight_fresnel(blend: float) -> Textured:
     """Layer Weight node, Fresnel: dielectric Fresnel of index 1 / (1 - blend), inverted from behind."""
     eta = max(1 - blend, 1e-5)
-    return table(dielectric_fresnel(COSINE, 1 / eta), dielectric_fresnel(COSINE, eta))
+    return table(fresnel(COSINE, 1 / eta), fresnel(COSINE, eta))
 
 
 def layer_weight_facing(blend: float) -> Textured:

@@ -21,8 +21,7 @@ from dnrtrain.contract import SceneFrame, View
 from ...core.scene_records import Lens
 from ...raytrace.tasks import Costs, Task
 
-COLOUR = ("R", "G", "B", "A")
-LAYERS = (*COLOUR, "depth.Z", "normal.X", "normal.Y", "normal.Z", "albedo.R", "albedo.G", "albedo.B", "object.Id")
+LAYERS = (*"RGBA", "depth.Z", "normal.X", "normal.Y", "normal.Z", "albedo.R", "albedo.G", "albedo.B", "object.Id")
 """Channels of a frame. Normals are of world space; all but colour and albedo are of the ray through the pixel's
 centre; albedo is the diffuse reflectance."""
 HALF = ("R", "G", "B", "A", "normal.X", "normal.Y", "normal.Z", "albedo.R", "albedo.G", "albedo.B")

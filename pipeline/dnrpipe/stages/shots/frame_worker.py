@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from dnrpipe.core.errors import UserError
-from dnrpipe.core.images import over_white, write_png
+from dnrpipe.core.images import over_white, rgba, write_png
 from dnrpipe.core.settings import Settings
 from dnrpipe.raytrace.background import Background
 from dnrpipe.raytrace.base_worker import LEAST_ALPHA
@@ -22,14 +21,14 @@ from dnrpipe.raytrace.base_worker import Worker as BaseWorker
 from dnrpipe.raytrace.denoise import denoise
 from dnrpipe.raytrace.engine import Engine, masked, masked_channels
 from dnrpipe.raytrace.frames import Frames
-from dnrpipe.raytrace.recorded import Stopwatch
+from dnrpipe.raytrace.recorded import Stopwatch, timed
 from dnrtrain.dataset import view_in_memory
 from dnrtrain.display import DisplayTransform
 from dnrtrain.exr import write_exr
 from dnrtrain.model import render
 
 from ..trainer import torch_device
-from .frame_tasks import COLOUR, HALF, LAYERS, NETWORK, FrameAnswer, FrameCommon, FrameTask
+from .frame_tasks import HALF, LAYERS, NETWORK, FrameAnswer, FrameCommon, FrameTask
 
 GUIDE_RAYS = 16
 """Primary rays per pixel of the denoiser's auxiliary images: clean."""
@@ -95,19 +94,12 @@ class Worker:
     def render(self, task: FrameTask, ms: dict[str, float]) -> tuple[list[Layers], int]:
         """(channels of LAYERS, float32 [H, W] each, of the frame and, if wanted, of its base image; pixels that were
         not finite). ms: milliseconds of the parts."""
-
-        def timed(name: str, function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-            began = time.perf_counter()
-            found = function(*arguments, **options)
-            ms[name] = 1000 * (time.perf_counter() - began)
-            return found
-
         if task.way.name == "path":
-            found, lost = self._path(task, timed)
+            found, lost = self._path(task, ms)
         else:
-            found, lost = self._from_base(task, timed)
+            found, lost = self._from_base(task, ms)
         if self.background is not None:
-            behind = timed("background", self.background.frame, task.view)
+            behind = timed(ms, "background", self.background.frame, task.view)
             for layers in found:
                 clear = 1 - np.clip(layers["A"], 0, 1)
                 for i, name in enumerate("RGB"):
@@ -117,22 +109,21 @@ class Worker:
 
     def shown(self, layers: dict[str, np.ndarray]) -> np.ndarray:
         """Display RGB over white, float32 [H, W, 3] in [0, 1]."""
-        image = np.stack([layers[name] for name in COLOUR], axis=-1)
-        return over_white(self.display, image)[0].permute(1, 2, 0).numpy()
+        return over_white(self.display, rgba(layers))[0].permute(1, 2, 0).numpy()
 
-    def _from_base(self, task: FrameTask, timed: Callable[..., Any]) -> tuple[list[Layers], int]:
+    def _from_base(self, task: FrameTask, ms: dict[str, float]) -> tuple[list[Layers], int]:
         if self.base is None:
             raise UserError(f"frame {task.view.name}: {task.way.told} need baked light")
         self.base.repaired = self.base.masked = 0
         if task.earlier is None:
-            channels = timed("base image", self.base.channels, task.view, task.way.spp)
+            channels = timed(ms, "base image", self.base.channels, task.view, task.way.spp)
         else:
             asked = (task.view, task.earlier, task.number, task.way.spp)
-            channels = timed("base image", self.base.remembered, *asked)
+            channels = timed(ms, "base image", self.base.remembered, *asked)
         lost = self.base.masked
         colours: list[np.ndarray] = []
         if task.way.name == "neural":
-            colours.append(timed(NETWORK, self._corrected, task, channels))
+            colours.append(timed(ms, NETWORK, self._corrected, task, channels))
         if task.way.name == "base" or task.plain is not None:
             premultiplied = np.stack([channels[f"base.{c}"] for c in "RGB"], axis=-1)
             colours.append(premultiplied / np.maximum(channels["base.A"], LEAST_ALPHA)[..., None])
@@ -151,13 +142,13 @@ class Worker:
             raise UserError("shots need a model whose output is radiance: type --set model.output=log")
         return radiance[0].permute(1, 2, 0).numpy()
 
-    def _path(self, task: FrameTask, timed: Callable[..., Any]) -> tuple[list[Layers], int]:
+    def _path(self, task: FrameTask, ms: dict[str, float]) -> tuple[list[Layers], int]:
         view = task.view
         frames = self.frames((view.width, view.height))
-        image, lost = masked(timed("path tracing", self._traced, task, frames))
-        guide = timed("primary rays", frames.auxiliary, view, GUIDE_RAYS, task.seed)
-        clean = timed("denoiser", denoise, image, guide.albedo, guide.normal, quality=task.way.quality)
-        gbuffer, more = masked_channels(timed("G-buffer", frames.gbuffer, view))
+        image, lost = masked(timed(ms, "path tracing", self._traced, task, frames))
+        guide = timed(ms, "primary rays", frames.auxiliary, view, GUIDE_RAYS, task.seed)
+        clean = timed(ms, "denoiser", denoise, image, guide.albedo, guide.normal, quality=task.way.quality)
+        gbuffer, more = masked_channels(timed(ms, "G-buffer", frames.gbuffer, view))
         alpha = guide.coverage if task.lens is None else image[..., 3]
         layers = {name: clean[..., i] for i, name in enumerate("RGB")} | {"A": alpha}
         layers |= {name: gbuffer[name] for name in LAYERS if name in gbuffer}

@@ -20,12 +20,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dnrtrain.exr import read_exr
-
-from ...core.images import over_white
+from ...core.images import over_white, read_rgba
 from ...core.scene_files import read_frame
 from ..stage import Run
-from .frame_tasks import COLOUR
 
 if TYPE_CHECKING:
     from dnrtrain.display import DisplayTransform
@@ -82,5 +79,4 @@ def display_of(run: Run) -> DisplayTransform:
 
 def shown(display: DisplayTransform, path: Path) -> Any:
     """A frame's file as display RGB over white, torch [1, 3, H, W]. Raises DamagedFile."""
-    channels, _ = read_exr(path)
-    return over_white(display, np.stack([channels[name] for name in COLOUR], axis=-1)).clamp(0, 1)
+    return over_white(display, read_rgba(path)).clamp(0, 1)

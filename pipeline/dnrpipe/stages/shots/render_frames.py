@@ -95,7 +95,7 @@ def render_frames(
     renderer: Renderer,
     tasks: Sequence[FrameTask],
     *,
-    label: str = "frames",
+    label: str,
     purpose: Purpose = "inference",
 ) -> None:
     """Render what is missing. Raises TasksFailed, after all others are done. Raises OSError: the disk is full.

@@ -30,7 +30,7 @@ from .tasks import CellResult, CellTask, FileWorker, Step1Result, Step1Task, Tra
 
 if TYPE_CHECKING:
     from dnrtrain.dataset import Base, ViewSet
-    from dnrtrain.records import Epoch, ModelRecord
+    from dnrtrain.records import Epoch
 
 CELL_VERSION = 3  # raise when training or measuring changes what a cell holds, or what fingerprints hash
 STEP1_SHARE = 1 / 3
@@ -100,7 +100,6 @@ class Worker(FileWorker):
     def _train(self, task: CellTask) -> Training:
         """Step 2 in the cell's own folder."""
         settings, coarse = task.settings, task.coarse_cost
-        pace = None
         if task.seconds is not None:
             pace = self._pace(task)
             spent = STEP1_SHARE * task.seconds if task.full_step1 else self._clock(coarse) if coarse else 0.0
@@ -116,7 +115,6 @@ class Worker(FileWorker):
         cost = training_cost(task.folder)
         return Training(
             epochs=settings.finetune.step2.epochs,
-            seconds_per_epoch=pace,
             step1=coarse,
             step2=cost,
             seconds=cost.seconds + (coarse.seconds if coarse else 0.0),
@@ -126,6 +124,8 @@ class Worker(FileWorker):
 
     def _pace(self, task: Step1Task | CellTask) -> float:
         """Seconds of one epoch: the second of two (the first warms up), kept for the row's other seeds."""
+        from dnrtrain.checkpoint import finished_record
+
         task.pace.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(f"{task.pace}.lock"):  # cells side by side train by one figure, not by one each
             if not task.pace.exists():
@@ -200,17 +200,10 @@ def _with_epochs(settings: Settings, epochs: int) -> Settings:
     return changed
 
 
-def finished_record(folder: Path) -> ModelRecord:
-    """Of a training that has just finished."""
-    from dnrtrain.checkpoint import read_record
-
-    record = read_record(folder)
-    assert record is not None
-    return record
-
-
 def training_cost(folder: Path) -> TrainingCost:
     """Sums over all epochs, those of an interrupted run included, and what the choice at the end took."""
+    from dnrtrain.checkpoint import finished_record
+
     record = finished_record(folder)
     cost: dict[str, Any] = {
         name: sum(getattr(epoch, name) for epoch in record.history) + record.choosing.get(name, 0)

@@ -12,7 +12,7 @@ import numpy as np
 from dnrtrain.exr import read_metadata
 
 from ...core.errors import UserError
-from ...core.images import flip_error, picture_of, write_png
+from ...core.images import flip_error, mean_known, picture_of, write_png
 from ...core.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -126,5 +126,5 @@ METRICS = ("psnr", "psnr_mask", "ssim", "ssim_mask", "lpips_vgg", "lpips_alex", 
 
 def mean_of(tests: list[dict[str, Any]], name: str) -> float | None:
     """Mean of a metric over the test views that have it."""
-    values = [test[name] for test in tests if test[name] is not None]
-    return round(float(np.mean(values)), 5) if values else None
+    mean = mean_known(test[name] for test in tests)
+    return None if mean is None else round(mean, 5)

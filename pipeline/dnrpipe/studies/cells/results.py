@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-import os
 import platform
 import shlex
 import statistics
@@ -18,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from ...core.errors import UserError
-from ...core.machine import processor
+from ...core.machine import memory_bytes, processor
 from ...workers.view_tasks import worker_count
 
 PACKAGES = ("dnrpipe", "torch", "numpy", "mitsuba", "bpy", "flip-evaluator")
@@ -42,6 +41,7 @@ def read_made(path: Path, command: str, schema: int, part: str) -> dict[str, Any
 
 def made_by() -> dict[str, Any]:
     """What results say of their making: command, commit, date, machine, versions."""
+    memory = memory_bytes()
     return {
         "command": shlex.join(["dnrpipe", *sys.argv[1:]]),
         **code_state(),
@@ -49,7 +49,7 @@ def made_by() -> dict[str, Any]:
         "machine": {
             "processor": processor(),
             "cores": worker_count(0),  # that this process may use
-            "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
+            "memory_gib": None if memory is None else round(memory / 2**30, 1),
             "system": f"{platform.system()} {platform.machine()}",
         },
         "versions": {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}},
@@ -94,6 +94,11 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table; all columns but the first are right-aligned."""
     lines = [head, ["---", *["---:"] * (len(head) - 1)], *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def number(value: float | None, digits: int) -> str:
+    """A table's cell."""
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def made_line(results: Mapping[str, Any]) -> str:

@@ -137,10 +137,9 @@ class CellTask(TrainingTask):
 
 
 class Training(BaseModel):
-    """What a cell's training took. seconds_per_epoch: of step 2, where seconds limited it."""
+    """What a cell's training took."""
 
     epochs: int
-    seconds_per_epoch: float | None
     step1: Step1Result | None
     step2: TrainingCost
     seconds: float

@@ -54,26 +54,29 @@ METHODS: dict[str, Method] = {
 }
 
 
-@dataclass
-class Baseline:
-    """One way of path tracing: milliseconds of its parts and display pictures, view by view.
+@dataclass(kw_only=True)
+class Ran:
+    """One renderer's frames: milliseconds of the parts and display pictures, view by view."""
 
-    masked: pixels of them that were not finite, and are black.
-    """
+    parts: dict[str, list[float]] = field(default_factory=dict)
+    pictures: list[Any] = field(default_factory=list)
+
+    def ms(self) -> float:
+        """Median over the views of the sum of the parts."""
+        return float(np.median(np.sum(list(self.parts.values()), axis=0)))
+
+
+@dataclass
+class Baseline(Ran):
+    """One way of path tracing. masked: pixels of its pictures that were not finite, and are black."""
 
     spp: int
     method: str
-    parts: dict[str, list[float]] = field(default_factory=dict)
-    pictures: list[Any] = field(default_factory=list)
     masked: int = 0
 
     @property
     def name(self) -> str:
         return f"{self.spp} spp {self.method}"
-
-    def ms(self) -> float:
-        """Median over the views of the sum of the parts."""
-        return float(np.median(np.sum(list(self.parts.values()), axis=0)))
 
 
 def make_baselines(sample_counts: Sequence[int], methods: Sequence[str] = tuple(METHODS)) -> dict[str, Baseline]:

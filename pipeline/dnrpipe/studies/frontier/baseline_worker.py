@@ -7,7 +7,6 @@ by its own converged picture: with as many samples as ours, raw, with another se
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from dnrtrain.exr import read_exr
 from dnrtrain.perceptual import build_lpips
 
 from ...blender.tasks import CyclesAnswer
-from ...core.images import over_white
+from ...core.images import mean_known, over_white, read_rgba
 from ...core.scene_files import read_frame, read_record, split_views
 from ...core.workspace import Workspace
 from ...stages.trainer import perceptual_weights
@@ -54,7 +53,7 @@ class Worker(FileWorker):
         for number, view in enumerate(views):
             render_baselines(scene, view, 10_007 * (number + 1), clock, baselines)
         names = [view.name for view in views]
-        judge = Judge(workspace, names, [scene.shown(_read_rgba(workspace.raytraced("test", name))) for name in names])
+        judge = Judge(workspace, names, [scene.shown(read_rgba(workspace.raytraced("test", name))) for name in names])
         points = [
             BaselinePoint(
                 name=baseline.name,
@@ -81,7 +80,7 @@ class Worker(FileWorker):
         display = DisplayTransform(read_frame(workspace), workspace.scene)
 
         def pictures(name: str) -> list[Any]:
-            return [over_white(display, _read_rgba(task.folder / name / f"{view}.exr")) for view in task.views]
+            return [over_white(display, read_rgba(task.folder / name / f"{view}.exr")) for view in task.views]
 
         judge = Judge(workspace, task.views, pictures("reference"))
         points = [
@@ -110,13 +109,4 @@ class Judge:
     def means(self, pictures: list[Any]) -> dict[str, Any]:
         """Means over the views of the metrics that cells have; None where no view has one."""
         rows = [view_metrics(one, *known, self.lpips) for one, known in zip(pictures, self.known, strict=True)]
-        return {
-            key: float(np.mean(values)) if (values := [row[key] for row in rows if row[key] is not None]) else None
-            for key in rows[0]
-        }
-
-
-def _read_rgba(path: Path) -> np.ndarray:
-    """RGBA of a picture's file, [H, W, 4]."""
-    channels, _ = read_exr(path)
-    return np.stack([channels[channel] for channel in "RGBA"], axis=-1)
+        return {key: mean_known(row[key] for row in rows) for key in rows[0]}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from ...core.units import duration
+from ..cells.results import number
 from .point_costs import pareto, total_seconds
 from .records import FrontierResults
 
@@ -35,8 +36,8 @@ def _front(results: FrontierResults, frames: int) -> list[str]:
         one = everything[name]
         lines.append(
             f"| {name} | {total_seconds(one, frames):.1f} | {one.upfront:.1f} |"
-            f" {one.ms:.1f} | {one.psnr:.2f} | {_number(one.ssim, 4)} |"
-            f" {_number(one.lpips_vgg, 4)} | {_number(one.flip, 4)} |"
+            f" {one.ms:.1f} | {one.psnr:.2f} | {number(one.ssim, 4)} |"
+            f" {number(one.lpips_vgg, 4)} | {number(one.flip, 4)} |"
         )
     return [*lines, "", verdict(results, frames)]
 
@@ -83,7 +84,3 @@ def _break_even(results: FrontierResults) -> list[str]:
             f" {p.frame_ms:.1f} | {p.psnr:.2f} | {level} | {even} |"
         )
     return lines
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"

@@ -22,7 +22,6 @@ from ...core.settings import Settings
 from ...core.workspace import Workspace
 from ...stages.trainer import perceptual_weights, torch_device
 from ...stages.trust import best_share
-from ..cells.cell import finished_record
 from .records import Record
 
 if TYPE_CHECKING:
@@ -105,6 +104,7 @@ class Worker:
         return found[-1] | {"steps": [one["steps"] for one in found], "threads": self.threads}
 
     def _train_one(self, task: TrainTask, weights: Any, folder: Path, epochs: int) -> dict[str, Any]:
+        from dnrtrain.checkpoint import finished_record, step_seconds
         from dnrtrain.events import EpochEnd
         from dnrtrain.step2 import run_step2
 
@@ -133,13 +133,12 @@ class Worker:
                 last = now
         took = time.monotonic() - started
         between, cpu_between = np.maximum(0.0, np.median(gaps, axis=0)).tolist()
-        history = finished_record(folder).history
-        later = history[1:] or history  # the first epoch warms up
-        steps = sum(entry.steps for entry in later)
+        record = finished_record(folder)
+        (seconds, cpu_seconds), history = step_seconds(record), record.history
         booked = sum(entry.seconds for entry in history)
         return {
-            "seconds": sum(entry.seconds for entry in later) / steps,
-            "cpu_seconds": sum(entry.cpu_seconds for entry in later) / steps,
+            "seconds": seconds,
+            "cpu_seconds": cpu_seconds,
             "between": between,
             "cpu_between": cpu_between,
             "startup": max(0.0, took - booked - between * len(history)),

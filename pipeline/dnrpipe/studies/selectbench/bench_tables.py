@@ -97,10 +97,10 @@ def _overall(figures: Figures, budget: int) -> str:
     others = [pool for pool in figures.pools if pool not in SPHERICAL]
     rows = []
     for policy in figures.policies:
-        found = [figures.against(policy, kind, figures.pools, budget, "psnr") for kind in ("random", "simple")]
+        found = [figures.against(policy, kind, figures.pools, budget) for kind in ("random", "simple")]
         line = [f"`{policy}`", *[difference(one) for one in found], _worst(found[1])]
         if 0 < len(others) < len(figures.pools):
-            line.append(difference(figures.against(policy, "simple", others, budget, "psnr")))
+            line.append(difference(figures.against(policy, "simple", others, budget)))
         rows.append(line)
     head = ["policy", "Δ to `random`", "Δ to each pool's best simple rule", "worst scene"]
     if 0 < len(others) < len(figures.pools):
@@ -117,8 +117,8 @@ def _pool(figures: Figures, pool: str, budget: int) -> str:
     for policy in present:
         line = [f"`{policy}`"]
         line += [spread(figures.means(pool, budget, policy, metric), digits) for metric, _, digits in METRICS]
-        line.append(difference(figures.against(policy, "random", [pool], budget, "psnr")))
-        found = figures.against(policy, "simple", [pool], budget, "psnr")
+        line.append(difference(figures.against(policy, "random", [pool], budget)))
+        found = figures.against(policy, "simple", [pool], budget)
         line += ["the best rule", ""] if policy == best else [difference(found), _worst(found)]
         for metric, _, digits in TIMES:
             means = figures.means(pool, budget, policy, metric)

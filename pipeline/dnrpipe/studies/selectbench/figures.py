@@ -54,8 +54,8 @@ class Figures:
             return None
         return max(found, key=lambda name: statistics.fmean(found[name][place] for place in shared))
 
-    def against(self, policy: str, kind: str, pools: Sequence[str], budget: int, metric: str) -> Difference | None:
-        """policy - baseline, each pool with its own: ``random``, or its best simple rule for kind ``simple``.
+    def against(self, policy: str, kind: str, pools: Sequence[str], budget: int) -> Difference | None:
+        """PSNR: policy - baseline, each pool with its own: ``random``, or its best simple rule for kind ``simple``.
 
         Over several pools it is the mean of each (scene, seed) over them. None where they share nothing, or where the
         policy is the baseline everywhere; where it is the baseline in some pools, these count as 0.
@@ -66,7 +66,7 @@ class Figures:
             return None
         found: dict[tuple[str, int], list[float]] = {}
         for pool, baseline in baselines.items():
-            ours, theirs = (self.values(pool, budget, name, metric) for name in (policy, baseline))
+            ours, theirs = (self.values(pool, budget, name, "psnr") for name in (policy, baseline))
             for place in ours.keys() & theirs.keys():
                 found.setdefault(place, []).append(ours[place] - theirs[place])
         whole = {place: statistics.fmean(pairs) for place, pairs in found.items() if len(pairs) == len(baselines)}
