@@ -14,7 +14,7 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 
-from dnrpipe.raytrace.plugins.energy import fresnel
+from dnrpipe.core.optics import fresnel
 
 from ..bundle import xmltree
 from .textures import Placement, Textured, Value, constant

@@ -15,21 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from ...core.optics import fresnel
+
 COSINES, ROUGHNESSES = 32, 32
 STRATA = 24
 MIN_ALPHA = 1e-3
-
-
-def fresnel(cosine: np.ndarray, eta: float) -> np.ndarray:
-    """Unpolarised reflectance of a dielectric interface; 1 under total reflection.
-
-    eta: index beyond the surface over index on the side of the view.
-    """
-    g2 = eta * eta - 1 + cosine * cosine
-    g = np.sqrt(np.maximum(g2, 0))
-    parallel = (g - cosine) / np.maximum(g + cosine, 1e-9)
-    ratio = (cosine * (g + cosine) - 1) / np.maximum(cosine * (g - cosine) + 1, 1e-9)
-    return np.where(g2 > 0, 0.5 * parallel**2 * (1 + ratio**2), 1.0)
 
 
 def average_fresnel(eta: float) -> float:
