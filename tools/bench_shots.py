@@ -328,8 +328,23 @@ def equal_rung(row: dict[str, Any], names: Sequence[str]) -> dict[str, Any] | No
         for rung, it_is in zip(row["rungs"], same, strict=True)
         if it_is or as_good(rung, row["ours"], names)
     ]
-    enough += [{**rung, "cycles": True} for rung in row.get("cycles", []) if as_good(rung, row["ours"], names)]
+    enough += [rung for rung in of_cycles(row) if as_good(rung, row["ours"], names)]
     return min(enough, key=lambda rung: rung["frame"], default=None)
+
+
+def last_rung(row: dict[str, Any]) -> dict[str, Any]:
+    """Of the most samples, denoised best; of both tracers' the quicker: what is as good takes longer than that."""
+    return min((rungs[-1] for rungs in (row["rungs"], of_cycles(row)) if rungs), key=lambda rung: rung["frame"])
+
+
+def of_cycles(row: dict[str, Any]) -> list[dict[str, Any]]:
+    """The row's rungs of Cycles, which know it."""
+    return [{**rung, "cycles": True} for rung in row.get("cycles", [])]
+
+
+def named(rung: dict[str, Any]) -> str:
+    """As ``8 spp, high`` or ``Cycles, 8 spp, high``."""
+    return f"{'Cycles, ' if 'cycles' in rung else ''}{rung['spp']} spp, {rung['quality']}"
 
 
 def as_good(rung: dict[str, Any], own: dict[str, Any], names: Sequence[str]) -> bool:
@@ -361,12 +376,11 @@ def _table(machine: str, rows: Sequence[dict[str, Any]]) -> str:
         cells = [row["scene"], row["size"], way, f"{row['before']:.0f}", f"{row['frame']:.2f}"]
         cells += [f"{own['psnr']:.2f}", f"{own['lpips']:.4f}", f"{own['flip']:.4f}", f"{own['flicker']:.4f}"]
         if rung is None:
-            last = row["rungs"][-1]  # of the most samples, denoised best
-            cells += [f"not by {last['spp']} spp", f"> {last['frame']:.2f}", f"{last['flicker']:.4f}"]
+            last = last_rung(row)
+            cells += [f"not by {named(last)}", f"> {last['frame']:.2f}", f"{last['flicker']:.4f}"]
             cells += [f"{ours:.0f}", f"> {REEL * last['frame']:.0f}", f"< {ours / (REEL * last['frame']):.2f}"]
         else:
-            tracer = "Cycles, " if "cycles" in rung else ""
-            cells += [f"{tracer}{rung['spp']} spp, {rung['quality']}", f"{rung['frame']:.2f}", f"{rung['flicker']:.4f}"]
+            cells += [named(rung), f"{rung['frame']:.2f}", f"{rung['flicker']:.4f}"]
             cells += [f"{ours:.0f}", f"{REEL * rung['frame']:.0f}", f"{ours / (REEL * rung['frame']):.2f}"]
         cells += [break_even(row, name) for name in ("psnr", "lpips")]
         lines.append(f"| {' | '.join(cells)} |")
@@ -376,7 +390,7 @@ def _table(machine: str, rows: Sequence[dict[str, Any]]) -> str:
 def break_even(row: dict[str, Any], name: str) -> str:
     """N*: from how many frames on the shot is cheaper than path tracing as good by the figure."""
     rung = equal_rung(row, (name,))
-    traced = (rung or row["rungs"][-1])["frame"]
+    traced = (rung or last_rung(row))["frame"]
     fewest = break_even_frames(row["before"], traced, row["frame"])
     return "never" if fewest is None else f"{fewest}" if rung else f"< {fewest}"
 

@@ -1,0 +1,65 @@
+"""The shot benchmark's arithmetic: which path tracing is as good, and what the table makes of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from tools.bench_shots import REEL, equal_rung, markdown
+
+
+def figures(psnr: float, lpips: float) -> dict[str, float]:
+    return {"psnr": psnr, "ssim": 0.9, "lpips": lpips, "flip": 0.05, "flicker": 0.01}
+
+
+def rung(spp: int, frame: float, psnr: float, lpips: float, quality: str = "high") -> dict[str, Any]:
+    return {"spp": spp, "quality": quality, "frame": frame, **figures(psnr, lpips)}
+
+
+def row(**changes: Any) -> dict[str, Any]:
+    """A shot by base images of 30 dB / .05: 100 s before its first frame, 2 s a frame."""
+    return {
+        "scene": "a",
+        "size": "640x360",
+        "machine": "M",
+        "before": 100.0,
+        "frame": 2.0,
+        "chosen": {"way": {"name": "base", "spp": 8}},
+        "ours": figures(30.0, 0.05),
+        "rungs": [rung(4, 2.0, 29.0, 0.06), rung(8, 4.0, 31.0, 0.06), rung(16, 8.0, 33.0, 0.04)],
+        **changes,
+    }
+
+
+def cells(found: dict[str, Any]) -> list[str]:
+    return [cell.strip() for cell in markdown({"rows": [found]}).splitlines()[-1].strip("|").split("|")]
+
+
+def test_path_tracing_must_be_as_good_in_both() -> None:
+    assert (equal_rung(row(), ("psnr", "lpips")) or {})["spp"] == 16
+    assert (equal_rung(row(), ("psnr",)) or {})["spp"] == 8
+    assert cells(row())[9] == "16 spp, high"
+    assert float(cells(row())[14]) == pytest.approx((100 + REEL * 2) / (REEL * 8), abs=0.01)
+
+
+def test_the_rival_is_the_cheaper_of_the_two_path_tracers() -> None:
+    quick, slow = rung(32, 3.0, 30.5, 0.05, "fast"), rung(32, 9.0, 30.5, 0.05)
+    assert cells(row(cycles=[slow]))[9] == "16 spp, high"
+    found = cells(row(cycles=[rung(16, 1.0, 29.9, 0.01), quick]))
+    assert found[9:11] == ["Cycles, 32 spp, fast", "3.00"]
+    assert float(found[14]) == pytest.approx((100 + REEL * 2) / (REEL * 3), abs=0.01)
+
+
+def test_a_path_traced_shot_is_as_good_as_the_rung_that_it_is() -> None:
+    """At its own seconds: a rung's few frames vary; and none of the rungs need look as good as the shot by chance."""
+    way = {"way": {"name": "path", "spp": 4}}
+    assert equal_rung(row(chosen=way, frame=2.2), ("psnr", "lpips")) == rung(4, 2.2, 29.0, 0.06)
+
+
+def test_where_nothing_is_as_good_the_last_rungs_bound_the_ratio() -> None:
+    """Either tracer would take longer than its last rung: than the quicker of these at least."""
+    poor = row(ours=figures(40.0, 0.01))
+    assert cells(poor)[9] == "not by 16 spp, high" and cells(poor)[10] == "> 8.00"
+    found = cells(poor | {"cycles": [rung(64, 5.0, 35.0, 0.02)]})
+    assert found[9] == "not by Cycles, 64 spp, high" and found[10] == "> 5.00"
+    assert float(found[14].removeprefix("< ")) == pytest.approx((100 + REEL * 2) / (REEL * 5), abs=0.01)
