@@ -140,7 +140,8 @@ def test_pieces_of_a_table_add_up_and_others_do_not() -> None:
 
 def test_cells_of_another_device_are_told_apart() -> None:
     whole = json.loads((paper_tables.RESULTS / "paper-steps.json").read_text())
-    cells = {row: [cell for cell in whole["cells"] if cell["row"] == row] for row in ("paper", "vanilla")}
+    known = [{name: value for name, value in cell.items() if name != "device"} for cell in whole["cells"]]
+    cells = {row: [cell for cell in known if cell["row"] == row] for row in ("paper", "vanilla")}
     first = {**whole, "cells": cells["paper"], "device": "cuda"}
     other = {**whole, "cells": cells["vanilla"], "device": "cpu", "command": "another"}
     with pytest.raises(ValueError, match="device"):
@@ -150,6 +151,10 @@ def test_cells_of_another_device_are_told_apart() -> None:
     assert {cell["device"] for cell in both["cells"] if cell["row"] == "vanilla"} == {"cpu"}
     told = [line for line in markdown(both).splitlines() if "(trained on cpu)" in line]
     assert told and all("DNR (Thies" in line for line in told)
+    # The same place trained on the other device changes nothing: the results' own device counts.
+    again = {**other, "cells": [{**cell, "psnr": 0.0} for cell in cells["paper"]]}
+    kept = paper_tables.added(first, again, mixed=True)["cells"]
+    assert len(kept) == len(cells["paper"]) and all(cell["device"] == "cuda" and cell["psnr"] > 0 for cell in kept)
 
 
 def test_the_papers_numbers_are_the_papers() -> None:

@@ -44,6 +44,7 @@ from dnrpipe.stages.shots.render_frames import FRAMES_FOLDER, frame_outcomes
 from dnrpipe.stages.shots.renderers import path_tracer
 from dnrpipe.stages.stage import Run
 from dnrpipe.workers.task_list import run_tasks
+from dnrpipe.workers.view_tasks import worker_count
 from dnrtrain.atomic import write_json
 from dnrtrain.contract import View, write_cameras
 from dnrtrain.exr import read_exr
@@ -91,10 +92,9 @@ def main() -> None:
             }
             rows.append(row)
             write_json(options.out, {"rows": sorted(rows, key=lambda row: row["scene"])})
-        elif "cycles" in row or row["machine"] != processor() or not (root / "beside").exists():
+        elif "cycles" in row or row["machine"] != processor() or not reference_of(root).exists():
             continue
-        if "cycles" not in row:
-            row["cycles"] = by_cycles(root, options.frames, row["ours"])
+        row["cycles"] = by_cycles(root, options.frames, row["ours"])
         write_json(options.out, {"rows": sorted(rows, key=lambda row: row["scene"])})
     print(markdown({"rows": rows}))
 
@@ -214,7 +214,7 @@ def by_cycles(root: Path, frames: int, ours: dict[str, float]) -> list[dict[str,
     lpips, display = lpips_of(run), display_of(run)
     pairs = [(i - 1, i) for i in places(frames)]
     numbers = sorted({number for pair in pairs for number in pair})
-    files = {n: folder_of_rung(root, REFERENCE.spp, REFERENCE.quality, TAKES[0]) / f"{n:05d}.exr" for n in numbers}
+    files = {n: reference_of(root) / f"{n:05d}.exr" for n in numbers}
     views = {n: View.model_validate(read_exr(path)[1]["view"]) for n, path in files.items()}
     surfaces = {n: surface_of(views[n], path) for n, path in files.items()}
     folder = root / "beside" / "cycles"
@@ -232,7 +232,7 @@ def by_cycles(root: Path, frames: int, ours: dict[str, float]) -> list[dict[str,
         )
         task.folder.mkdir(parents=True, exist_ok=True)
         worker = "dnrpipe.blender.passes.cycles_frames"
-        (outcome,) = run_tasks(worker, {"threads": 0}, [task.data()], workers=1, log=run.log)
+        (outcome,) = run_tasks(worker, {"threads": worker_count(0)}, [task.data()], workers=1, log=run.log)
         if outcome.result is None:
             raise SystemExit(f"Cycles: {outcome.error}")
         return CyclesAnswer.model_validate(outcome.result)
@@ -267,6 +267,11 @@ def places(frames: int) -> tuple[int, int]:
 def root_of(folder: Path, scene: str, size: str) -> Path:
     """A shot's workspace."""
     return folder / f"{scene}-{size}.dnr"
+
+
+def reference_of(root: Path) -> Path:
+    """A reference's first picture of each frame that is compared."""
+    return folder_of_rung(root, REFERENCE.spp, REFERENCE.quality, TAKES[0])
 
 
 def folder_of_rung(root: Path, spp: int, denoiser: str, take: int) -> Path:

@@ -69,7 +69,8 @@ SAME = ("schema", "preset", "resolution", "seconds", "spp", "budget", "candidate
 def added(old: dict[str, Any], new: dict[str, Any], *, mixed: bool = False) -> dict[str, Any]:
     """Results with the cells of both, those of ``new`` where both have one. Raises ValueError: not of one table.
 
-    mixed: the cells may be of two devices, and each says of which; machine, commit and date are ``old``'s.
+    mixed: the cells may be of two devices, and each says of which; machine, commit and date are ``old``'s. Where both
+    have a cell of other devices, ``old``'s stays.
     """
     for name in SAME if mixed else (*SAME, *DEVICE):
         if old.get(name) != new.get(name):
@@ -77,7 +78,10 @@ def added(old: dict[str, Any], new: dict[str, Any], *, mixed: bool = False) -> d
     cells = (*old["cells"], *new["cells"])
     if mixed:
         cells = tuple({"device": of["device"], **cell} for of in (old, new) for cell in of["cells"])
-    places = {_place(cell): cell for cell in cells}
+    places: dict[tuple[Any, ...], dict[str, Any]] = {}
+    for cell in cells:
+        if places.setdefault(_place(cell), cell).get("device") == cell.get("device"):
+            places[_place(cell)] = cell
     whole = {**(old if mixed else new), "cells": list(places.values())}
     whole["seeds"] = len({cell["seed"] for cell in places.values()})
     whole["command"] = "; ".join(dict.fromkeys(part for of in (old, new) for part in of["command"].split("; ")))
@@ -121,13 +125,10 @@ def main() -> int:
         )
         return 2
     command = [sys.executable, "-m", "dnrpipe.cli", *table.command, *size, *more, "--out", str(out)]
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # `timeout` sends it to the run, too: both end in order
-    process = subprocess.Popen(command)
-    try:
-        code = process.wait()
-    except KeyboardInterrupt:
-        process.wait()
-        code = 130
+    process = subprocess.Popen(command, start_new_session=True)  # it hears of Ctrl-C and `timeout` once, by us
+    for name in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(name, lambda *_: process.terminate())
+    code = process.wait()
     if made.exists():
         results = json.loads(made.read_text())
         RESULTS.mkdir(parents=True, exist_ok=True)

@@ -47,7 +47,7 @@ def main() -> None:
 
 
 def strip(row: dict[str, Any], root: Path) -> Image.Image:
-    """A scene: three pictures with their figures, and what is cut out of them."""
+    """A scene: three pictures with their figures, and what is cut out of them. The rival is Mitsuba's."""
     number = places(row["frames"])[0]
     rivals = [rung for rung in row["rungs"] if rung["frame"] <= row["frame"]]
     rival = max(rivals, key=lambda rung: rung["psnr"]) if rivals else min(row["rungs"], key=lambda rung: rung["frame"])

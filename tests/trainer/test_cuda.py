@@ -6,14 +6,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from test_losses import random_weights
 
 from conftest import Scene
 from dnrtrain.checkpoint import load_model
 from dnrtrain.events import EpochEnd, Selected
 from dnrtrain.metrics import psnr
 from dnrtrain.model import render_views
-from dnrtrain.perceptual import PerceptualLoss
+from dnrtrain.perceptual import PerceptualLoss, random_weights
 from dnrtrain.settings import LossWeights, ModelSettings, Step1Settings, Step2Settings
 from dnrtrain.step1 import run_step1
 from dnrtrain.step2 import run_step2

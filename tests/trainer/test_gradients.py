@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_losses import random_weights
 from torch import Tensor
 from torch.autograd import gradcheck
 
@@ -24,7 +23,7 @@ from dnrtrain.dataset import Batch
 from dnrtrain.display import DisplayTransform, srgb_oetf
 from dnrtrain.metrics import psnr, psnr_masked, ssim_masked
 from dnrtrain.model import DNR, compose
-from dnrtrain.perceptual import Lpips, PerceptualLoss
+from dnrtrain.perceptual import Lpips, PerceptualLoss, random_weights
 from dnrtrain.settings import ModelSettings, Step2Settings
 from dnrtrain.textures import TexturePyramid, apply_harmonics, depth_coordinate, octahedral, spherical_harmonics
 

@@ -7,11 +7,10 @@ import math
 import numpy as np
 import pytest
 import torch
-from test_losses import random_weights
 
 from dnrtrain import perceptual
 from dnrtrain.metrics import image_metrics, psnr, psnr_masked, ssim, ssim_map, ssim_masked
-from dnrtrain.perceptual import Lpips, build_lpips
+from dnrtrain.perceptual import Lpips, build_lpips, random_weights
 from dnrtrain.weights import WeightsMissing, load_weights
 
 

@@ -241,6 +241,7 @@ class CyclesTask(Task):
 
     Args:
         methods: of `cycles_frames.METHODS`; none: all.
+        seed: of the views' numbers; the reference's is the next one.
         background: the world stands behind everything, else nothing.
         folder: for the pictures: ``NAME/VIEW.exr``, linear Rec.709, premultiplied RGBA.
         output: for the answer, as JSON.

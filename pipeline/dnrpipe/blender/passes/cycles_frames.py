@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,8 @@ METHODS: dict[str, tuple[str, str] | None] = {
 }
 """Blender's Open Image Denoise: (prefilter of albedo and normal, quality); ``denoised`` is Blender's default."""
 REFERENCE = "reference"
+SEEDS = 1 << 16
+"""Between the numbers of two pictures of a view."""
 
 
 class Worker:
@@ -52,22 +54,25 @@ class Worker:
         seconds: dict[str, list[float]] = {}
         for spp in task.samples:
             for method in task.methods or METHODS:
-                _sampling(scene, spp, task.seed, METHODS[method])
+                _sampling(scene, spp, METHODS[method])
                 name = f"{spp} spp {method}"
-                ms[name], seconds[name] = self._frames(draw, task.views, task.folder / name)
+                ms[name], seconds[name] = self._frames(draw, task, name, task.seed)
         if task.reference_spp is not None:
-            _sampling(scene, task.reference_spp, task.seed + 1, None)
-            self._frames(draw, task.views, task.folder / REFERENCE, warm=False)
+            _sampling(scene, task.reference_spp, None)
+            self._frames(draw, task, REFERENCE, task.seed + 1, warm=False)
         return CyclesAnswer(threads=self.threads, ms=ms, seconds=seconds)
 
     def _frames(
-        self, draw: Callable[[View, Path], None], views: Sequence[View], folder: Path, warm: bool = True
+        self, draw: Callable[[View, Path], None], task: CyclesTask, name: str, seed: int, warm: bool = True
     ) -> tuple[list[float], list[float]]:
+        """Render the views, each with numbers of its own -> milliseconds and seconds of a `CyclesAnswer`."""
+        folder = task.folder / name
         folder.mkdir(parents=True, exist_ok=True)
         if warm:
-            draw(views[0], folder / f"{views[0].name}.exr")
+            draw(task.views[0], folder / f"{task.views[0].name}.exr")
         ms, seconds = [], []
-        for view in views:
+        for place, view in enumerate(task.views):
+            bpy.context.scene.cycles.seed = seed * SEEDS + place
             wall, cpu = time.monotonic(), time.process_time()
             draw(view, folder / f"{view.name}.exr")
             ms.append(1000 * (time.process_time() - cpu) / self.threads)
@@ -77,7 +82,7 @@ class Worker:
 
 def _sampling(scene: bpy.types.Scene, samples: int, seed: int, denoiser: tuple[str, str] | None) -> None:
     cycles = scene.cycles
-    cycles.samples, cycles.seed = samples, seed
+    cycles.samples = samples
     cycles.use_denoising = denoiser is not None
     if denoiser is None:
         return

@@ -19,9 +19,8 @@ from .rows import GROUPS, ROWS
 SCHEMA = 1
 read_results = functools.partial(read_made, command="ablate", schema=SCHEMA, part="cells")
 DIFFERENCES = (("psnr", 2), ("ssim", 4), ("lpips_vgg", 4))
-METRICS: tuple[str, ...] = ("psnr", "ssim", "lpips_vgg")
 COMPARED = (("psnr", "PSNR", 2), ("ssim", "SSIM", 4), ("lpips_vgg", "LPIPS VGG", 4), ("lpips_alex", "LPIPS Alex", 4))
-# Wu, Li, Wei: DNRSelect, table I (25 views, NeRF-Synthetic, 800²): PSNR, SSIM, LPIPS.
+# Wu, Li, Wei: DNRSelect, table I (25 views, NeRF-Synthetic, 800²): PSNR, SSIM, LPIPS; of which network it does not say.
 PUBLISHED = {
     "full": (28.12, 0.8506, 0.0479),
     "paper-no-augmentation": (26.64, 0.8179, 0.0542),
@@ -58,7 +57,8 @@ class Figures:
         for name in present:
             devices = {cell["device"] for cell in results["cells"] if cell["row"] == name and "device" in cell}
             if others := sorted(devices - {results.get("device")}):
-                self.what = {**self.what, name: f"{self.what[name]} (trained on {', '.join(others)})"}
+                part = "in part " if results.get("device") in devices else ""
+                self.what = {**self.what, name: f"{self.what[name]} ({part}trained on {', '.join(others)})"}
         self.rows = [name for name in ROWS if name in present] + [name for name in present if name not in ROWS]
         self.cells = {(cell["scene"], cell["row"], cell["seed"]): cell for cell in results["cells"]}
         self.scenes = [name for name in results["scenes"] if any(key[0] == name for key in self.cells)]
@@ -195,15 +195,14 @@ def _paper(figures: Figures) -> str:
 
 def _claims(figures: Figures, row: str, other: str) -> list[list[str]]:
     """A line for each metric: row - other, what the paper has, each scene's."""
-    known = row in PUBLISHED and other == "paper"
-    published, full = (dict(zip(METRICS, PUBLISHED[name], strict=True)) for name in (row if known else "full", "full"))
+    known = PUBLISHED.get(row) if other == "paper" else None
     lines: list[list[str]] = []
     for metric, title, digits in COMPARED:
         found = figures.difference(row, other, metric)
         if found is None:
             continue
-        of = "lpips_vgg" if metric == "lpips_alex" else metric  # the paper does not say of which network its LPIPS is
-        theirs = published[of] - full[of] if known else None
+        place = ("psnr", "ssim", "lpips").index(metric.partition("_")[0])
+        theirs = known[place] - PUBLISHED["full"][place] if known else None
         lines.append([
             *([figures.what[row], f"`{other}`", str(found.pairs)] if not lines else ["", "", ""]),
             *(title, difference(found, digits), NONE if theirs is None else f"{theirs:+.{digits}f}"),

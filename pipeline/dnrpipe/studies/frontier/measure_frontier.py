@@ -40,7 +40,7 @@ from .records import (
     PathTracingTask,
 )
 
-BASELINE_VERSION, CYCLES_VERSION = 1, 1
+BASELINE_VERSION, CYCLES_VERSION = 1, 2
 BASELINE_WORKER = "dnrpipe.studies.frontier.baseline_worker"
 CYCLES = "cycles"
 OTHERS = ("random", "all", "paper")
