@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -165,6 +166,10 @@ def test_a_proxy_is_believed_where_it_is_named(closed: Server, tmp_path: Path) -
         forged = token | {"X-Forwarded-For": "203.0.113.7"}
         assert httpx.get(f"{closed.url}/healthz", headers=forged).status_code == 200
         assert httpx.get(f"{behind.url}/healthz", headers=forged).status_code == 200
+        for _ in range(200):  # the line is written once the answer is sent
+            if "203.0.113.7" in behind.log.read_text():
+                break
+            time.sleep(0.05)
         assert "203.0.113.7" not in closed.log.read_text() and "203.0.113.7" in behind.log.read_text()
         for headers, status in (
             ({"X-Forwarded-Host": "render.example.org", "Origin": public}, 200),

@@ -72,7 +72,8 @@ class Walker:
         """
         s, agent = self.settings, self.agent
         if episode == 0:
-            self.largest_reward = self.largest_value = 0.0
+            # What it learned of earlier, larger rewards is no divergence: their running mean counts, too.
+            self.largest_reward, self.largest_value = self.unit or 0.0, 0.0
         random = step_random(self.seed, STEP1, epoch, episode)
         epsilon = epsilon_at(epoch, s.epochs, s.epsilon_start, s.epsilon_end)
         selected = torch.zeros(self.count, dtype=torch.bool, device=self.device)

@@ -80,7 +80,7 @@ class Worker:
         return ms, seconds
 
 
-def _sampling(scene: bpy.types.Scene, samples: int, seed: int, denoiser: tuple[str, str] | None) -> None:
+def _sampling(scene: bpy.types.Scene, samples: int, denoiser: tuple[str, str] | None) -> None:
     cycles = scene.cycles
     cycles.samples = samples
     cycles.use_denoising = denoiser is not None
