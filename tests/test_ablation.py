@@ -155,6 +155,10 @@ def test_cells_of_another_device_are_told_apart() -> None:
     again = {**other, "cells": [{**cell, "psnr": 0.0} for cell in cells["paper"]]}
     kept = paper_tables.added(first, again, mixed=True)["cells"]
     assert len(kept) == len(cells["paper"]) and all(cell["device"] == "cuda" and cell["psnr"] > 0 for cell in kept)
+    # And trained on it again, a cell of either device gives way.
+    redone = {**both, "cells": [{**cell, "psnr": 0.0} for cell in known if cell["row"] in cells]}
+    made = paper_tables.added(both, redone)["cells"]
+    assert len(made) == len(both["cells"]) and all(cell["device"] == "cuda" and cell["psnr"] == 0 for cell in made)
 
 
 def test_the_papers_numbers_are_the_papers() -> None:

@@ -91,12 +91,17 @@ def main() -> None:
                 **measured(scene.resolve(), root, size, options.frames),
             }
             rows.append(row)
-            write_json(options.out, {"rows": sorted(rows, key=lambda row: row["scene"])})
+            save(options.out, rows)
         elif "cycles" in row or row["machine"] != processor() or not reference_of(root).exists():
             continue
         row["cycles"] = by_cycles(root, options.frames, row["ours"])
-        write_json(options.out, {"rows": sorted(rows, key=lambda row: row["scene"])})
+        save(options.out, rows)
     print(markdown({"rows": rows}))
+
+
+def save(path: Path, rows: list[dict[str, Any]]) -> None:
+    """By scene; after Cycles and before: it takes as long as the rest."""
+    write_json(path, {"rows": sorted(rows, key=lambda row: row["scene"])})
 
 
 def measured(scene: Path, root: Path, size: tuple[int, int], frames: int) -> dict[str, Any]:

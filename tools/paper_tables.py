@@ -67,21 +67,21 @@ SAME = ("schema", "preset", "resolution", "seconds", "spp", "budget", "candidate
 
 
 def added(old: dict[str, Any], new: dict[str, Any], *, mixed: bool = False) -> dict[str, Any]:
-    """Results with the cells of both, those of ``new`` where both have one. Raises ValueError: not of one table.
+    """Results with the cells of both, each with its device. Raises ValueError: not of one table.
 
-    mixed: the cells may be of two devices, and each says of which; machine, commit and date are ``old``'s. Where both
-    have a cell of other devices, ``old``'s stays.
+    Where both have a cell, it is that of ``new``, unless only that of ``old`` is of the results' own device.
+
+    mixed: the cells may be of two devices; device, machine, commit and date of the results are ``old``'s.
     """
     for name in SAME if mixed else (*SAME, *DEVICE):
         if old.get(name) != new.get(name):
             raise ValueError(f"{name} is {old.get(name)} there and {new.get(name)} here")
-    cells = (*old["cells"], *new["cells"])
-    if mixed:
-        cells = tuple({"device": of["device"], **cell} for of in (old, new) for cell in of["cells"])
     places: dict[tuple[Any, ...], dict[str, Any]] = {}
-    for cell in cells:
-        if places.setdefault(_place(cell), cell).get("device") == cell.get("device"):
-            places[_place(cell)] = cell
+    for of in (old, new):
+        for cell in ({"device": of["device"], **cell} for cell in of["cells"]):
+            known = places.get(_place(cell), cell)
+            if cell["device"] in (old["device"], known["device"]):
+                places[_place(cell)] = cell
     whole = {**(old if mixed else new), "cells": list(places.values())}
     whole["seeds"] = len({cell["seed"] for cell in places.values()})
     whole["command"] = "; ".join(dict.fromkeys(part for of in (old, new) for part in of["command"].split("; ")))

@@ -69,8 +69,9 @@ def test_selection_and_books(scene: Scene, tmp_path: Path, policy: str) -> None:
     events = step1(scene.raster, tmp_path, policy=policy, val=scene.raster.subset([0, 1]))
     epochs = [event for event in events if isinstance(event, EpochEnd)]
     assert [(e.epoch, e.epochs, e.steps, e.skipped) for e in epochs] == [(1, 2, 12, 0), (2, 2, 12, 0)]
-    # Of the same views: those that are visited are others in each epoch.
-    assert epochs[1].val["psnr"] > epochs[0].val["psnr"] > 0 and epochs[1].losses["dnr"] > 0
+    assert epochs[1].val["psnr"] > epochs[0].val["psnr"] > 0
+    if policy != "rl-paper":  # the agent visits other views in each epoch
+        assert epochs[1].losses["dnr"] < epochs[0].losses["dnr"]
     assert ("rl" in epochs[0].losses) == (policy == "rl-paper")
     last = events[-1]
     assert isinstance(last, Selected) and last.selection.policy == policy

@@ -52,13 +52,9 @@ class Figures:
 
     def __init__(self, results: Mapping[str, Any]) -> None:
         # Published results may name rows that are no longer offered, and say of others what they were then.
-        self.what: dict[str, str] = results.get("rows") or {name: row.what for name, row in ROWS.items()}
+        what: Mapping[str, str] = results.get("rows") or {name: row.what for name, row in ROWS.items()}
         present = dict.fromkeys(cell["row"] for cell in results["cells"])
-        for name in present:
-            devices = {cell["device"] for cell in results["cells"] if cell["row"] == name and "device" in cell}
-            if others := sorted(devices - {results.get("device")}):
-                part = "in part " if results.get("device") in devices else ""
-                self.what = {**self.what, name: f"{self.what[name]} ({part}trained on {', '.join(others)})"}
+        self.what = {**what, **{name: what[name] + _elsewhere(results, name) for name in present}}
         self.rows = [name for name in ROWS if name in present] + [name for name in present if name not in ROWS]
         self.cells = {(cell["scene"], cell["row"], cell["seed"]): cell for cell in results["cells"]}
         self.scenes = [name for name in results["scenes"] if any(key[0] == name for key in self.cells)]
@@ -108,6 +104,14 @@ class Figures:
     def _value(self, scene: str, row: str, seed: int, metric: str) -> Any:
         """None where there is no such cell, or it was not measured."""
         return self.cells.get((scene, row, seed), {}).get(metric)
+
+
+def _elsewhere(results: Mapping[str, Any], row: str) -> str:
+    """What a row's name is followed by: where cells were trained on other devices than the results' own, on which."""
+    own = results.get("device")
+    devices = {cell.get("device", own) for cell in results["cells"] if cell["row"] == row}
+    others = sorted(devices - {own})
+    return f" ({'in part ' if own in devices else ''}trained on {', '.join(others)})" if others else ""
 
 
 def ratio(a: float, b: float) -> float:
