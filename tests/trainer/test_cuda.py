@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from conftest import Scene
+from dnrtrain import graphs
 from dnrtrain.checkpoint import load_model
 from dnrtrain.events import EpochEnd, Selected
 from dnrtrain.metrics import psnr
@@ -72,3 +73,28 @@ def test_the_perceptual_loss_is_the_cpus() -> None:
     a, b = torch.rand(2, 1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
     here = float(network(a, b))
     assert float(network.cuda()(a.cuda(), b.cuda())) == pytest.approx(here, rel=1e-3)
+
+
+@pytest.mark.parametrize("augment", [False, True])
+def test_graphs_train_what_the_networks_do(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, augment: bool
+) -> None:
+    most = graphs.MOST_PIXELS
+    weights = {"vgg": random_weights("vgg")}
+    settings = Step2Settings(epochs=3, precision="float32", augment=augment, frequency_norm="ortho")
+    losses: dict[int, list[float]] = {}
+    for pixels in (0, most):
+        monkeypatch.setattr(graphs, "MOST_PIXELS", pixels)
+        steps = tmp_path / str(pixels)
+        common = {"seed": 0, "device": "cuda", "fingerprint": "f"}
+        first = run_step1(
+            scene.raster, None, MODEL, STEP1, policy="farthest", budget=4, checkpoints=steps / "step1", **common
+        )
+        events = list(first)
+        second = run_step2(
+            scene.traced, None, steps / "step1", MODEL, settings, checkpoints=steps / "step2", weights=weights, **common
+        )
+        events += list(second)
+        losses[pixels] = [value for event in events if isinstance(event, EpochEnd) for value in event.losses.values()]
+    print(losses)
+    assert len(losses[0]) > 9 and losses[most] == pytest.approx(losses[0], rel=0.02)

@@ -10,13 +10,17 @@ from __future__ import annotations
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
+from .graphs import Graph
 from .metrics import ssim
 from .model import Output
 from .perceptual import PerceptualLoss
 from .precision import at_least_float32
 from .settings import Step2Settings
+
+OF_PICTURES = ("photometric", "ssim", "perceptual", "frequency", "total_variation")
+"""The terms that see pictures alone."""
 
 
 def photometric(prediction: Tensor, target: Tensor, kind: str) -> Tensor:
@@ -88,6 +92,11 @@ class Step2Loss:
     def __init__(self, settings: Step2Settings, perceptual: PerceptualLoss | None) -> None:
         self.settings = settings
         self.perceptual = perceptual
+        self.graph: Graph | None = None
+
+    def record(self) -> None:
+        """Use CUDA graphs where they pay (see `dnrtrain.graphs`): each loss is back-propagated before the next one."""
+        self.graph = Graph(self.perceptual or nn.Module(), self._of_pictures)
 
     def __call__(
         self, output: Output, target: Tensor, random: np.random.Generator, *, bfloat16: bool
@@ -97,22 +106,36 @@ class Step2Loss:
         ``random`` places the crop of L_p; ``bfloat16`` concerns VGG's convolutions only.
         """
         weights, rgb = self.settings.loss, output.rgb
-        terms: dict[str, Tensor] = {}
-        if weights.photometric:
-            terms["photometric"] = photometric(rgb, target, self.settings.photometric)
-        if weights.ssim:
-            terms["ssim"] = structural(rgb, target)
+        pictures = [rgb, target]
         if weights.perceptual and self.perceptual is not None:
-            terms["perceptual"] = self.perceptual(
-                *random_crop(rgb, target, self.settings.perceptual_crop, random), bfloat16=bfloat16
-            )
-        if weights.frequency:
-            terms["frequency"] = frequency(rgb, target, self.settings.frequency_norm)
-        if weights.total_variation:
-            terms["total_variation"] = total_variation(rgb)
+            pictures += random_crop(rgb, target, self.settings.perceptual_crop, random)
+        names = tuple(name for name in OF_PICTURES if getattr(weights, name))
+        if self.perceptual is None:
+            names = tuple(name for name in names if name != "perceptual")
+        of_pictures = self.graph if self.graph is not None and names else self._of_pictures
+        terms = dict(zip(names, of_pictures(*pictures, names=names, bfloat16=bfloat16).unbind(), strict=True))
         if weights.regularisation and output.texture is not None:
             terms["regularisation"] = texture_regularisation(output.texture)
         total = rgb.sum() * 0.0
         for name, value in terms.items():
             total = total + getattr(weights, name) * value
         return total, terms
+
+    def _of_pictures(
+        self, rgb: Tensor, target: Tensor, *window: Tensor, names: tuple[str, ...], bfloat16: bool
+    ) -> Tensor:
+        """The named terms [len(names)]. window: of both pictures, for L_p."""
+        terms = [self._term(name, rgb, target, *window, bfloat16=bfloat16) for name in names]
+        return torch.stack(terms) if terms else rgb.new_zeros(0)
+
+    def _term(self, name: str, rgb: Tensor, target: Tensor, *window: Tensor, bfloat16: bool) -> Tensor:
+        if name == "photometric":
+            return photometric(rgb, target, self.settings.photometric)
+        if name == "ssim":
+            return structural(rgb, target)
+        if name == "frequency":
+            return frequency(rgb, target, self.settings.frequency_norm)
+        if name == "total_variation":
+            return total_variation(rgb)
+        assert self.perceptual is not None
+        return self.perceptual(*window, bfloat16=bfloat16)

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from .aggregator import Aggregator
 from .correction import correct, guide_channels, guide_maps, require_base
 from .dataset import Batch, ViewSet
+from .graphs import Graph
 from .renderer import SLOPE, build_renderer
 from .settings import ModelSettings
 from .tiles import tiles
@@ -51,6 +52,7 @@ class DNR(nn.Module):
         super().__init__()
         self.settings = settings
         self.use_bfloat16 = False
+        self.graph: Graph | None = None
         generator = torch.Generator().manual_seed(seed)
         # Module constructors fill weights from the global generator; they are all overwritten below.
         with torch.random.fork_rng(devices=[]):
@@ -84,11 +86,19 @@ class DNR(nn.Module):
             groups.append(seen)
         if settings.chain:
             groups.append(self.aggregator.at_chain(batch))
-        outputs = self.renderer(groups, bfloat16=self.use_bfloat16)
+        outputs = (self.graph or self._render)(*groups, bfloat16=self.use_bfloat16)
         if settings.base == "none":
             return Output(compose(outputs, batch.coverage), texture)
         rgb, radiance = correct(batch, outputs, settings)
         return Output(compose(rgb, batch.coverage), texture, radiance)
+
+    def record(self) -> None:
+        """Train with CUDA graphs where they pay (see `dnrtrain.graphs`): each forward pass needs its backward pass
+        before the next one."""
+        self.graph = Graph(self.renderer, self._render)
+
+    def _render(self, *groups: Tensor, bfloat16: bool) -> Tensor:
+        return self.renderer(groups, bfloat16=bfloat16)
 
 
 def compose(rgb: Tensor, coverage: Tensor) -> Tensor:

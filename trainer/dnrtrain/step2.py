@@ -122,6 +122,10 @@ class _Step2(TrainingRun[Step2Settings]):
 
     loss: Step2Loss
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.loss.record()
+
     @property
     def steps_per_epoch(self) -> int:
         return -(-len(self.views) // self.settings.batch)

@@ -59,6 +59,7 @@ class TrainingRun(ABC, Generic[Settings]):
         self.views = self.views.to(self.device)
         self.val = None if self.val is None else self.val.to(self.device)
         self.dnr.train()
+        self.dnr.record()
         rate, scale = self.settings.learning_rate, self.settings.texture_rate_scale
         self.optimiser = adam(self.trained(), rate, self.device, scale)
         self.watch = Watch()
