@@ -55,8 +55,8 @@ TABLES = {
         "paper-views.json",
         "views",
     ),
-    # In the folder of table a, whose rows `paper`, `paper-uv` and `paper-random` it shares.
-    "c": Table(("ablate", *COMMON, "--rows", "fig7a,fig7b,fig7c"), "paper-figure7.json", "rows"),
+    # One with table a, whose rows `paper`, `paper-uv` and `paper-random` it shares.
+    "c": Table(("ablate", *COMMON, "--rows", "fig7a,fig7b,fig7c"), "paper-steps.json", "rows"),
 }
 
 PLACE = ("scene", "row", "pool", "budget", "policy", "seed")

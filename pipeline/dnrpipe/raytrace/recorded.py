@@ -31,6 +31,9 @@ def without_collection() -> Iterator[None]:
 class Recorded:
     """A function of Dr.Jit arrays, recorded at its first call and replayed afterwards.
 
+    On a GPU it is not: there Dr.Jit 1.5 aborts the process where it records what looks up a scene ("jit_var(r0): unknown
+    variable", on an H100). The function is called anew each time, which takes some 70 ms of Python a frame.
+
     scene: what the function renders. Pointers to its media go in with the arguments: calls of media are refused where
     the process holds others than the scene's (`second_targets`), unless a pointer says that all of them are meant. Of
     emitters, shapes and BSDFs the scene holds such pointers.
@@ -41,7 +44,8 @@ class Recorded:
         import mitsuba as mi
 
         media = [mi.MediumPtr(medium) for medium in media_of(scene)] if scene is not None else []
-        self.frozen: Any = dr.freeze(function, state_fn=lambda *arguments: media)
+        enabled = not mi.variant().startswith("cuda")
+        self.frozen: Any = dr.freeze(function, state_fn=lambda *arguments: media, enabled=enabled)
 
     @property
     def n_recordings(self) -> int:
