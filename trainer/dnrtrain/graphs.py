@@ -43,7 +43,7 @@ class Graph:
             samples = tuple(tensor.detach().clone().requires_grad_(tensor.requires_grad) for tensor in inputs)
             recorded = _Recorded(self._weights, partial(self._network, **options))
             if hasattr(torch.autograd.graph, "set_warn_on_accumulate_grad_stream_mismatch"):  # from torch 2.11 on
-                # Gradients come from the stream that recorded; autograd waits for it, and would say so in each training.
+                # Gradients come from the stream that recorded; autograd waits for it, and would say so each time.
                 torch.autograd.graph.set_warn_on_accumulate_grad_stream_mismatch(False)
             self._graphs[key] = torch.cuda.make_graphed_callables(recorded, samples)
         return self._graphs[key](*inputs)

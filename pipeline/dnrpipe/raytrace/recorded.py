@@ -31,8 +31,8 @@ def without_collection() -> Iterator[None]:
 class Recorded:
     """A function of Dr.Jit arrays, recorded at its first call and replayed afterwards.
 
-    On a GPU it is not: there Dr.Jit 1.5 aborts the process where it records what looks up a scene ("jit_var(r0): unknown
-    variable", on an H100). The function is called anew each time, which takes some 70 ms of Python a frame.
+    On a GPU it is not: there Dr.Jit 1.5 aborts the process where it records what looks up a scene ("jit_var(r0):
+    unknown variable", on an H100). The function is called anew each time, which takes some 70 ms of Python a frame.
 
     scene: what the function renders. Pointers to its media go in with the arguments: calls of media are refused where
     the process holds others than the scene's (`second_targets`), unless a pointer says that all of them are meant. Of
