@@ -65,6 +65,14 @@ def test_it_goes_most_of_the_way_from_random_views_to_the_best(count: int, level
     assert share >= 0.7
 
 
+def test_values_that_overshoot_are_no_divergence() -> None:
+    walker, _ = next(walked(np.full(40, 0.01), 25, paper_step1(epochs=1)))
+    allowed = walker.largest_reward * sum(walker.settings.gamma**k for k in range(24))
+    for share, diverged in ((10.0, False), (100.0, True)):
+        walker.largest_value = share * allowed
+        assert (walker.trouble() is not None) == diverged
+
+
 def test_values_beyond_what_rewards_allow_are_divergence() -> None:
     """Without discount the maximum feeds on its own errors, and the values leave any range."""
     losses = 0.01 * np.random.default_rng(0).lognormal(0.0, 0.45, 40)

@@ -68,9 +68,10 @@ def device_name() -> str:
 def markdown(results: dict[str, Any]) -> str:
     """Its tables: columns are what was measured."""
     parts = []
-    for made in results.values():
+    for name, made in results.items():
         rows = [[str(value) for value in row.values()] for row in made["rows"]]
-        head = f"`{made['command']}`, {made['date'][:10]}; {made['device']}, torch {made['versions']['torch']}."
+        when = f"{made['date'][:10]}; {made['device']}, torch {made['versions']['torch']}"
+        head = f"{name.capitalize()}: `{made['command']}`, {when}."
         parts.append(f"{head}\n\n{table(list(made['rows'][0]), rows)}")
     return "\n\n".join(parts)
 

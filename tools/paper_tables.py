@@ -2,7 +2,7 @@
 
     python -m tools.paper_tables a      # Table I at equal steps, and DNR beside it
     python -m tools.paper_tables b      # quality against the number of traced views
-    python -m tools.paper_tables c      # figures 7a, 7b and 7c
+    python -m tools.paper_tables c      # figures 7a, 7b and 7c: further rows of table a
 
 Each is one run of `dnrpipe ablate` or `dnrpipe bench-select` that goes on where it stopped. Its results are added to
 those in docs/results/, also after Ctrl-C, so that a table may be made in pieces, also on several machines. What stands
@@ -29,11 +29,17 @@ from filelock import FileLock
 
 from dnrpipe.core.settings import resolve
 from dnrpipe.stages.trainer import torch_device
+from dnrpipe.studies.ablation.rows import GROUPS, PAPER_TABLE
 from dnrtrain.atomic import write_json
 
 RESULTS = Path(__file__).resolve().parents[1] / "docs" / "results"
 COMMON = ("--preset", "paper-128", "--scenes", "furniture,bricks,microphone", "--seeds", "3")
 """The scenes whose views take least to trace; all take as long to train on."""
+
+FIGURES = ",".join(
+    dict.fromkeys(row for name in ("fig7a", "fig7b", "fig7c") for row in GROUPS[name] if row not in PAPER_TABLE)
+)
+"""The rows of figures 7 that table a lacks."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +61,8 @@ TABLES = {
         "paper-views.json",
         "views",
     ),
-    # One with table a, whose rows `paper`, `paper-uv` and `paper-random` it shares.
-    "c": Table(("ablate", *COMMON, "--rows", "fig7a,fig7b,fig7c"), "paper-steps.json", "rows"),
+    # One with table a, which has the figures' other rows.
+    "c": Table(("ablate", *COMMON, "--rows", FIGURES), "paper-steps.json", "rows"),
 }
 
 PLACE = ("scene", "row", "pool", "budget", "policy", "seed")

@@ -45,7 +45,9 @@ class Graph:
             if hasattr(torch.autograd.graph, "set_warn_on_accumulate_grad_stream_mismatch"):  # from torch 2.11 on
                 # Gradients come from the stream that recorded; autograd waits for it, and would say so each time.
                 torch.autograd.graph.set_warn_on_accumulate_grad_stream_mismatch(False)
-            self._graphs[key] = torch.cuda.make_graphed_callables(recorded, samples)
+            with torch.cuda.device(inputs[0].device):  # it records the current one
+                graph = torch.cuda.make_graphed_callables(recorded, samples, allow_unused_input=True)
+            self._graphs[key] = graph
         return self._graphs[key](*inputs)
 
 

@@ -95,8 +95,13 @@ class Step2Loss:
         self.graph: Graph | None = None
 
     def record(self) -> None:
-        """Use CUDA graphs where they pay (see `dnrtrain.graphs`): each loss is back-propagated before the next one."""
+        """Use CUDA graphs where they pay (see `dnrtrain.graphs`), until `forget`: each loss is back-propagated before
+        the next one."""
         self.graph = Graph(self.perceptual or nn.Module(), self._of_pictures)
+
+    def forget(self) -> None:
+        """Let the graphs' memory go."""
+        self.graph = None
 
     def __call__(
         self, output: Output, target: Tensor, random: np.random.Generator, *, bfloat16: bool

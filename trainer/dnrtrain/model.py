@@ -93,9 +93,13 @@ class DNR(nn.Module):
         return Output(compose(rgb, batch.coverage), texture, radiance)
 
     def record(self) -> None:
-        """Train with CUDA graphs where they pay (see `dnrtrain.graphs`): each forward pass needs its backward pass
-        before the next one."""
+        """Train with CUDA graphs where they pay (see `dnrtrain.graphs`), until `forget`: each forward pass needs its
+        backward pass before the next one."""
         self.graph = Graph(self.renderer, self._render)
+
+    def forget(self) -> None:
+        """Let the graphs' memory go."""
+        self.graph = None
 
     def _render(self, *groups: Tensor, bfloat16: bool) -> Tensor:
         return self.renderer(groups, bfloat16=bfloat16)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -122,9 +122,8 @@ class _Step2(TrainingRun[Step2Settings]):
 
     loss: Step2Loss
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.loss.record()
+    def recorded(self) -> Sequence[DNR | Step2Loss]:
+        return [self.dnr, self.loss]
 
     @property
     def steps_per_epoch(self) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
@@ -15,6 +15,7 @@ from . import checkpoint
 from .contract import ContractError, DamagedFile
 from .dataset import Batch, ViewSet
 from .events import Diverged, EpochEnd, Event, Note
+from .losses import Step2Loss
 from .model import DNR
 from .preview import Preview
 from .records import Epoch, ModelRecord, Progress
@@ -59,7 +60,6 @@ class TrainingRun(ABC, Generic[Settings]):
         self.views = self.views.to(self.device)
         self.val = None if self.val is None else self.val.to(self.device)
         self.dnr.train()
-        self.dnr.record()
         rate, scale = self.settings.learning_rate, self.settings.texture_rate_scale
         self.optimiser = adam(self.trained(), rate, self.device, scale)
         self.watch = Watch()
@@ -81,6 +81,10 @@ class TrainingRun(ABC, Generic[Settings]):
 
     def trained(self) -> list[nn.Module]:
         """Modules that the optimiser steps, and whose weights must stay finite."""
+        return [self.dnr]
+
+    def recorded(self) -> Sequence[DNR | Step2Loss]:
+        """What may train as CUDA graphs."""
         return [self.dnr]
 
     def more_trouble(self) -> str | None:
@@ -108,13 +112,20 @@ class TrainingRun(ABC, Generic[Settings]):
             yield Note(text)
         if epoch:
             yield Note(f"step {self.number} continues after epoch {epoch} of {epochs}")
-        while epoch < epochs:
-            done = self._epoch(epoch)
-            yield done
-            if isinstance(done, EpochEnd):
-                epoch += 1
-                if self.preview is not None:
-                    yield from self.preview.after(done, self.dnr, self.average)
+        recorded = self.recorded()
+        for part in recorded:
+            part.record()
+        try:
+            while epoch < epochs:
+                done = self._epoch(epoch)
+                yield done
+                if isinstance(done, EpochEnd):
+                    epoch += 1
+                    if self.preview is not None:
+                        yield from self.preview.after(done, self.dnr, self.average)
+        finally:
+            for part in recorded:
+                part.forget()
 
     def rate(self, step: int) -> float:
         """Learning rate of a step, counted from the first epoch on."""

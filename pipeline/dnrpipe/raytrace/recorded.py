@@ -44,18 +44,24 @@ class Recorded:
         import mitsuba as mi
 
         media = [mi.MediumPtr(medium) for medium in media_of(scene)] if scene is not None else []
-        enabled = not mi.variant().startswith("cuda")
-        self.frozen: Any = dr.freeze(function, state_fn=lambda *arguments: media, enabled=enabled)
+        self.evaluate: Any = dr.eval
+        self.replays = not mi.variant().startswith("cuda")
+        self.frozen: Any = dr.freeze(function, state_fn=lambda *arguments: media, enabled=self.replays)
+        self.calls = 0
 
     @property
     def n_recordings(self) -> int:
-        """How often it was recorded: more than once where something that varies came in other than as data."""
-        return self.frozen.n_recordings
+        """How often it was recorded: more than once where something that varies came in other than as data. Where it
+        is not replayed, the first call counts, which compiles."""
+        return self.frozen.n_recordings if self.replays else min(1, self.calls)
 
     def __call__(self, *arguments: Any) -> Any:
         known, began = self.n_recordings, (time.monotonic(), time.process_time())
         with without_collection():
             values = self.frozen(*arguments)
+            if not self.replays:
+                self.evaluate(values)  # as a replay leaves them
+        self.calls += 1
         if self.n_recordings > known:
             Stopwatch.leave_out(*began)
         return values

@@ -22,6 +22,8 @@ denoised, in no more time (31.6 to 36.5 dB): there light would not pay. The othe
 there it does, but for `jewels`, whose caustics baked light leaves out."""
 STEADY = 4
 """Samples per pixel; with fewer, denoised frames flicker."""
+PATIENCE = 8
+"""Samples per pixel, as many as base images have rays, beyond which nobody waits who asked for nothing."""
 
 
 class Wanted(BaseModel):
@@ -73,7 +75,7 @@ def choose(options: Sequence[Option], wanted: Wanted) -> tuple[Option, str]:
     With a time: the best PSNR that fits in; the quickest where none does. With a quality: the cheapest that reaches it;
     the best where none does. With neither, the wanted quality is the best of baked light's, with as few rays as cost it
     next to nothing (`NEAR`): the cheapest option that has both its PSNR and its LPIPS. Where light is not weighed it is
-    what baked light usually has (`USUAL`).
+    what baked light usually has (`USUAL`), or the best that at most PATIENCE samples give.
 
     Raises ValueError: no options.
     """
@@ -99,7 +101,8 @@ def choose(options: Sequence[Option], wanted: Wanted) -> tuple[Option, str]:
     if not baked:
         enough = [option for option in options if option.reaches(*USUAL) and option.way.spp >= STEADY]
         if not enough:
-            return max(options, key=quality), "the best of its kind"
+            few = [option for option in options if option.way.spp <= PATIENCE]
+            return max(few or options, key=quality), f"the best of up to {PATIENCE} samples"
         return min(enough, key=lambda option: option.seconds), "as good as baked light usually is"
     best = max(baked, key=quality)
     lpips = None if best.lpips is None else best.lpips * NEAR[1]

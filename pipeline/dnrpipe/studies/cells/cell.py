@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from dnrtrain.dataset import Base, ViewSet
     from dnrtrain.records import Epoch
 
-CELL_VERSION = 3  # raise when training or measuring changes what a cell holds, or what fingerprints hash
+CELL_VERSION = 4  # raise when training or measuring changes what a cell holds, or what fingerprints hash
 STEP1_SHARE = 1 / 3
 """Share of the training time that step 1 may take where all rows train equally long."""
 
