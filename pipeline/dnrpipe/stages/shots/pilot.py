@@ -91,7 +91,7 @@ class Pilot:
 
     def measure(self, renderer: Renderer, ways: Sequence[Way]) -> list[Measured]:
         """The ways on the windows, one after the other; of each neural one also the base image that it corrects,
-        before it. The references come first where there are none yet, then a whole frame by the first way.
+        before it. The references come first where there are none yet; last a whole frame by the first way, twice.
 
         Raises UserError: a frame failed twice.
         """
@@ -114,7 +114,7 @@ class Pilot:
                     rendered = way if number in (0, last) else base_of(way)
                     keys.append(key if number == last else None)
                     tasks.append(self._task(rendered, at, place, earlier, len(tasks), seed))
-        if not known:
+        for _ in range(0 if known else 2):  # the first one readies what its size takes, and takes up to twice as long
             keys.append(None)
             tasks.append(self._task(ways[0], self.windows[0][0], None, None if tracing else (), len(tasks), 0))
         found: dict[Way, list[_Window]] = {}

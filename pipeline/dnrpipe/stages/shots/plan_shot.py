@@ -26,8 +26,9 @@ FEWER = (2, 4)
 """Rays per pixel of base images that are tried beside the settings'."""
 DEEP, MOST_DEEP = 8, 0.02
 """Surfaces of a path beyond which light is no more that of matt surfaces, which reflect too little, but of glass behind
-glass; and the share of such light from which on baking does not pay. Base images follow glass as far as path tracing does,
-and what shines through it onto matt surfaces is baked blurred. (`jewels` 7.6 %; the other example scenes have 0 to 0.8 %.)
+glass; and the share of such light from which on baking does not pay. Base images follow glass as far as path tracing
+does, and what shines through it onto matt surfaces is baked blurred. (`jewels` 7.6 %; the other example scenes have 0
+to 0.8 %.)
 """
 LIGHT_PATH = 2.5
 """Seconds of a path of baked light over those of a camera path: it sets out from everywhere, in all directions."""
