@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -46,7 +47,7 @@ class Graph:
                 # Gradients come from the stream that recorded; autograd waits for it, and would say so each time.
                 torch.autograd.graph.set_warn_on_accumulate_grad_stream_mismatch(False)
             with torch.cuda.device(inputs[0].device):  # it records the current one
-                graph = torch.cuda.make_graphed_callables(recorded, samples, allow_unused_input=True)
+                graph: Any = torch.cuda.make_graphed_callables(recorded, samples, allow_unused_input=True)
             self._graphs[key] = graph
         return self._graphs[key](*inputs)
 

@@ -45,7 +45,7 @@ class Recorded:
 
         media = [mi.MediumPtr(medium) for medium in media_of(scene)] if scene is not None else []
         self.evaluate: Any = dr.eval
-        self.replays = not mi.variant().startswith("cuda")
+        self.replays = not str(mi.variant()).startswith("cuda")
         self.frozen: Any = dr.freeze(function, state_fn=lambda *arguments: media, enabled=self.replays)
         self.calls = 0
 
