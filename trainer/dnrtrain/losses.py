@@ -111,12 +111,11 @@ class Step2Loss:
         ``random`` places the crop of L_p; ``bfloat16`` concerns VGG's convolutions only.
         """
         weights, rgb = self.settings.loss, output.rgb
+        missing = "perceptual" if self.perceptual is None else None
+        names = tuple(name for name in OF_PICTURES if getattr(weights, name) and name != missing)
         pictures = [rgb, target]
-        if weights.perceptual and self.perceptual is not None:
+        if "perceptual" in names:
             pictures += random_crop(rgb, target, self.settings.perceptual_crop, random)
-        names = tuple(name for name in OF_PICTURES if getattr(weights, name))
-        if self.perceptual is None:
-            names = tuple(name for name in names if name != "perceptual")
         of_pictures = self.graph if self.graph is not None and names else self._of_pictures
         terms = dict(zip(names, of_pictures(*pictures, names=names, bfloat16=bfloat16).unbind(), strict=True))
         if weights.regularisation and output.texture is not None:
