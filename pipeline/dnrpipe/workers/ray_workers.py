@@ -44,7 +44,7 @@ MOST_FAILURES = 3
 """So often an actor may fail to start, one after the other."""
 CLOSE_WAIT = 10.0
 STATE_WAIT = 60.0
-"""Seconds to wait for word whether a node is alive; Ray itself takes up to half a minute to notice."""
+"""Seconds to wait for word of a node; Ray itself takes up to half a minute to notice that one is gone."""
 LOG_TAIL = 1 << 16
 """Bytes of a worker's output that come back with an answer, at most."""
 GPU_VARIANT = "cuda"
@@ -301,32 +301,31 @@ _SENDING = threading.Lock()
 
 
 def _node_is_gone(node: str) -> bool:
-    """Whether the node that an actor ran on is no longer part of the cluster; waits until it is clear."""
-    import ray
+    """Whether the node that an actor ran on is no longer part of the cluster; waits until it is clear.
 
-    number = node.partition(" ")[2]
-    until = time.monotonic() + STATE_WAIT
-    while time.monotonic() < until:
-        found = {one["NodeID"]: one["Alive"] for one in ray.nodes()}
-        if not found.get(number, False):
-            return True
-        if _answers(number):
-            return False
-    return True
-
-
-def _answers(number: str) -> bool:
-    """Whether the node runs a call now."""
+    A node that Ray counts as alive after STATE_WAIT is there, however busy.
+    """
     import ray
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-    ask = ray.remote(num_cpus=0, max_retries=0)(installed)
-    call = ask.options(scheduling_strategy=NodeAffinitySchedulingStrategy(number, soft=False)).remote()
-    try:
-        ray.get(call, timeout=10)
-    except ray.exceptions.RayError:
-        return False
-    return True
+    number = node.partition(" ")[2]
+    strategy = NodeAffinitySchedulingStrategy(number, soft=False)
+    ask = ray.remote(num_cpus=0, max_retries=0)(installed).options(scheduling_strategy=strategy)
+    until = time.monotonic() + STATE_WAIT
+    call = ask.remote()
+    while time.monotonic() < until:
+        if not any(one["Alive"] for one in ray.nodes() if one["NodeID"] == number):
+            return True
+        if not ray.wait([call], timeout=READY_POLL)[0]:
+            continue
+        try:
+            ray.get(call)
+        except ray.exceptions.RayError:  # the node is going, or the process that was to answer died
+            time.sleep(1)
+            call = ask.remote()
+        else:
+            return False
+    return False
 
 
 def _reason(error: Exception) -> str:
