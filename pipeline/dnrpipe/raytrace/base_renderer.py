@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from .engine import masked_channels
-from .lightmap import light_textures
+from .lightmap import light_texture
 from .recorded import Recorded, prepare_emitters
 from .sensors import Camera, opaque_camera
 from .sequence import GOLDEN, ORDER, TILE, fraction
@@ -70,8 +70,8 @@ class BaseRenderer:
 
         self.mi, self.scene = mi, scene
         self.repaired = self.masked = 0
-        self.light = light_textures(mi, light)
         self.paths = SpecularPaths(scene, gloss=gloss)
+        self.light = light_texture(mi, light, gloss=self.paths.ends_at_rough)
         self.tables = mi.UInt32(ORDER.ravel()), self.paths.steps
         self.lets_through = self.paths.lets_through
         prepare_emitters(mi, scene)
@@ -132,7 +132,7 @@ class BaseRenderer:
         A pixel's samples lie side by side; the first goes through the pixel's centre.
 
         Args:
-            light: E and S, a texture of six channels for the front and one for the back.
+            light: a `light_texture`.
             tables: places within a tile, steps of the random numbers.
             camera: see `opaque_camera`.
             rays: ``samples``, as data.

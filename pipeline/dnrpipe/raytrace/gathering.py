@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from .lightmap import LEAST_RHO, LightBaker, light_textures
+from .lightmap import LEAST_RHO, LightBaker, light_texture
 from .lobes import media_of
 from .sequence import GOLDEN, fraction
 
@@ -99,8 +99,9 @@ class Gathered:
     def __init__(self, mi: Any, scene: Any, light: np.ndarray, *, gloss: bool, caustics: bool) -> None:
         from .specular_paths import SpecularPaths  # imports Mitsuba
 
-        self.mi, self.light = mi, light_textures(mi, light)
+        self.mi = mi
         self.paths = SpecularPaths(scene, camera=False, gloss=gloss, caustics=caustics)
+        self.light = light_texture(mi, light, gloss=self.paths.ends_at_rough)
 
     def sample(self, scene: Any, numbers: Any, ray: Any, medium: Any, active: Any) -> tuple[Any, Any, list[Any]]:
         """As `mi.SamplingIntegrator.sample` with emitters hidden. medium: None."""

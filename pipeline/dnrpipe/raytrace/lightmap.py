@@ -47,12 +47,26 @@ LEAST_RHO = 1e-3
 """Texels that reflect less hold no light worth knowing."""
 
 
-def light_textures(mi: Any, light: np.ndarray) -> list[Any]:
-    """E and S of the front and of the back, float32 [2, 2, size, size, 3] -> two textures of six channels."""
+def light_texture(mi: Any, light: np.ndarray, *, gloss: bool) -> Any:
+    """E and S of the front and of the back, float32 [2, 2, size, size, 3] -> texture for `look_up_light`.
+
+    gloss: with S, six channels; else three. Front and back lie one above the other, a row of each repeated between
+    them, so that neither takes light of the other.
+    """
     import drjit as dr
 
-    sides = [np.concatenate([light[0, i], light[1, i]], axis=-1) for i in range(2)]
-    return [mi.Texture2f(mi.TensorXf(side), wrap_mode=dr.WrapMode.Clamp) for side in sides]
+    front, back = (np.concatenate(light[: 1 + gloss, side], axis=-1) for side in range(2))
+    rows = np.concatenate([front, front[-1:], back[:1], back])
+    return mi.Texture2f(mi.TensorXf(rows), wrap_mode=dr.WrapMode.Clamp)
+
+
+def look_up_light(mi: Any, texture: Any, uv: Any, back: Any, active: Any) -> list[Any]:
+    """Channels of a `light_texture` at atlas coordinates. back: of the back, else of the front."""
+    import drjit as dr
+
+    rows, size, _ = texture.shape
+    row = uv.y * (size / rows) + dr.select(back, mi.Float((size + 2) / rows), 0)
+    return texture.eval(mi.Point2f(uv.x, row), active)
 
 
 class LightBaker:
