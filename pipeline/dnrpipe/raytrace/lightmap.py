@@ -47,8 +47,9 @@ LEAST_RHO = 1e-3
 """Texels that reflect less hold no light worth knowing."""
 
 
-def light_texture(mi: Any, light: np.ndarray, *, gloss: bool) -> Any:
-    """E and S of the front and of the back, float32 [2, 2, size, size, 3] -> texture for `look_up_light`.
+def light_texture(mi: Any, light: np.ndarray, *, gloss: bool) -> tuple[Any, Any, Any]:
+    """E and S of the front and of the back, float32 [2, 2, size, size, 3] -> texture for `look_up_light`, and where in
+    it V = 1 of the front and V = 0 of the back are, as data.
 
     gloss: with S, six channels; else three. Front and back lie one above the other, a row of each repeated between
     them, so that neither takes light of the other.
@@ -57,16 +58,17 @@ def light_texture(mi: Any, light: np.ndarray, *, gloss: bool) -> Any:
 
     front, back = (np.concatenate(light[: 1 + gloss, side], axis=-1) for side in range(2))
     rows = np.concatenate([front, front[-1:], back[:1], back])
-    return mi.Texture2f(mi.TensorXf(rows), wrap_mode=dr.WrapMode.Clamp)
+    texture = mi.Texture2f(mi.TensorXf(rows), wrap_mode=dr.WrapMode.Clamp)
+    top, start = len(front) / len(rows), (len(front) + 2) / len(rows)
+    return texture, dr.opaque(mi.Float, top), dr.opaque(mi.Float, start)
 
 
-def look_up_light(mi: Any, texture: Any, uv: Any, back: Any, active: Any) -> list[Any]:
+def look_up_light(mi: Any, light: tuple[Any, Any, Any], uv: Any, back: Any, active: Any) -> list[Any]:
     """Channels of a `light_texture` at atlas coordinates. back: of the back, else of the front."""
     import drjit as dr
 
-    rows, size, _ = texture.shape
-    row = uv.y * (size / rows) + dr.select(back, mi.Float((size + 2) / rows), 0)
-    return texture.eval(mi.Point2f(uv.x, row), active)
+    texture, top, start = light
+    return texture.eval(mi.Point2f(uv.x, uv.y * top + dr.select(back, start, 0)), active)
 
 
 class LightBaker:

@@ -36,9 +36,9 @@ NUMBERS = 5
 """Random numbers per vertex: two for the direction, one for the lobe, two for the emitter."""
 MIRRORED = 0.25
 """Share of the samples that the first glass reflects. By Fresnel's share, a lamp in the water would be a few specks."""
-LEAST_THROUGHPUT = 1e-2
-"""Fainter paths end, such as those that two panes or polished floors mirror one after the other: 1e-3 took 1.4 times as
-long for 0.03 dB."""
+LEAST_THROUGHPUT, LEAST_BY_CHANCE = 1e-2, 1e-3
+"""Fainter paths end, such as those that two polished floors mirror one after the other: with 1e-3 a frame took 1.4 times
+as long for 0.03 dB behind the corrector. Where chance ends faint paths anyway, the second."""
 LEAST_RHO = 0.05
 """Diffuse reflectance from which a surface ends a chain."""
 NARROW = 1000.0
@@ -106,6 +106,7 @@ class SpecularPaths:
         """
         origin = mi.Point3f(ray.o)
         every = number >= 0
+        least = LEAST_THROUGHPUT if sampler is None else LEAST_BY_CHANCE
 
         # ------------------------------ The path ------------------------------
         active = mi.Bool(every)
@@ -202,13 +203,13 @@ class SpecularPaths:
             radiance += dr.select(rough, throughput * around, 0)
 
             # ------------------------- The next vertex ------------------------
-            alive = onwards & (bsdf_sample.pdf > 0) & (dr.max(throughput) > LEAST_THROUGHPUT)
+            alive = onwards & (bsdf_sample.pdf > 0) & (dr.max(throughput) > least)
             if dr.hint(not self.caustics, mode="scalar"):
                 alive &= null | ~is_sharp(mi, bsdf_sample)
             if dr.hint(sampler is not None, mode="scalar"):
                 kept = dr.minimum(dr.max(throughput), 1)
                 alive &= sampler.next_1d() < kept
-                throughput /= dr.maximum(kept, LEAST_THROUGHPUT)
+                throughput /= dr.maximum(kept, least)
             covered |= met & ~(null & alive)
             next_ray = si.spawn_ray(dr.select(passed, ray.d, si.to_world(bsdf_sample.wo)))
             medium = self._next_medium(medium, si, bsdf_sample, next_ray, onwards)
