@@ -38,7 +38,7 @@ MIRRORED = 0.25
 """Share of the samples that the first glass reflects. By Fresnel's share, a lamp in the water would be a few specks."""
 LEAST_THROUGHPUT, LEAST_BY_CHANCE = 1e-2, 1e-3
 """Fainter paths end, such as those that two polished floors mirror one after the other: with 1e-3 a frame took 1.4
-times as long for 0.03 dB behind the corrector. Where chance ends faint paths anyway, the second."""
+times as long for 0.03 dB behind the corrector. The second is of paths from surfaces, which chance ends anyway."""
 LEAST_RHO = 0.05
 """Diffuse reflectance from which a surface ends a chain."""
 NARROW = 1000.0
@@ -106,7 +106,7 @@ class SpecularPaths:
         """
         origin = mi.Point3f(ray.o)
         every = number >= 0
-        least = LEAST_THROUGHPUT if sampler is None else LEAST_BY_CHANCE
+        least = LEAST_THROUGHPUT if self.camera else LEAST_BY_CHANCE
 
         # ------------------------------ The path ------------------------------
         active = mi.Bool(every)
