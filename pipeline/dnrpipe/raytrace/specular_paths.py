@@ -38,7 +38,8 @@ MIRRORED = 0.25
 """Share of the samples that the first glass reflects. By Fresnel's share, a lamp in the water would be a few specks."""
 LEAST_THROUGHPUT, LEAST_BY_CHANCE = 1e-2, 1e-3
 """Fainter paths end, such as those that two polished floors mirror one after the other: with 1e-3 the kernel took
-1.4 times as long for 0.03 dB behind the corrector (`drums`: 0.2 dB). The second is of paths from surfaces, which chance ends anyway."""
+1.4 times as long for 0.03 dB behind the corrector (`drums`: 0.2 dB). The second is of paths from surfaces, which chance
+ends anyway."""
 LEAST_RHO = 0.05
 """Diffuse reflectance from which a surface ends a chain."""
 NARROW = 1000.0
