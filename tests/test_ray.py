@@ -86,13 +86,13 @@ class Worker:
 
 @pytest.fixture(scope="session")
 def cluster() -> Iterator[Cluster]:
-    # Ray gives its workers niceness 15: beside other tests a start takes a minute.
-    os.environ["RAY_worker_niceness"] = "0"  # noqa: SIM112 (so spelt)
-    found = Cluster(initialize_head=True, head_node_args={**NODE, "include_dashboard": False})
-    for _ in range(2):
-        found.add_node(**NODE)
-    found.wait_for_nodes()
-    yield found
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_worker_niceness", "0")  # Ray's 15: beside other tests a start takes a minute
+        found = Cluster(initialize_head=True, head_node_args={**NODE, "include_dashboard": False})
+        for _ in range(2):
+            found.add_node(**NODE)
+        found.wait_for_nodes()
+        yield found
     import ray
 
     ray.shutdown()
