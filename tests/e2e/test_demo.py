@@ -23,8 +23,11 @@ def _dnrpipe(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return done
 
 
-SHORT = ("select.budget=8", "finetune.step2.epochs=20", "cameras.test=4", "raytrace.evaluation_spp=256")
-"""A third of the draft preset's views, a sixth of its steps: what every run of the tests can wait for."""
+SHORT = (
+    *("select.budget=5", "cameras.train=20", "cameras.test=2", "raytrace.evaluation_spp=192"),
+    *("base.light_size=512", "base.light_spp=16", "finetune.step2.epochs=25"),
+)
+"""A fifth of the draft preset's views and of its paths of light, a tenth of its steps: what every run can wait for."""
 
 
 @pytest.fixture(scope="module", params=["short", pytest.param("whole", marks=pytest.mark.robustness)])
@@ -40,10 +43,10 @@ def demo(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 def test_held_out_quality(demo: Path) -> None:
     metrics = json.loads((demo / "evaluation" / "metrics.json").read_text())
     whole = demo.parent.name.startswith("whole")
-    assert len(metrics["views"]) == (12 if whole else 4)
+    assert len(metrics["views"]) == (12 if whole else 2)
     mean = metrics["mean"]
     print({key: round(value, 4) for key, value in mean.items() if value is not None})
-    assert mean["psnr"] >= (33.5 if whole else 33.2)
+    assert mean["psnr"] >= (33.5 if whole else 33.1)
     assert mean["ssim"] >= 0.975
     assert mean["psnr_base"] < mean["psnr_shipped"] < mean["psnr"]
     rungs = metrics["baseline"]  # path tracing with a denoiser: more samples are better, and take longer

@@ -22,7 +22,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.e2e]
 
 def test_a_ball_rolls_and_the_frames_are_right(tmp_path: Path) -> None:
     scene = shot_scenes.rolling(tmp_path)
-    words = ("shot", str(scene), "--frames", "1-5", "--size", "48x27", "--way", "neural")
+    light = ("--set", "base.light_size=256", "--set", "base.light_spp=32")
+    words = ("shot", str(scene), "--frames", "1-5", "--size", "48x27", "--way", "neural", *light)
     told = run(*words, folder=tmp_path).stdout
     assert "ball moves in frames 3-5: path-traced there" in told
     shot = tmp_path / "rolling.shot.dnr" / "shots" / "wide"

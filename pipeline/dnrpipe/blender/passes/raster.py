@@ -12,6 +12,7 @@ from dnrpipe.core.errors import UserError
 from ..geometry.render_graph import render_layer
 
 WORKBENCH_AA = ((1, "OFF"), (5, "5"), (8, "8"), (11, "11"), (16, "16"), (32, "32"))
+WORLD_COLUMNS = 1024
 
 
 def configure_raster(scene: bpy.types.Scene, engine: str, samples: int) -> None:
@@ -46,6 +47,7 @@ def configure_raster(scene: bpy.types.Scene, engine: str, samples: int) -> None:
         _cycles(scene, samples)
         if engine == "cycles-direct":
             scene.cycles.max_bounces = 0
+            _sample_world_coarsely(scene)
     else:
         raise UserError(f"unknown raster engine '{engine}'; choose eevee, workbench or cycles-direct")
 
@@ -78,6 +80,13 @@ def _cycles(scene: bpy.types.Scene, samples: int) -> None:
     cycles.use_animated_seed = False
     for layer in scene.view_layers:
         layer.samples = 0  # a layer may override the scene's samples
+
+
+def _sample_world_coarsely(scene: bpy.types.Scene) -> None:
+    """Cycles' own map of where the world is bright has 4096 columns for a sky: two seconds before the first frame."""
+    if scene.world is not None and scene.world.cycles.sampling_method == "AUTOMATIC":
+        scene.world.cycles.sampling_method = "MANUAL"
+        scene.world.cycles.sample_map_resolution = WORLD_COLUMNS
 
 
 def _viewport_colour(material: bpy.types.Material) -> None:
