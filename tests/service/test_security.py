@@ -126,6 +126,7 @@ def test_guessing_tokens_is_slowed_down(closed: Server) -> None:
         assert list(client.jobs()) == []
 
 
+@pytest.mark.robustness  # half a minute of waiting for the server's patience to end
 def test_slow_senders_are_hung_up_on(server: Server) -> None:
     """Half a head, half a head after an answer, a body that does not come: each ends, and others are answered."""
     host = urlsplit(server.url).netloc

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import functools
 import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -72,7 +74,6 @@ class Worker:
             assert self.model is not None  # loaded by now: that is no part of a frame
         watch = Stopwatch()
         (layers, *plain), lost = self.render(task, ms)
-        picture = self.shown(layers)
         answer: FrameAnswer = {
             **watch.costs(),
             "way": task.way.name,
@@ -84,8 +85,11 @@ class Worker:
         began = time.monotonic()
         for path in (task.output, task.picture):
             path.parent.mkdir(parents=True, exist_ok=True)
-        write_png(task.picture, picture)
-        write_exr(task.output, layers, header, half=HALF)  # last: it says that the frame is made
+        task.picture.unlink(missing_ok=True)  # an older one beside a new frame would pass for its picture
+        with ThreadPoolExecutor(1) as beside:  # both compress, each on one core
+            picture = beside.submit(self._write_picture, task.picture, layers)
+            write_exr(task.output, layers, header, half=HALF)
+            picture.result()
         answer["write_seconds"] = time.monotonic() - began
         if task.plain is not None:
             write_exr(task.plain, plain[0], header, half=HALF)
@@ -107,9 +111,9 @@ class Worker:
                 layers["A"] = np.ones_like(layers["A"])
         return found, lost
 
-    def shown(self, layers: dict[str, np.ndarray]) -> np.ndarray:
-        """Display RGB over white, float32 [H, W, 3] in [0, 1]."""
-        return over_white(self.display, rgba(layers))[0].permute(1, 2, 0).numpy()
+    def _write_picture(self, path: Path, layers: Layers) -> None:
+        """As it is displayed, over white."""
+        write_png(path, over_white(self.display, rgba(layers))[0].permute(1, 2, 0).numpy())
 
     def _from_base(self, task: FrameTask, ms: dict[str, float]) -> tuple[list[Layers], int]:
         if self.base is None:
