@@ -211,9 +211,6 @@ def test_many_tiny_tasks(cluster: Cluster, modules: Path) -> None:
     assert time.monotonic() - started < 60
 
 
-# One processor of the cluster is still taken after a minute, in one run of five or so, on an idle machine, too: perhaps
-# an actor that is killed while it starts. Not understood.
-@pytest.mark.robustness
 def test_closing_the_iterator_ends_the_actors(cluster: Cluster, modules: Path) -> None:
     import ray
 
