@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
+import resource
 import subprocess
-import time
 from itertools import pairwise
 from pathlib import Path
 
@@ -64,10 +64,16 @@ def test_held_out_quality(demo: Path) -> None:
 
 
 def test_again_does_nothing(demo: Path, demo_blend: Path) -> None:
-    started = time.monotonic()
+    before = _children_seconds()
     done = _dnrpipe("run", str(demo_blend), folder=demo.parent)
-    assert time.monotonic() - started < 10
+    assert _children_seconds() - before < 10
     assert done.stdout.count("up to date") == 5
+
+
+def _children_seconds() -> float:
+    """Processor time of all commands so far."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def test_the_report_draws_in_a_browser(demo: Path, tmp_path: Path) -> None:
