@@ -38,6 +38,13 @@ class DepthPilot(Strict):
     seconds: float
     steps: tuple[DepthStep, ...]
 
+    def beyond(self, depth: int) -> float | None:
+        """Share of the light on paths of more vertices, by the least depth looked at that is as large; None: none is.
+
+        Direct light and ``max_depth`` always are.
+        """
+        return next((step.mean for step in self.steps if step.depth >= depth), None)
+
 
 class Effect(Strict):
     """One row of the plan.
@@ -159,11 +166,9 @@ def _indirect(found: Evidence, depth: int | None, by: str, pilot: DepthPilot | N
     if by == "settings":
         return Evidence(depth > DIRECT_DEPTH, True, (f"path depth {depth} by setting", *found.words))
     assert pilot is not None
-    step = next(step for step in pilot.steps if step.depth == pilot.max_depth)
-    said = f"path depth {depth}: deeper paths hold {step.mean:.2%} of the light (pilot)"
-    first = next((s for s in pilot.steps if s.depth == DIRECT_DEPTH), None)
-    if depth > DIRECT_DEPTH and first is not None:
-        said += f"; direct light alone would miss {first.mean:.1%}"
+    said = f"path depth {depth}: deeper paths hold {pilot.beyond(depth) or 0:.2%} of the light (pilot)"
+    if depth > DIRECT_DEPTH:
+        said += f"; direct light alone would miss {pilot.beyond(DIRECT_DEPTH) or 0:.1%}"
     return Evidence(depth > DIRECT_DEPTH, found.present, (said, *found.words))
 
 

@@ -108,8 +108,8 @@ def light_plan(settings: Settings, plan: EffectPlan) -> LightPlan:
     """As the settings say; where they say auto, what suits the images and how much of the light has bounced."""
     chosen, way = settings.base, settings.base.light
     if way == "auto":
-        steps = plan.pilot.steps if plan.pilot else ()
-        way = "gathered" if any(step.depth == DIRECT_DEPTH and step.mean >= GATHER_FROM for step in steps) else "traced"
+        bounced = plan.pilot.beyond(DIRECT_DEPTH) if plan.pilot else None
+        way = "gathered" if (bounced or 0) >= GATHER_FROM else "traced"
     side = max(settings.cameras.width, settings.cameras.height)
     wanted = max(min(TEXELS * side, MANY), TEXELS_BEYOND[way] * side)
     return LightPlan(
