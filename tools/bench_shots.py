@@ -159,8 +159,7 @@ def arc(scene: Path, root: Path, size: tuple[int, int], frames: int) -> list[Vie
 
 def beside(root: Path, views: Sequence[View], pairs: Sequence[tuple[int, int]]) -> dict[str, Any]:
     """Quality of the shot's frames, and of path tracing with seconds per frame, on pairs of frames."""
-    workspace = Workspace.open(root)
-    run = Run(workspace, resolve_settings(workspace, {}, None), Console(quiet=True), "render", "bench")
+    run = opened(root)
     lpips, display = lpips_of(run), display_of(run)
     tracer = path_tracer(run, background=True)
     numbers = sorted({number for pair in pairs for number in pair})
@@ -214,8 +213,7 @@ def beside(root: Path, views: Sequence[View], pairs: Sequence[tuple[int, int]]) 
 
 def by_cycles(root: Path, frames: int, ours: dict[str, float]) -> list[dict[str, Any]]:
     """Rungs of Cycles on the compared frames, as those of `beside`: of what lies in the shot's workspace."""
-    workspace = Workspace.open(root)
-    run = Run(workspace, resolve_settings(workspace, {}, None), Console(quiet=True), "render", "bench")
+    run = opened(root)
     lpips, display = lpips_of(run), display_of(run)
     pairs = [(i - 1, i) for i in places(frames)]
     numbers = sorted({number for pair in pairs for number in pair})
@@ -226,7 +224,7 @@ def by_cycles(root: Path, frames: int, ours: dict[str, float]) -> list[dict[str,
 
     def rendered(samples: Sequence[int], methods: Sequence[str], seed: int) -> CyclesAnswer:
         task = CyclesTask(
-            scene_dir=workspace.scene,
+            scene_dir=run.workspace.scene,
             views=tuple(views.values()),
             samples=tuple(samples),
             methods=tuple(methods),
@@ -262,6 +260,12 @@ def by_cycles(root: Path, frames: int, ours: dict[str, float]) -> list[dict[str,
         if any(as_good(rung, ours, ("psnr", "lpips")) for rung in rungs):
             break
     return rungs
+
+
+def opened(root: Path) -> Run:
+    """The shot's workspace, to render more of its frames in."""
+    workspace = Workspace.open(root)
+    return Run(workspace, resolve_settings(workspace, {}, None), Console(quiet=True), "render", "bench")
 
 
 def places(frames: int) -> tuple[int, int]:
