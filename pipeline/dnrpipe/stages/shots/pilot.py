@@ -133,6 +133,7 @@ class Pilot:
                     f"pilot/{task.way.name} {task.way.spp}",
                     outcome.result["seconds"],
                     cpu_seconds=outcome.result["cpu_seconds"],
+                    peak_mb=outcome.result["peak_mb"],
                     width=task.view.width,
                     height=task.view.height,
                 )
