@@ -46,7 +46,7 @@ def test_held_out_quality(demo: Path) -> None:
     assert len(metrics["views"]) == (12 if whole else 2)
     mean = metrics["mean"]
     print({key: round(value, 4) for key, value in mean.items() if value is not None})
-    assert mean["psnr"] >= (33.5 if whole else 33.1)
+    assert mean["psnr"] >= (33.5 if whole else 33.2)
     assert mean["ssim"] >= 0.975
     assert mean["psnr_base"] < mean["psnr_shipped"] < mean["psnr"]
     rungs = metrics["baseline"]  # path tracing with a denoiser: more samples are better, and take longer

@@ -38,12 +38,12 @@ class DepthPilot(Strict):
     seconds: float
     steps: tuple[DepthStep, ...]
 
-    def beyond(self, depth: int) -> float | None:
-        """Share of the light on paths of more vertices, by the least depth looked at that is as large; None: none is.
+    def beyond(self, depth: int) -> float:
+        """Share of the light on paths of more vertices, by the least depth looked at that is as large; 0 where none is.
 
-        Direct light and ``max_depth`` always are.
+        Direct light and ``max_depth`` are looked at: beyond the latter is less than the tolerance.
         """
-        return next((step.mean for step in self.steps if step.depth >= depth), None)
+        return next((step.mean for step in self.steps if step.depth >= depth), 0.0)
 
 
 class Effect(Strict):
@@ -166,9 +166,9 @@ def _indirect(found: Evidence, depth: int | None, by: str, pilot: DepthPilot | N
     if by == "settings":
         return Evidence(depth > DIRECT_DEPTH, True, (f"path depth {depth} by setting", *found.words))
     assert pilot is not None
-    said = f"path depth {depth}: deeper paths hold {pilot.beyond(depth) or 0:.2%} of the light (pilot)"
+    said = f"path depth {depth}: deeper paths hold {pilot.beyond(depth):.2%} of the light (pilot)"
     if depth > DIRECT_DEPTH:
-        said += f"; direct light alone would miss {pilot.beyond(DIRECT_DEPTH) or 0:.1%}"
+        said += f"; direct light alone would miss {pilot.beyond(DIRECT_DEPTH):.1%}"
     return Evidence(depth > DIRECT_DEPTH, found.present, (said, *found.words))
 
 

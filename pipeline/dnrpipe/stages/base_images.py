@@ -108,8 +108,8 @@ def light_plan(settings: Settings, plan: EffectPlan) -> LightPlan:
     """As the settings say; where they say auto, what suits the images and how much of the light has bounced."""
     chosen, way = settings.base, settings.base.light
     if way == "auto":
-        bounced = plan.pilot.beyond(DIRECT_DEPTH) if plan.pilot else None
-        way = "gathered" if (bounced or 0) >= GATHER_FROM else "traced"
+        bounced = plan.pilot.beyond(DIRECT_DEPTH) if plan.pilot else 0.0
+        way = "gathered" if bounced >= GATHER_FROM else "traced"
     side = max(settings.cameras.width, settings.cameras.height)
     wanted = max(min(TEXELS * side, MANY), TEXELS_BEYOND[way] * side)
     return LightPlan(

@@ -186,8 +186,8 @@ def _no_baked_light(
         return f"model.base = {run.settings.model.base}"
     if _light_is_ready(run):
         return ""
-    deep = run.effect_plan.pilot.beyond(DEEP) if run.effect_plan.pilot else None
-    if wanted.aimless and deep is not None and deep > MOST_DEEP:
+    deep = run.effect_plan.pilot.beyond(DEEP) if run.effect_plan.pilot else 0.0
+    if wanted.aimless and deep > MOST_DEEP:
         return f"{deep:.1%} of the light meets more than {DEEP} surfaces, glass behind glass, as in base images"
     most = ladder[-1]
     tracing = path_option(most, shape).seconds
