@@ -184,11 +184,13 @@ class Bench(Study[Place]):
             self._plan_pool(pool, places, starts)
 
     def _choice_task(self, pool: Pool, contender: Contender, settings: Settings, seed: int) -> ChoiceTask:
-        policy, budget, inputs = contender.policy, settings.select.most, pool.data.inputs
-        if contender.kind == "step1":  # the preset's epochs: what step 1 takes is part of what its policy costs
+        policy, kind, budget, inputs = contender.policy, contender.kind, settings.select.most, pool.data.inputs
+        if budget == len(pool.data.train):  # nothing to choose, so no agent is trained, and all policies share one file
+            policy, kind = "farthest", "rule"
+        if kind == "step1":  # the preset's epochs: what step 1 takes is part of what its policy costs
             return self.step1_task(pool.data, settings, policy, seed)
         decisive = [CHOICE_VERSION, rules_fingerprint(), inputs, policy, budget, seed]
-        if contender.kind == "active":
+        if kind == "active":
             model, step1 = settings.model.coarse().model_dump(), settings.select.step1.model_dump()
             decisive = [CHOICE_VERSION, CELL_VERSION, __version__, inputs, model, step1, asdict(ActiveSettings())]
             decisive += [policy, budget, seed, *self.environment]
@@ -199,7 +201,7 @@ class Bench(Study[Place]):
             "seed": seed,
             "label": f"{pool.folder} {contender.name} {budget}",
         }
-        if contender.kind == "rule":
+        if kind == "rule":
             return RuleTask(**common, budget=budget)
         return ActiveTask(**common, settings=settings)
 

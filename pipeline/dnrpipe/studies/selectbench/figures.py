@@ -16,6 +16,8 @@ from .policies import SIMPLE
 from .pools import POOLS
 
 SPHERICAL = ("dome", "sphere")
+Choice = tuple[str, int]
+"""A policy, and how many views it chose."""
 
 
 class Figures:
@@ -30,6 +32,7 @@ class Figures:
         self.scenes = [name for name in results["scenes"] if name in present]
         self.pools = [name for name in POOLS if any(place[0] == name for place in self.cells)]
         self.budgets = sorted({place[1] for place in self.cells})
+        self.reaches_all = self.budgets[-1:] == [results.get("candidates")]
         # In the order of the run: published results name policies that are no longer offered, too.
         self.policies = list(dict.fromkeys(cell["policy"] for cell in results["cells"]))
         self.seeds = sorted({cell["seed"] for cell in results["cells"]})
@@ -72,7 +75,7 @@ class Figures:
         whole = {place: statistics.fmean(pairs) for place, pairs in found.items() if len(pairs) == len(baselines)}
         return summarise({place: whole[place] for place in sorted(whole)})
 
-    def paired(self, policy: str, other: str, pool: str, budget: int, metric: str) -> Difference | None:
-        """policy - other over all (scene, seed) that both have; its interval speaks of these scenes."""
-        ours, theirs = (self.values(pool, budget, name, metric) for name in (policy, other))
-        return summarise({place: ours[place] - theirs[place] for place in sorted(ours.keys() & theirs)}, pairs=True)
+    def paired(self, pool: str, ours: Choice, theirs: Choice, metric: str) -> Difference | None:
+        """Ours - theirs over all (scene, seed) that both have; its interval speaks of these scenes."""
+        mine, other = (self.values(pool, budget, policy, metric) for policy, budget in (ours, theirs))
+        return summarise({place: mine[place] - other[place] for place in sorted(mine.keys() & other)}, pairs=True)

@@ -1,4 +1,7 @@
-"""Quality against the number of traced views, the paper's central figure: of benchmarks with three budgets or more."""
+"""Quality against the number of traced views, the paper's central figure.
+
+Of benchmarks with three budgets or more, or two of which one is all candidates.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +18,8 @@ DIFFERENCES = (("psnr", "ΔPSNR", 2), ("lpips_vgg", "ΔLPIPS", 4))
 
 
 def by_views(figures: Figures, pool: str) -> str:
-    """Tables over all budgets of a pool; "" where there are fewer than three."""
-    if len(figures.budgets) < LEAST_BUDGETS:
+    """Tables over all budgets of a pool; "" where there are too few."""
+    if len(figures.budgets) < LEAST_BUDGETS - figures.reaches_all:
         return ""
     parts = [f"### `{pool}`, against the number of traced views"]
     for metric, title, digits in METRICS:
@@ -26,9 +29,33 @@ def by_views(figures: Figures, pool: str) -> str:
         ]
         if any(cell != NONE for row in rows for cell in row[1:]):
             parts.append(f"{title}:\n\n{table(['views', *[f'`{policy}`' for policy in figures.policies]], rows)}")
+    if figures.reaches_all:
+        parts.append(_against_all(figures, pool))
     learned = [name for name in figures.policies if name in CONTENDERS and CONTENDERS[name].kind == "step1"]
     parts += [_learned(figures, pool, policy) for policy in learned]
     return "\n\n".join(parts)
+
+
+def _against_all(figures: Figures, pool: str) -> str:
+    """What fewer views than all lose."""
+    *fewer, every = figures.budgets
+    rows = [
+        [
+            str(budget),
+            f"`{policy}`",
+            *[
+                difference(figures.paired(pool, (policy, budget), (policy, every), metric), digits)
+                for metric, _, digits in DIFFERENCES
+            ],
+        ]
+        for budget in fewer
+        for policy in figures.policies
+        if {(pool, budget, policy), (pool, every, policy)} <= figures.cells.keys()
+    ]
+    return (
+        f"Fewer views minus all {every}, paired by scene and seed, with the {LEVEL:.0%} interval of Student's t over"
+        f" the pairs:\n\n{table(['views', 'policy', *[title for _, title, _ in DIFFERENCES]], rows)}"
+    )
 
 
 def _learned(figures: Figures, pool: str, policy: str) -> str:
@@ -38,8 +65,8 @@ def _learned(figures: Figures, pool: str, policy: str) -> str:
     for budget in figures.budgets:
         line = [str(budget)]
         for other in others:
-            found = [difference(figures.paired(policy, other, pool, budget, m), d) for m, _, d in DIFFERENCES]
-            line += found
+            pair = (policy, budget), (other, budget)
+            line += [difference(figures.paired(pool, *pair, metric), digits) for metric, _, digits in DIFFERENCES]
         rows.append([*line, in_traced_views(figures, pool, budget, policy)])
     head = [f"{title} to `{other}`" for other in others for _, title, _ in DIFFERENCES]
     return (
