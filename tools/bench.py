@@ -47,7 +47,7 @@ def precision_line() -> str:
     from dnrtrain.renderer import UNet
 
     torch.manual_seed(0)
-    net = UNet(17, 24, 3).to(memory_format=torch.channels_last)
+    net = UNet(17, 24, 3).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     image = torch.randn(1, 17, 128, 128)
     seconds: dict[bool, list[float]] = {False: [], True: []}
     for _ in range(12):

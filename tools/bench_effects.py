@@ -65,7 +65,7 @@ def bench(scene: Path, folder: Path, spp: int) -> dict[str, Any]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("scenes", nargs="*", type=Path, help="default: blender_scenes/*.blend")
     parser.add_argument("--spp", type=int, default=16, help="samples of each half (default 16)")
     parser.add_argument("--json", type=Path, help="also write the rows here")

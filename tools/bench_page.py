@@ -38,7 +38,7 @@ class StaticServer(http.server.ThreadingHTTPServer):
                 sent[self.path] = len(content)
                 outputfile.write(content)
 
-            def log_message(self, *_: Any) -> None: ...
+            def log_message(self, format: str, *args: Any) -> None: ...
 
         super().__init__(("127.0.0.1", 0), functools.partial(Handler, directory=str(folder)))
 

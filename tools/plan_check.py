@@ -6,7 +6,8 @@
 Seconds are processor seconds of a stage, which other work on the machine does not stretch. The PSNR is predicted with
 the prior refitted without the scene (``tools.plan_prior``), so that it has not seen what it predicts.
 
-Whether to train at all is asked for each scene at the PSNR of its best measured neural point. What each route really
+Whether to train at all is asked for each scene at the PSNR of its best measured neural point; the corrector as it is
+shipped, which no frontier measures, is left out. What each route really
 costs is read off the frontier: path tracing on its measured baselines, the base image where it is good enough, the
 cheapest measured neural point that is. The answer counts as right where the route it names costs at most 15 % more
 than the cheapest.
@@ -124,7 +125,8 @@ def _expected(predictor: Predictor, results: FrontierResults, wanted: float, fra
     scale = predictor.wall.work.pixels / (width * height)
     assert predictor.pilot.frames is not None  # make_predictor asked for it
     part = as_reported(predictor.pilot.frames, predictor.quality.reference)
-    return routes(part, neural, light, scale, wanted, frames)
+    part = part.model_copy(update={"shipped": None})  # no frontier measures the corrector as it is shipped
+    return routes(part, neural, light, light, scale, wanted, frames)
 
 
 def _actual(results: FrontierResults, neural: list[Point], wanted: float, frames: int) -> dict[str, float]:

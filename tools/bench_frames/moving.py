@@ -140,8 +140,8 @@ def _figures(
     pairs = []
     for i in last:
         pair = (i - 1, i)
-        planes = [[_plane(images[j]) for j in pair] for images in (shown, truth)]
-        pairs.append(flicker(*planes, [surfaces[j] for j in pair]))
+        ours, true = ([_plane(images[j]) for j in pair] for images in (shown, truth))
+        pairs.append(flicker(ours, true, [surfaces[j] for j in pair]))
     return {**quality, **{key: float(np.mean([pair[key] for pair in pairs])) for key in pairs[0]}}
 
 

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -117,7 +117,8 @@ def _run(worker: Worker, common: dict[str, Any], view: View, target: float, most
         task = {**common, "seed": seed, "samples": str(path), "samples_fingerprint": "bench"}
         passes = 0
         while (step := schedule.next()) is not None and step.add:
-            schedule.passed(view.name, add=step.add, **worker({**task, "add": step.add}))
+            answer = cast(dict[str, Any], worker({**task, "add": step.add}))
+            schedule.passed(view.name, add=step.add, **answer)
             passes += 1
         assert step is not None  # a view that is idle has a step: samples, or its end
         samples = read_samples(path, "bench", view.height, view.width)

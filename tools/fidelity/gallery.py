@@ -98,7 +98,8 @@ def write_triptych(cycles: np.ndarray, found: np.ndarray, target: Path) -> None:
 def smoothed(signed: np.ndarray) -> np.ndarray:
     """Mean of the 5 x 5 neighbourhood, [H, W, 3]: what is left of a difference when noise averages out."""
     padded = np.pad(signed, ((2, 2), (2, 2), (0, 0)), mode="edge")
-    return np.lib.stride_tricks.sliding_window_view(padded, (5, 5), axis=(0, 1)).mean(axis=(-1, -2))
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (5, 5, 1))  # [H, W, 3, 5, 5, 1]
+    return windows.mean(axis=(-3, -2, -1))
 
 
 def differences(cycles: np.ndarray, found: np.ndarray) -> str:
