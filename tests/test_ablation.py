@@ -137,6 +137,8 @@ def test_pieces_of_a_table_add_up_and_others_do_not() -> None:
         paper_tables.added(first, {**piece, "resolution": "256x256"})
     with pytest.raises(ValueError, match="precision"):
         paper_tables.added(first, {**piece, "precision": ["bfloat16"]})
+    with pytest.raises(ValueError, match="step2_steps"):
+        paper_tables.added({**first, "step2_steps": 2500}, {**piece, "step2_steps": 500})
 
 
 def test_cells_of_another_device_are_told_apart() -> None:
@@ -390,6 +392,7 @@ def test_bad_requests_are_one_line_and_leave_nothing(tmp_path: Path) -> None:
         (("--preset", "drift"), "unknown preset"),
         (("--set", "finetune.epoch=3"), "finetune.epoch"),
         (("--rows", "paper-uv-depth", "--set", "model.output=log"), "output = log"),
+        (("--rows", "dnr", "--set", "select.policy=coverage"), "chosen by farthest, random, rl-paper"),
     ):
         done = ablate(tmp_path / "out", *arguments)
         assert done.returncode == 2, done.stderr

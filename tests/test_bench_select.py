@@ -23,6 +23,7 @@ from dnrpipe.core.cameras import make_cameras
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import CameraSettings, resolve
 from dnrpipe.studies.cells.intervals import difference, half_width, summarise, t_distribution, t_quantile
+from dnrpipe.studies.cells.request import epochs_of
 from dnrpipe.studies.selectbench.active.batches import KINDS
 from dnrpipe.studies.selectbench.bench_select import choose_budgets
 from dnrpipe.studies.selectbench.bench_tables import markdown, together
@@ -240,6 +241,29 @@ def test_every_pool_has_its_own_rival_and_differences_are_paired() -> None:
     assert "| 29.12 ± 0.18 |" in line and "| **+4.12 [+2.54, +5.71]** |" in line and "| +1.00 (a) |" in line
     assert "| 1.50 | 32 |" in line  # selection and total seconds
     assert "bench-select" in text and "commit abc" in text and "Student's t over scenes" in text
+
+
+def test_the_best_simple_rule_is_best_over_scenes_not_over_cells() -> None:
+    """Scene a has three seeds and likes `farthest` by 0.3 dB, b and c have one and like `kmedoids` by 0.2."""
+    values = {
+        (scene, "dome", 10, policy, seed): 20.0 + (gain if policy == liked else 0.0)
+        for scene, seeds, liked, gain in (
+            ("a", 3, "farthest", 0.3),
+            ("b", 1, "kmedoids", 0.2),
+            ("c", 1, "kmedoids", 0.2),
+        )
+        for policy in ("farthest", "kmedoids")
+        for seed in range(seeds)
+    }
+    figures = Figures(results(values))
+    assert figures.best_simple("dome", 10) == "kmedoids"  # by cells 0.08 against 0.18, by scenes 0.133 against 0.1
+    found = figures.against("farthest", "simple", ["dome"], 10)
+    assert found is not None and found.mean == pytest.approx(-0.1 / 3)
+
+
+def test_steps_are_whole_passes_over_the_views() -> None:
+    assert epochs_of(2500, 10, 1) == 250 and epochs_of(2500, 10, 4) == 833 and epochs_of(2500, 25, 4) == 357
+    assert epochs_of(3, 100, 1) == 1
 
 
 def test_quality_against_the_number_of_views_has_pairs_and_the_price_of_choosing() -> None:

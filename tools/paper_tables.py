@@ -68,7 +68,7 @@ TABLES = {
 PLACE = ("scene", "row", "pool", "budget", "policy", "seed")
 """What tells the cells of a table apart."""
 DEVICE = ("device", "threads")
-SAME = ("schema", "preset", "resolution", "seconds", "spp", "budget", "candidates", "precision")
+SAME = ("schema", "preset", "resolution", "seconds", "spp", "budget", "candidates", "precision", "step2_steps")
 """What cells of one table have in common."""
 
 

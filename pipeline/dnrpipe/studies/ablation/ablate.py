@@ -24,6 +24,7 @@ from ..cells.cell import STEP1_SHARE
 from ..cells.measure import METRICS, mean_of, pictured
 from ..cells.request import SMOKE_RUN, SMOKE_SCENE, merged
 from ..cells.scenes import (
+    BY_POSE,
     Scene,
     choose_by_pose,
     find_scenes,
@@ -156,6 +157,10 @@ class Ablation(Study[tuple[str, str, int]]):
         settings = settings_of(row, self.base, self.overrides)
         if not row.network and settings.model.base == "none":
             raise UserError(f"row {row.name}: preset '{settings.preset}' has no base image (model.base is none)")
+        policy = settings.select.policy
+        if not row.everything and policy not in (*BY_POSE, *TRAINED_NAMES):
+            known = ", ".join((*BY_POSE, *TRAINED_NAMES))
+            raise UserError(f"row {row.name}: select.policy={policy}: an ablation's views are chosen by {known}")
         return settings if scene is None else without_left_out(scene.workspace, settings)
 
     # -- results ---------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
@@ -30,6 +31,11 @@ def merged(layers: Sequence[Mapping[str, Any]], assignments: Sequence[str]) -> d
     for layer in (*layers, *map(parse_assignment, assignments)):
         found = merge(found, layer)
     return found
+
+
+def epochs_of(steps: int, views: int, batch: int) -> int:
+    """Passes over so many views that come nearest to ``steps`` optimiser steps, one at least."""
+    return max(1, round(steps / math.ceil(views / batch)))
 
 
 def choose_names(

@@ -51,13 +51,17 @@ class Scene:
         return Run(self.workspace, settings, self.console, stage, self.run_id)
 
 
+BY_POSE = ("farthest", "random")
+"""Rules of camera poses alone."""
+
+
 def choose_by_pose(views: Sequence[View], policy: str, budget: int, seed: int) -> list[View]:
-    """The views that a rule of poses alone chooses: ``farthest`` or ``random``."""
+    """The views that a rule of `BY_POSE` chooses."""
     from dnrtrain.selector.policies import untrained
     from dnrtrain.selector.protocol import Candidates
 
     rule = untrained(policy)
-    assert rule is not None  # both names above are rules
+    assert rule is not None
     return [views[place] for place in rule.choose(Candidates.of_views(views), budget, seed).views]
 
 

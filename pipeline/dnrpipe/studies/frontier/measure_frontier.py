@@ -24,6 +24,7 @@ from ...stages.stage import Run
 from ...workers.view_tasks import worker_count
 from ..ablation.ablate import Ablation
 from ..ablation.rows import ROWS, Row
+from ..cells.request import epochs_of
 from ..cells.results import made_by
 from ..cells.scenes import Scene, prepared, without_left_out
 from ..cells.study import WorkerPool
@@ -65,7 +66,7 @@ class Sweep:
         """All points as rows; the base image alone last. Raises UserError: no paper row at these sizes."""
         batch = settings.finetune.step2.batch
         found = [
-            self._row(f"{views} views, {spp} spp, {steps} steps", views, spp, max(1, round(steps * batch / views)))
+            self._row(f"{views} views, {spp} spp, {steps} steps", views, spp, epochs_of(steps, views, batch))
             for views in self.budgets
             for spp in self.samples
             for steps in self.steps

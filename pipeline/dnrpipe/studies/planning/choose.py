@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from ..cells.request import epochs_of
 from .quality import Quality
 from .records import Choice, Interval, Pilot, Prediction, Seconds
 from .seconds import TIME_SPREAD, Costs, noise_at
@@ -31,9 +32,8 @@ class Predictor:
 
     def choice(self, views: int, spp: int, steps: int) -> Choice:
         """The choice of about so many steps: whole passes over the views, one at least."""
-        per_epoch = math.ceil(views / self.batch)
-        epochs = max(1, round(steps / per_epoch))
-        return Choice(views=views, spp=spp, epochs=epochs, steps=epochs * per_epoch)
+        epochs = epochs_of(steps, views, self.batch)
+        return Choice(views=views, spp=spp, epochs=epochs, steps=epochs * math.ceil(views / self.batch))
 
     def predict(self, choice: Choice) -> Prediction:
         """What the choice is expected to cost and give."""

@@ -24,7 +24,7 @@ from ...core.settings import Settings, merge, resolve
 from ...core.workspace import digest
 from ..cells.cell import CELL_VERSION
 from ..cells.measure import METRICS, mean_of, written_seconds
-from ..cells.request import SMOKE_RUN, SMOKE_SCENE, merged
+from ..cells.request import SMOKE_RUN, SMOKE_SCENE, epochs_of, merged
 from ..cells.scenes import base_files, find_scenes, make_bases, trace_references, trace_train, without_left_out
 from ..cells.study import CELL_WORKER, Study
 from ..cells.tasks import CellTask, ChoiceFile, Step1Task, files_of
@@ -235,7 +235,7 @@ class Bench(Study[Place]):
         if self.steps is None:
             return settings
         changed = settings.model_copy(deep=True)
-        changed.finetune.step2.epochs = max(1, round(self.steps * changed.finetune.step2.batch / views))
+        changed.finetune.step2.epochs = epochs_of(self.steps, views, changed.finetune.step2.batch)
         return changed
 
     def _settings(self, pool: Pool) -> Settings:

@@ -3,6 +3,7 @@
 Two policies are compared where all else is equal: scene, pool, budget, seed. The seeds of a scene share its difficulty
 and its candidates, so they are no independent trials: the unit is the *scene*, its value the mean over seeds, and the
 interval is Student's over scenes. With a single scene the units are its seeds, and the interval speaks of that scene.
+Only against the number of views (`Figures.paired`) is every pair a unit, and the interval speaks of these very scenes.
 """
 
 from __future__ import annotations
@@ -49,13 +50,20 @@ class Figures:
         return [statistics.fmean(values[scene, seed] for scene in self.scenes) for seed in whole]
 
     def best_simple(self, pool: str, budget: int) -> str | None:
-        """The simple rule of highest mean PSNR over the (scene, seed) that all simple rules here have."""
+        """The simple rule of highest PSNR, a scene counting once, over the (scene, seed) that all simple rules have."""
         found = {name: self.values(pool, budget, name, "psnr") for name in SIMPLE}
         found = {name: values for name, values in found.items() if values}
         shared = set.intersection(*(set(values) for values in found.values())) if found else set()
         if not shared:
             return None
-        return max(found, key=lambda name: statistics.fmean(found[name][place] for place in shared))
+        by_scene: dict[str, set[tuple[str, int]]] = {}
+        for place in shared:
+            by_scene.setdefault(place[0], set()).add(place)
+
+        def mean(name: str) -> float:
+            return statistics.fmean(statistics.fmean(found[name][p] for p in places) for places in by_scene.values())
+
+        return max(found, key=mean)
 
     def against(self, policy: str, kind: str, pools: Sequence[str], budget: int) -> Difference | None:
         """PSNR: policy - baseline, each pool with its own: ``random``, or its best simple rule for kind ``simple``.
