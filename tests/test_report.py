@@ -248,6 +248,19 @@ def test_missing_weights_and_noisy_references_are_said(tmp_path: Path) -> None:
         assert "L_p was dropped" not in build_report(root).read_text(encoding="utf-8")
 
 
+def test_a_renderer_without_training_is_said_to_be_that(tmp_path: Path) -> None:
+    """`--budget 0`: the shipped corrector is the model of step 2, with no history and no views."""
+    root = make_workspace(tmp_path / "x.dnr", size=16, chosen=[], lpips=False)
+    _rewrite(root / "checkpoints" / "step2" / "model.json", lambda m: m.update(history=[]))
+    data = collect(root)
+    assert data.verdict.startswith("Without training, the renderer reaches")
+    assert not any("finetune" in part.command for part in data.missing)
+    told = " ".join(data.notes)
+    assert "LPIPS could not be measured" in told and "L_p was dropped" not in told
+    (root / "evaluation" / "metrics.json").unlink()
+    assert "it has not been measured yet" in collect(root).verdict
+
+
 def test_choosing_that_costs_more_than_it_saves_is_said(tmp_path: Path) -> None:
     root = make_workspace(tmp_path / "x.dnr", candidates=12, size=16)  # saves 20.2 s, step 1 takes 24 s
     html = build_report(root).read_text(encoding="utf-8")

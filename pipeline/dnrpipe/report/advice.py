@@ -21,13 +21,16 @@ def verdict(quality: Quality | None, selection: Selection | None) -> str:
     if selection is None:
         return "The scene is prepared; no views have been chosen yet."
     chosen = f"{len(selection.views)} of {selection.candidates} candidate views"
+    how = f"Trained on {chosen}" if selection.views else "Without training"
+    if quality is None and not selection.views:
+        return "No views are to be ray-traced: the renderer is the shipped one; it has not been measured yet."
     if quality is None:
         return f"{chosen} were chosen for ray tracing ({selection.policy}); the renderer has not been measured yet."
     psnr = next((row for row in quality.rows if row.key == "psnr"), None)
     if psnr is None:
-        return f"Trained on {chosen}."
+        return f"{how}."
     views = "the one view" if len(quality.views) == 1 else f"{len(quality.views)} views"
-    text = f"Trained on {chosen}, the renderer reaches {psnr.mean:.1f} dB on {views} that it never saw"
+    text = f"{how}, the renderer reaches {psnr.mean:.1f} dB on {views} that it never saw"
     if quality.neural_seconds is None or quality.frame_seconds is None:
         return text + "."
     text += f", at {duration(quality.neural_seconds)} per frame"
@@ -57,17 +60,15 @@ def missing(
     root: Path,
     cameras: dict[str, list[View]],
     selection: Selection | None,
-    training: Sequence[Training],
     quality: Quality | None,
 ) -> list[Missing]:
     """Parts of the report whose stages have not run, in the order of the stages."""
-    steps = {t.step for t in training}
     due = [
         (not cameras["train"], "cameras and passes", "prepare SCENE"),
         (selection is None, "the choice of views", "select"),
         (selection is None or selection.traced < len(selection.views), "ground truth of the chosen views",
          "raytrace-selected"),
-        (2 not in steps, "the fine-tuned renderer", "finetune"),
+        (not (root / "checkpoints" / "step2" / "model.json").is_file(), "the fine-tuned renderer", "finetune"),
         (quality is None, "held-out quality and pictures", "evaluate"),
     ]  # fmt: skip
     where = f" -w {shlex.quote(root.name)}"
@@ -85,7 +86,9 @@ def notes(
 ) -> list[str]:
     """What a reader should know before trusting the figures, one or two sentences each."""
     found = []
-    if quality and (text := perceptual_note(quality, manifest.get("settings", {}))):
+    if quality and (
+        text := perceptual_note(quality, manifest.get("settings", {}), trained=any(t.step == 2 for t in training))
+    ):
         found.append(text)
     if quality and (broken := sum(view.psnr is None for view in quality.views)):
         found.append(

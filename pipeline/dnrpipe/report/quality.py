@@ -119,11 +119,11 @@ def _row(views: Sequence[TestView], metric: tuple[str, str, str, int, bool]) -> 
     )
 
 
-def perceptual_note(quality: Quality, settings: dict[str, Any]) -> str | None:
-    """A note if training or evaluation had no pretrained weights, else None."""
+def perceptual_note(quality: Quality, settings: dict[str, Any], *, trained: bool) -> str | None:
+    """A note if training, where there was one, or evaluation had no pretrained weights, else None."""
     parts = []
     weight = settings.get("finetune", {}).get("step2", {}).get("loss", {}).get("perceptual", 0.1)
-    if not quality.trained_with_perceptual and weight:
+    if trained and not quality.trained_with_perceptual and weight:
         parts.append("the perceptual loss L_p was dropped in step 2, so quality does not compare with runs that had it")
     if not any(row.key.startswith("lpips") for row in quality.rows):
         parts.append("LPIPS could not be measured")

@@ -106,7 +106,7 @@ def evaluate(run: Run) -> Outcome:
         views=rows,
         mean=mean,
         perceptual=perceptual is not None,
-        trained_with_perceptual=workspace.manifest.stages["finetune"].detail.get("perceptual", False),
+        trained_with_perceptual=workspace.manifest.stages["finetune"].detail.get("perceptual"),
         device=torch.cuda.get_device_name() if device.startswith("cuda") else "cpu",
         raster_engine=workspace.manifest.prepared.raster_engine if workspace.manifest.prepared else "",
         reference_noise_target=settings.raytrace.evaluation_noise,
