@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import json
 from pathlib import Path
@@ -20,6 +21,7 @@ from dnrpipe.studies.planning.carry_out import steps_that_fit, steps_within
 from dnrpipe.studies.planning.choose import NEAR, Predictor, best_within, budgets, cheapest_reaching
 from dnrpipe.studies.planning.pilot import pilot_path, read_pilot
 from dnrpipe.studies.planning.pilot_worker import without_reference
+from dnrpipe.studies.planning.plan_text import break_even_line
 from dnrpipe.studies.planning.quality import (
     Gain,
     Measured,
@@ -45,8 +47,17 @@ from dnrpipe.studies.planning.records import (
     TracePart,
     TrainingPart,
 )
-from dnrpipe.studies.planning.routes import UNTRAINED, as_reported, baseline_front, break_even, routes, seconds_for
-from dnrpipe.studies.planning.seconds import Costs, Work, noise_at, view_line
+from dnrpipe.studies.planning.routes import (
+    PATH_TRACING,
+    TRAINED,
+    UNTRAINED,
+    as_reported,
+    baseline_front,
+    break_even,
+    routes,
+    seconds_for,
+)
+from dnrpipe.studies.planning.seconds import RULE_SECONDS, Costs, Work, noise_at, view_line
 
 PRIOR = load_prior()
 POSITIVE = st.floats(1e-8, 1e-5)
@@ -105,7 +116,7 @@ def pilot() -> Pilot:
 
 def predictor() -> Predictor:
     one = pilot()
-    work = Work(pixels=128 * 128, trained=128 * 128, light=(512, 128), policy_seconds=1.0, tests=12, evaluation_spp=512)
+    work = Work(pixels=128 * 128, trained=128 * 128, light=(512, 128), step1=0, tests=12, evaluation_spp=512)
     gain = scene_gain(PRIOR, [Measured(6, 100, 1.0), Measured(6, 300, 1.8)])
     wall, processor = Costs(one, work, "seconds"), Costs(one, work, "cpu_seconds")
     return Predictor(one, wall, processor, Quality(PRIOR, 28.0, gain), batch=1)
@@ -141,8 +152,29 @@ def test_light_is_extrapolated_by_texels_and_paths() -> None:
     costs = predictor().wall
     slope = 1.5 / (256**2 * 32)  # of the bake above
     assert costs.light() == pytest.approx(4.0 + 512**2 * 128 * slope)
-    done = Costs(costs.pilot, Work(1, 1, None, 0.0, 0, 1), "seconds")
+    done = Costs(costs.pilot, Work(1, 1, None, 0, 0, 1), "seconds")
     assert done.light() == 0.0
+
+
+def test_step_1_takes_as_long_as_its_steps_on_whole_pictures() -> None:
+    """The pilot's step of 0.05 s (0.07 of the processor) is of 128²; four times the pixels take four times as long."""
+    costs = predictor().wall
+    assert costs.select() == RULE_SECONDS  # a rule trains nothing
+    work = dataclasses.replace(costs.work, pixels=256 * 256, step1=100)
+    assert Costs(costs.pilot, work, "seconds").select() == pytest.approx(100 * 0.05 * 4)
+    assert Costs(costs.pilot, work, "cpu_seconds").select() == pytest.approx(100 * 0.07 * 4)
+
+
+def test_why_there_is_no_break_even_is_said() -> None:
+    def plan(traced: bool, neural: bool, frames: int | None = None) -> Plan:
+        kinds = ((PATH_TRACING, traced), (TRAINED, neural))
+        found = [Route(name=n, what="", upfront=1, frame=1, total=1, psnr=30, reaches=reaches) for n, reaches in kinds]
+        return Plan.model_construct(routes=found, break_even=frames)
+
+    assert "Path tracing is not expected" in break_even_line(plan(traced=False, neural=True))
+    assert "neural renderer is not expected" in break_even_line(plan(traced=True, neural=False))
+    assert "never pays" in break_even_line(plan(traced=True, neural=True))
+    assert "120 frames" in break_even_line(plan(traced=True, neural=True, frames=120))
 
 
 def test_processor_seconds_count_no_waiting_and_no_cores() -> None:

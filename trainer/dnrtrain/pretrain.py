@@ -12,6 +12,7 @@ terms would take noise for structure, so they are small or none.
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -63,7 +64,7 @@ def pretrain(
     """Train for so many seconds in all; yields a record every ``every`` seconds, the last one at the end.
 
     Args:
-        folder: holds the state of an interrupted training, which goes on.
+        folder: holds the state of an interrupted training, which goes on if all that decides it is the same.
         side: of the squares, pixels.
         begin: a corrector to go on from; None: fresh.
     """
@@ -74,7 +75,8 @@ def pretrain(
     optimiser = adam([dnr], RATE, "cpu")
     average = Averaged(dnr, EMA)
     spent, step = 0.0, 0
-    run = f"pretrain {model.model_dump_json()} {seed}"
+    scenes = [one.scene.seed for one in training]
+    run = f"pretrain {model.model_dump_json()} {seed} {batch} {side} {scenes} {begin and _checksum(begin)}"
     saved = checkpoint.load_state(folder, run)
     if saved is not None:
         dnr.load_state_dict(saved.parts["dnr"])
@@ -116,6 +118,14 @@ def pretrain(
                 found = judge(dnr, held_out)
             yield {"seconds": round(spent), "step": step, "loss": total / max(count, 1), **found}
             total, count, clock = 0.0, 0, time.monotonic()
+
+
+def _checksum(model: DNR) -> str:
+    found = hashlib.sha256()
+    for name, weights in sorted(model.state_dict().items()):
+        found.update(name.encode())
+        found.update(weights.detach().cpu().contiguous().numpy().tobytes())
+    return found.hexdigest()
 
 
 def photometric(rgb: Tensor, batch: Batch) -> Tensor:

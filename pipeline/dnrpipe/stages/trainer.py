@@ -57,6 +57,12 @@ def load(
     )
 
 
+def trained_pixels(settings: Settings, width: int, height: int) -> int:
+    """Pixels of an optimiser step of step 2 on views of that size: of a patch, where the settings have one."""
+    patch = settings.finetune.step2.patch or max(width, height)
+    return min(patch, width) * min(patch, height)
+
+
 def torch_device(settings: Settings) -> str:
     """The device the setting names; auto is CUDA where torch has it, else the CPU."""
     import torch

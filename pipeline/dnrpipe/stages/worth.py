@@ -25,7 +25,7 @@ from ..core.errors import UserError
 from ..core.settings import MOST_VIEWS
 from ..workers.view_tasks import worker_count
 from .stage import Run
-from .trainer import load, perceptual_weights, torch_device
+from .trainer import load, perceptual_weights, torch_device, trained_pixels
 from .trust import SPLIT, SPP, best_share, mean_psnr, traced_small
 
 if TYPE_CHECKING:
@@ -79,7 +79,8 @@ def worth(run: Run, candidates: int) -> Worth:
     traced = [r.seconds for r in run.workspace.ledger.read() if r.name.startswith(f"{SPLIT}/") and not r.cache_hit]
     scale = cameras.width * cameras.height * settings.raytrace.spp / (width * height * SPP)
     tracing = min(traced, default=0.0) * scale / worker_count(settings.raytrace.workers)  # the others compiled kernels
-    seconds = tracing + settings.finetune.step2.epochs * step
+    pixels = trained_pixels(settings, cameras.width, cameras.height) / trained_pixels(settings, width, height)
+    seconds = tracing + settings.finetune.step2.epochs * step * pixels
     count = views_worth(gain, seconds, settings.select.worth / 60, min(candidates, MOST_VIEWS))
     return Worth(gain=gain, seconds=seconds, views=count, expected=expected_gain(gain, count))
 

@@ -24,7 +24,7 @@ from ... import __version__
 from ...core.console import Console
 from ...core.errors import UserError
 from ...core.settings import Settings
-from ...core.workspace import digest, locked
+from ...core.workspace import digest, file_sha256, locked
 from ...stages.trainer import perceptual_weights, torch_device
 from ...workers.placement import Placement
 from ...workers.task_list import run_tasks
@@ -211,6 +211,8 @@ class Study(ABC, Generic[Place]):
             network, full_step1: of `CellTask`.
             spp: of the training views' pictures, None: the settings'.
         """
+        from dnrtrain.shipped import WEIGHTS
+
         views, seconds = (list(traced), self.seconds) if network else ([], None)
         model, step2 = settings.model.model_dump(mode="json"), settings.finetune.step2.model_dump(mode="json")
         used = [*(f"train/{name}" for name in views), *(f"test/{name}" for name in scene.test)]
@@ -218,6 +220,7 @@ class Study(ABC, Generic[Place]):
         if network:
             time = [seconds, full_step1] if seconds else None
             train = [seed, list(traced.values()), step2, coarse and coarse.fingerprint, time]
+            train += [file_sha256(WEIGHTS)] if settings.finetune.step2.start == "pretrained" else []
             decisive += [train, *self.environment]
         fingerprint = digest([CELL_VERSION, __version__, *decisive, self.perceptual])
         folder = self.out / "cells" / scene.name

@@ -135,6 +135,11 @@ def run_frontier(
         UserError: unknown names, numbers that do not fit. TasksFailed: some cells failed; the others are written.
     """
     workspace, settings = run.workspace, run.settings
+    if settings.raytrace.noise is not None or settings.raytrace.time is not None:
+        raise UserError(
+            "frontier compares numbers of samples, and views are to be traced to a noise level or a time here"
+            " (raytrace.noise, raytrace.time); `dnrpipe raytrace-selected --spp N` goes back to samples"
+        )
     candidates = len(split_views(workspace)["train"])
     counts = numbers(frames, "--frames", (200, 2000))
     others = () if also.strip() == "none" else tuple(filter(None, (part.strip() for part in also.split(","))))

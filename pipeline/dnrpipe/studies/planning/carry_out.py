@@ -61,7 +61,7 @@ def overrides_of(plan: Plan) -> dict[str, Any]:
     assert found is not None  # a plan without a choice is not carried out
     return {
         "select": {"budget": found.choice.views, "policy": plan.policy},
-        "raytrace": {"spp": found.choice.spp},
+        "raytrace": {"spp": found.choice.spp, "noise": None, "time": None},  # the samples are the goal now
         "finetune": {"step2": {"epochs": found.choice.epochs}},
     }
 

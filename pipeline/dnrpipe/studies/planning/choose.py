@@ -40,7 +40,7 @@ class Predictor:
         assert self.pilot.trace is not None
         views, steps, epochs = choice.views, choice.steps, choice.epochs
         stages = {
-            "select": self.wall.work.policy_seconds,
+            "select": self.wall.select(),
             "raytrace": self.wall.raytrace(views, choice.spp),
             "finetune": self.wall.finetune(steps, epochs),
         }
@@ -49,7 +49,9 @@ class Predictor:
         return Prediction(
             choice=choice,
             seconds=Seconds(**stages, evaluate=self.wall.evaluate(), total=within),
-            cpu_seconds=self.processor.raytrace(views, choice.spp) + self.processor.finetune(steps, epochs),
+            cpu_seconds=self.processor.select()
+            + self.processor.raytrace(views, choice.spp)
+            + self.processor.finetune(steps, epochs),
             psnr=self.quality.predict(views, steps, noise_at(self.pilot.trace, choice.spp)),
         )
 

@@ -14,15 +14,13 @@ from ...core.workspace import Workspace
 from ...effects.store import plan_of
 from ...stages.base_images import base_renderer
 from ...stages.stage import Run
+from ...stages.trainer import trained_pixels
 from .choose import Predictor, best_within, budgets, cheapest_reaching
 from .pilot import run_pilot
 from .quality import Prior, Quality, load_prior, measured_gains, scene_gain, views_error, with_noise
 from .records import Pilot, PilotFacts, Plan, Prediction, PriorFacts, Route, Wanted, read_plan, write_plan
 from .routes import as_reported, break_even, routes
-from .seconds import Costs, Work, noise_at, trained_pixels
-
-RULE_SECONDS = 2.0
-"""Wall seconds allowed for a choice of views that trains nothing."""
+from .seconds import Costs, Work, noise_at
 
 
 def make_plan(run: Run, wanted: Wanted, prior: Prior | None = None) -> Plan:
@@ -74,12 +72,11 @@ def make_predictor(workspace: Workspace, settings: Settings, pilot: Pilot, prior
     width, height = settings.cameras.width, settings.cameras.height
     splits = split_views(workspace)
     trains = policy_of(workspace, settings) in TRAINED_NAMES or settings.starts_coarse
-    steps = settings.select.step1.epochs * len(splits["train"])
     work = Work(
         pixels=width * height,
         trained=trained_pixels(settings, width, height),
         light=due,
-        policy_seconds=steps * training.seconds if trains else RULE_SECONDS,  # steps as long as the pilot's
+        step1=settings.select.step1.epochs * len(splits["train"]) if trains else 0,
         tests=len(splits.get("test", [])),
         evaluation_spp=trace.evaluation_spp,
     )

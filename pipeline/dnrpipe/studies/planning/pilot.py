@@ -30,7 +30,7 @@ from ...core.cameras import scaled_to
 from ...core.errors import UserError
 from ...core.scene_files import scene_fingerprint, split_views
 from ...core.settings import Settings
-from ...core.workspace import Workspace, digest
+from ...core.workspace import Workspace, digest, file_sha256
 from ...effects.plan import EffectPlan
 from ...effects.store import lenses, trace_config, variant_for
 from ...raytrace.tasks import BaseTask, BundleCommon, TraceTask
@@ -38,12 +38,12 @@ from ...stages.base_images import RENDERED, bake_light, base_renderer
 from ...stages.effect_plan import resolve_plan
 from ...stages.raytrace import view_seed
 from ...stages.stage import Run
+from ...stages.trainer import trained_pixels
 from ...workers.task_list import run_tasks
 from ...workers.view_tasks import warn_of_retries, worker_count
 from ..cells.scenes import choose_by_pose
 from .pilot_worker import FramesTask, PilotCommon, TrainTask
 from .records import FOLDER, BasePart, FramePart, LightPart, LightPoint, Pilot, Traced, TracePart, TrainingPart
-from .seconds import trained_pixels
 
 VERSION = 8
 RESOLUTION = 128
@@ -120,6 +120,8 @@ def read_pilot(workspace: Workspace) -> Pilot | None:
 
 def _fingerprint(workspace: Workspace, settings: Settings, plan: EffectPlan) -> str:
     """Hash of all that decides what the pilot measures."""
+    from dnrtrain.shipped import WEIGHTS
+
     step2 = settings.finetune.step2.model_dump(mode="json", exclude={"epochs"})
     return digest(
         [
@@ -127,6 +129,8 @@ def _fingerprint(workspace: Workspace, settings: Settings, plan: EffectPlan) -> 
             workspace.manifest.stages["prepare"].output,
             *(plan.integrator, plan.max_depth, sorted(plan.left_out), plan.model(settings.model).model_dump()),
             *(settings.base.model_dump(), step2, settings.raytrace.denoise, settings.device, os.cpu_count()),
+            *(worker_count(settings.raytrace.workers), settings.raytrace.variant, plan.on("spectral")),
+            file_sha256(WEIGHTS),
         ]
     )
 

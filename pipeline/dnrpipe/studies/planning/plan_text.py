@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ...core.units import duration
 from .records import RENDERER_STAGES, Plan, Prediction
+from .routes import PATH_TRACING, TRAINED, UNTRAINED
 
 BUSY = 1.5
 """Processes waiting per core from which on wall seconds say more of the other work than of this."""
@@ -94,12 +95,19 @@ def route_lines(plan: Plan) -> list[str]:
         found.append("Train: the neural renderer is the cheapest.")
     else:
         found.append(f"Do not train: {best.name} is cheaper.")
-    found.append(
-        "The neural renderer never pays for itself against path tracing at that PSNR."
-        if plan.break_even is None
-        else f"Break-even against path tracing + denoiser: {plan.break_even} frames."
-    )
-    return found
+    return [*found, break_even_line(plan)]
+
+
+def break_even_line(plan: Plan) -> str:
+    """From how many frames on the neural renderer pays for itself, or why that cannot be said. A plan with routes."""
+    reach = {route.name for route in plan.routes or [] if route.reaches}
+    if plan.break_even is not None:
+        return f"Break-even against path tracing + denoiser: {plan.break_even} frames."
+    if PATH_TRACING not in reach:
+        return "Path tracing is not expected to reach that PSNR, so there is no break-even."
+    if not reach & {UNTRAINED, TRAINED}:
+        return "The neural renderer is not expected to reach that PSNR, so there is no break-even."
+    return "The neural renderer never pays for itself against path tracing at that PSNR."
 
 
 def actual_lines(plan: Plan) -> list[str]:

@@ -223,7 +223,8 @@ class Plan(Record):
         gain: dB that the network adds with many views and steps.
         chosen: None where a table was asked for, or where nothing reaches the target.
         routes: to the wanted frames at ``routes_psnr``, the cheapest first.
-        break_even: frames from which on training is cheaper than path tracing; None where it never is.
+        break_even: frames from which on the neural renderer is cheaper than path tracing; None where it never is, or
+            where one of them does not reach the PSNR.
         train: whether the neural renderer is the cheapest route.
         carried_out: the choice once its steps fit the time that ray tracing left.
     """

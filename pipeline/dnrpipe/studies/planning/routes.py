@@ -18,7 +18,7 @@ from ..frames.pareto_front import crossover, frontier
 from .quality import with_noise
 from .records import FramePart, FramePoint, Prediction, Route
 
-UNTRAINED = "neural renderer, untrained"
+PATH_TRACING, UNTRAINED, TRAINED = "path tracing + denoiser", "neural renderer, untrained", "neural renderer"
 FURTHEST = 64.0
 """How many times the last baseline's time the slope is followed beyond it."""
 
@@ -82,11 +82,11 @@ def routes(
     if (answer := seconds_for(line, psnr)) is None:
         name, seconds, quality = line[-1]
         what = f"its best, {name}, ends at {quality:.1f} dB"
-        add("path tracing + denoiser", what, 0.0, seconds * scale, quality, quality >= psnr)
+        add(PATH_TRACING, what, 0.0, seconds * scale, quality, quality >= psnr)
     else:
         seconds, beyond = answer
         what = "beyond the pilot's samples, extrapolated" if beyond else _between(line, seconds)
-        add("path tracing + denoiser", what, 0.0, seconds * scale, psnr, True)
+        add(PATH_TRACING, what, 0.0, seconds * scale, psnr, True)
     base, alone = part.base.psnr, part.base.ms / 1000 * scale
     add("base image alone", "baked light, no network", light_seconds, alone, base, base >= psnr)
     if part.shipped is not None:
@@ -94,19 +94,22 @@ def routes(
         add(UNTRAINED, "baked light, shipped corrector", untrained_seconds, frame, quality, quality >= psnr)
     frame = part.neural[-1].ms / 1000 * scale
     if neural is None:
-        add("neural renderer", "no choice is expected to reach it", 0.0, frame, None, False)
+        add(TRAINED, "no choice is expected to reach it", 0.0, frame, None, False)
     else:
         choice, upfront = neural.choice, neural.seconds.total.expected
         what = f"{choice.views} views, {choice.spp} spp, {choice.steps} steps"
-        add("neural renderer", what, upfront, frame, neural.psnr.expected, True)
+        add(TRAINED, what, upfront, frame, neural.psnr.expected, True)
     return sorted(found, key=lambda route: (not route.reaches, route.total))
 
 
 def break_even(found: Sequence[Route]) -> int | None:
-    """Frames from which on the neural renderer, trained or not, is cheaper than path tracing; None: it never is."""
+    """Frames from which on the neural renderer, trained or not, is cheaper than path tracing.
+
+    None: it never is, or one of the two does not reach the PSNR.
+    """
     by_name = {route.name: route for route in found}
-    traced = by_name["path tracing + denoiser"]
-    ours = [by_name[name] for name in (UNTRAINED, "neural renderer") if name in by_name and by_name[name].reaches]
+    traced = by_name[PATH_TRACING]
+    ours = [by_name[name] for name in (UNTRAINED, TRAINED) if name in by_name and by_name[name].reaches]
     even = [break_even_frames(route.upfront, traced.frame, route.frame) for route in ours if traced.reaches]
     return min((frames for frames in even if frames is not None), default=None)
 

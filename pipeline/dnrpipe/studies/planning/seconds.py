@@ -17,19 +17,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...core.errors import UserError
-from ...core.settings import Settings
 from ...stages import trust
 from .records import Clock, Pilot, TracePart
 
 TIME_SPREAD = 1.4
 """Intervals of seconds reach from 1/1.4 to 1.4 times the prediction: 34 of 40 runs that followed their pilot ended
 within (docs/cost.md). A shared machine's speed drifts by so much from one minute to the next."""
-
-
-def trained_pixels(settings: Settings, width: int, height: int) -> int:
-    """Pixels of a training step on views of that size: of a patch, where the settings have one."""
-    patch = settings.finetune.step2.patch or max(width, height)
-    return min(patch, width) * min(patch, height)
+RULE_SECONDS = 2.0
+"""Allowed for a choice of views that trains nothing."""
 
 
 @dataclass(frozen=True)
@@ -79,14 +74,14 @@ def noise_at(part: TracePart, spp: int, raw: bool = False) -> float:
 class Work:
     """What decides the seconds beside the choice. pixels: of a view; trained: of a training step (a patch, maybe).
 
-    light: (texels of the side, paths per texel) still to bake, or None. policy_seconds: of the selection.
-    tests: test views; evaluation_spp: samples of their references.
+    light: (texels of the side, paths per texel) still to bake, or None. step1: its optimiser steps, on whole pictures;
+    0 where views are chosen without training. tests: test views; evaluation_spp: samples of their references.
     """
 
     pixels: int
     trained: int
     light: tuple[int, int] | None
-    policy_seconds: float
+    step1: int
     tests: int
     evaluation_spp: int
 
@@ -102,6 +97,12 @@ class Costs:
     def __post_init__(self) -> None:
         if self.pilot.trace is None or self.pilot.base is None or self.pilot.training is None:
             raise UserError("the pilot is not complete; run `dnrpipe plan` again")
+
+    def select(self) -> float:
+        """Choosing the views; a step of step 1 is taken to be as long as one of step 2 on as many pixels."""
+        part = self.pilot.training
+        assert part is not None
+        return self.work.step1 * getattr(part, self.clock) * self.work.pixels / part.pixels or RULE_SECONDS
 
     def raytrace(self, views: int, spp: int) -> float:
         """Tracing, baked light and base images of the training views."""
