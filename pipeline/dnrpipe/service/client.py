@@ -43,6 +43,9 @@ RETRY_SECONDS = 4.0
 RETRY_INTERVAL = 0.5
 MAX_WAIT = 60.0
 MAX_REFUSALS = 5
+PASSING = (500, 502, 503, 504)
+"""Statuses of a server, or of a proxy in front of it, that may answer in a moment: as good as no answer. Sending the
+request again is safe: submits carry an idempotency key. 507, a full disk, is no such status."""
 CHUNK = 1 << 20
 Answer = TypeVar("Answer")
 
@@ -240,14 +243,14 @@ def _trust() -> ssl.SSLContext:
 
 
 def checked(answer: httpx.Response) -> httpx.Response:
-    """Raises Refused. Raises httpx.TransportError: a proxy in front of the server does not reach it."""
+    """Raises Refused. Raises httpx.TransportError: the server, or a proxy in front of it, fails for the moment."""
     if answer.is_success:
         return answer
-    if answer.status_code in (502, 504):
-        raise httpx.ProxyError(f"the proxy in front of it answers with {answer.status_code}")
     try:
         detail = str(answer.json()["detail"])
     except (ValueError, KeyError, TypeError):
         detail = f"{answer.request.method} {answer.request.url.path} was answered with {answer.status_code}"
+    if answer.status_code in PASSING:
+        raise httpx.TransportError(detail)
     wait = answer.headers.get("retry-after", "")
     raise Refused(answer.status_code, detail, float(wait) if wait.isdigit() else None)
