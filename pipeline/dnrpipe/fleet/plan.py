@@ -29,9 +29,9 @@ from pydantic import Field, ValidationError
 from dnrtrain.settings import Strict
 
 from ..core.errors import UserError
+from ..core.scene_files import TAKES_SCENE
 from ..core.settings import merge, resolve
 
-TAKES_SCENE = ("run", "prepare", "shot")
 TAKES_NO_FORCE = ("export-nerf", "export-onnx", "export-gltf", "export-web")
 COMMANDS = (
     *TAKES_SCENE,
