@@ -27,7 +27,7 @@ from dnrpipe.service.client import Client, Refused
 from dnrpipe.service.lease_client import LeaseClient
 from dnrpipe.service.leases import SHA256_HEADER, Beat, Lease, LeaseGone
 from dnrpipe.service.models import End, Job, JobRequest, Limits
-from dnrpipe.service.queue import MAX_STARTS, Queue
+from dnrpipe.service.queue import MAX_LOSSES, Queue
 from dnrpipe.service.remote_worker import _move_source
 from dnrpipe.service.root import ServiceRoot
 from dnrpipe.service.routes_leases import _scene_of
@@ -449,7 +449,7 @@ def test_a_lease_in_the_queue(tmp_path: Path) -> None:
     claimed = queue.claim("box/cpu", lease="third", seconds=-1)
     assert claimed is not None and (claimed.starts, claimed.lost) == (3, 1)
     assert "--force" not in job_command(claimed, root)
-    for _ in range(MAX_STARTS - 3):
+    for _ in range(MAX_LOSSES - 2):
         assert queue.recover_lapsed() == [job]
         assert queue.claim("box/cpu", lease="last", seconds=-1) is not None
     assert queue.recover_lapsed() == [job]
