@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
+from dnrpipe.core.errors import UserError
 from dnrpipe.service.client import Client, Refused, Unreachable
 from dnrpipe.service.lease_client import LeaseClient
 from dnrpipe.service.leases import Beat, BeatAnswer, Lease
@@ -80,3 +82,24 @@ def test_a_server_that_keeps_failing_is_told_of_in_its_words() -> None:
         client.job(1)
     with _server(_says(507)) as url, Client(url) as client, pytest.raises(Refused, match="not now"):
         client.job(1)  # a full disk stays full
+
+
+def test_a_quiet_stream_that_breaks_is_taken_up_again() -> None:
+    """Longer without an event than the client tries again for; then the server is away for a moment."""
+
+    def quiet(handler: BaseHTTPRequestHandler) -> None:
+        handler.send_response(200)
+        handler.send_header("Content-Length", "1000")  # more than comes
+        handler.end_headers()
+        handler.wfile.write(b": still here\n\n")
+        time.sleep(0.5)
+        handler.close_connection = True
+
+    event = 'id: 7\nevent: message\ndata: {"time": 1.0, "text": "on"}\n\nevent: end\ndata: {}\n\n'
+    with _server(quiet, _says(503), _says(200, event)) as url, Client(url, retry_seconds=2.0) as client:
+        assert [found.id for found in client.events(1)] == [7]
+    with _server(quiet, _says(200, event)) as url, Client(url, retry_seconds=0.2) as client:
+        assert [found.id for found in client.events(1)] == [7]
+    broke = pytest.raises(UserError, match=r"the event stream broke \(not now\)")
+    with _server(_says(503)) as url, Client(url, retry_seconds=0.2) as client, broke:
+        next(client.events(1))

@@ -113,18 +113,27 @@ class Client:
         return self._ask("GET", f"/jobs/{job}/logs", LogPage, params={"offset": offset})
 
     def events(self, job: int, after: int = 0) -> Iterator[JobEvent]:
-        """The job's events until it has ended; resumes a broken stream where it broke."""
-        last, deadline = after, time.monotonic() + self.retry_seconds
+        """The job's events until it has ended; resumes a broken stream where it broke.
+
+        Raises UserError: nothing came for ``retry_seconds`` after it broke.
+        """
+        last, failing = after, None
+
+        def heard() -> None:
+            nonlocal failing
+            failing = None
+
         while True:
             try:
-                for event in self._stream(job, last):
+                for event in self._stream(job, last, heard):
                     if event is None:
                         return
                     last = event.id
                     yield event
-                    deadline = time.monotonic() + self.retry_seconds
             except httpx.TransportError as error:
-                if time.monotonic() > deadline:
+                now = time.monotonic()
+                failing = failing or now
+                if now - failing > self.retry_seconds:
                     raise UserError(f"{self.server}: the event stream broke ({error})") from None
             time.sleep(RETRY_INTERVAL)
 
@@ -183,8 +192,8 @@ class Client:
         """What the last picture of a fine-tuning shows. Raises Refused (404) before there is one."""
         return self._ask("GET", f"/workspaces/{workspace}/preview", PreviewState)
 
-    def _stream(self, job: int, after: int) -> Iterator[JobEvent | None]:
-        """Events; None at the end of the job."""
+    def _stream(self, job: int, after: int, heard: Callable[[], None]) -> Iterator[JobEvent | None]:
+        """Events; None at the end of the job. heard: called at each line, a quiet job's signs of life, too."""
         headers = {"Last-Event-ID": str(after), "Accept": "text/event-stream"}
         with self._http.stream("GET", f"/jobs/{job}/events", headers=headers) as answer:
             if answer.is_error:
@@ -192,6 +201,7 @@ class Client:
             checked(answer)
             fields: dict[str, str] = {}
             for line in answer.iter_lines():
+                heard()
                 if line:
                     name, _, value = line.partition(":")
                     fields[name] = value.removeprefix(" ")
