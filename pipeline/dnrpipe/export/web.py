@@ -75,8 +75,8 @@ def export_web(
     Returns folder, the bytes of `folder_sizes`, the figures of `held_out`, `psnr_unpacked` (the same network before
     weights and light were packed, dB), and with `check` those of `check_page`.
 
-    Raises UserError: no baked light, no ray-traced views, no npm, or a folder that is not ours to write; with `check`
-    also no Chromium.
+    Raises UserError: no baked light, no ray-traced views or ones that are out of date, no npm, or a folder that is not
+    ours to write; with `check` also no Chromium.
     """
     settings = resolve_settings(workspace, {}, None)
     views = raytraced_views(workspace)

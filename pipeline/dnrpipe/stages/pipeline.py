@@ -269,16 +269,19 @@ def discard(path: Path, owner: Stage, workspace: Workspace) -> None:
         workspace.save()
 
 
-def require_inputs(stage: Stage, workspace: Workspace, settings: Settings) -> None:
-    """Raise UserError naming the first command that must run before this stage can."""
+def require_inputs(stage: Stage, workspace: Workspace, settings: Settings, asking: str | None = None) -> None:
+    """Raise UserError naming the first command that must run before this stage can.
+
+    asking: what reads the same inputs, where that is not the stage itself.
+    """
     for need in stage.needs:
         upstream = STAGES[need]
-        require_inputs(upstream, workspace, settings)
+        require_inputs(upstream, workspace, settings, asking)
         found = state(upstream, workspace, settings)
         if found != "done":
             why = {"missing": "has not run", "partial": "is not complete", "stale": "is out of date"}[found]
             raise UserError(
-                f"{stage.command}: {upstream.command} {why} for {workspace.root};"
+                f"{asking or stage.command}: {upstream.command} {why} for {workspace.root};"
                 f" run `dnrpipe {upstream.command}` first"
             )
 
