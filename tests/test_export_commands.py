@@ -16,7 +16,9 @@ from dnrpipe.core.workspace import Source, Workspace
 from dnrpipe.export import gltf, nerf, web
 from dnrpipe.export.browser import require_chromium
 from dnrpipe.export.nerf import raytraced_views
+from dnrpipe.export.page_data import PageLight
 from dnrpipe.export.surface import read_baked_light
+from dnrpipe.export.web_model import training_fingerprint
 from dnrpipe.stages.base_images import light_path
 from dnrpipe.stages.pipeline import STAGES, fingerprint
 from dnrpipe.stages.session import resolve_settings
@@ -121,6 +123,17 @@ def test_pictures_of_other_cameras_are_refused(tmp_path: Path, monkeypatch: pyte
     ):
         with pytest.raises(UserError, match=r"^export.*: prepare is out of date .* run `dnrpipe prepare` first"):
             export()
+
+
+def test_a_page_does_not_go_on_with_training_on_former_pictures(tmp_path: Path) -> None:
+    """The same views and light, traced anew."""
+    workspace = Workspace.create(tmp_path / "w.dnr", Source(path="s.blend", sha256="0"))
+    light = PageLight(codes=np.zeros((1, 2, 2, 4), np.uint8), curve=1.0, range=1.0, files=[], cutouts=False)
+    found = {training_fingerprint(workspace, [], light)}
+    for output in ("first", "second"):
+        workspace.finish_stage("raytrace", fingerprint="", output=output, seconds=1.0, detail={"views": []})
+        found.add(training_fingerprint(workspace, [], light))
+    assert len(found) == 3 and training_fingerprint(workspace, [], light) in found
 
 
 def test_what_the_check_of_the_page_needs(monkeypatch: pytest.MonkeyPatch) -> None:
