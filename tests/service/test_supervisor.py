@@ -14,7 +14,9 @@ import pytest
 from dnrpipe.service import supervisor
 from dnrpipe.service.config import ServerConfig
 from dnrpipe.service.queue import Queue
+from dnrpipe.service.server import forget_settings
 from dnrpipe.service.supervisor import Supervisor
+from dnrpipe.service.worker import job_environment
 
 SLEEP = "import time; time.sleep(600)"
 
@@ -24,6 +26,15 @@ def _until(wish: Callable[[], bool]) -> None:
     while not wish():
         assert time.monotonic() < deadline
         time.sleep(0.02)
+
+
+def test_jobs_inherit_what_is_of_the_machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The cache and the time limit of a task reach a job through server and worker; settings do not."""
+    environment = {"PATH": "/bin", "DNRPIPE_CACHE": "/c", "DNRPIPE_TASK_TIMEOUT": "20m", "DNRPIPE_SELECT__BUDGET": "3"}
+    forget_settings(environment)
+    assert environment == {"PATH": "/bin", "DNRPIPE_CACHE": "/c", "DNRPIPE_TASK_TIMEOUT": "20m"}
+    monkeypatch.setattr("os.environ", environment)
+    assert job_environment("cpu", tmp_path).items() >= environment.items()
 
 
 def test_a_full_disk_ends_no_worker(
