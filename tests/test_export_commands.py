@@ -74,6 +74,17 @@ def test_what_npm_delivers_is_checked(tmp_path: Path, monkeypatch: pytest.Monkey
     assert not (tmp_path / "cache").exists()
 
 
+def test_an_npm_that_hangs_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    npm = tmp_path / "npm"
+    npm.write_text("#!/bin/sh\nexec sleep 60\n")
+    npm.chmod(0o755)
+    monkeypatch.setenv("DNRPIPE_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(web.shutil, "which", lambda name: str(npm))
+    monkeypatch.setattr(web, "NPM_SECONDS", 0.2)
+    with pytest.raises(UserError, match=r"did not deliver .* within 0\.2 s"):
+        web.runtime()
+
+
 def test_a_truncated_light_map_is_one_line(tmp_path: Path) -> None:
     workspace = Workspace.create(tmp_path / "w.dnr", Source(path="s.blend", sha256="0"))
     with pytest.raises(UserError, match="it comes with `dnrpipe raytrace-selected`"):
