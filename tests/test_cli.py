@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from dnrpipe.cli.service import serve
+from dnrpipe.core.errors import UserError
 from dnrpipe.core.workspace import SCHEMA, Manifest, Source, Workspace, locked
 
 
@@ -46,6 +48,20 @@ def test_no_such_scene_and_folders(tmp_path: Path) -> None:
     _refused(_run("prepare", "none.blend", folder=tmp_path), "none.blend", "no such file")
     _refused(_run("prepare", str(tmp_path), folder=tmp_path), "is a folder")
     assert not list(tmp_path.glob("*.dnr"))
+
+
+def test_a_file_where_a_folder_is_wanted(tmp_path: Path) -> None:
+    (tmp_path / "a.blend").write_bytes(b"BLENDER-v300")
+    _refused(_run("run", "a.blend", "-w", "a.blend", folder=tmp_path), "a.blend: is there already")
+    _refused(_run("serve", "--root", "a.blend", "--port", "0", folder=tmp_path), "a.blend: is there already")
+    assert (tmp_path / "a.blend").read_bytes() == b"BLENDER-v300"
+
+
+@pytest.mark.parametrize("option", ["--rate", "--job-hours"])
+@pytest.mark.parametrize("value", ["nan", "inf", "0", "1e300"])
+def test_what_no_server_can_be_told(option: str, value: str) -> None:
+    with pytest.raises(UserError, match=f"{option} .*: must be above 0, and 1000000 at most"):
+        serve.main([option, value, "--root", "nowhere/at/all"], standalone_mode=False)
 
 
 def test_bad_numbers(tmp_path: Path) -> None:

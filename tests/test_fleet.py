@@ -55,6 +55,19 @@ def test_scenes_times_variants(tmp_path: Path) -> None:
     assert 'select.policy="random"' in fleet.jobs[1].commands[0]
 
 
+def test_settings_reach_commands_that_take_no_scene(tmp_path: Path) -> None:
+    """They are told until a command remembers them; the executor is not remembered, so each one is told that."""
+    (tmp_path / "a.blend").touch()
+    settings = 'preset = "draft"\nscenes = ["a.blend"]\n[settings]\nfinetune.step2.epochs = 9\nexecutor.workers = 3\n'
+    fleet = read_fleet(
+        _file(tmp_path, f'commands = ["export-gltf", "report", "finetune", "evaluate", "export-nerf"]\n{settings}')
+    )
+    export, report, finetune, evaluate, again = (line[1:-2] for line in fleet.jobs[0].commands)
+    executor = ("--set", "executor.workers=3")
+    assert export == again == () and evaluate == executor
+    assert report == finetune == ("--preset", "draft", "--set", "finetune.step2.epochs=9", *executor)
+
+
 @pytest.mark.parametrize(
     "text, message",
     [

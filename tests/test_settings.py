@@ -10,6 +10,9 @@ from hypothesis import strategies as st
 
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import PRESETS, merge, parse_assignment, resolve
+from dnrpipe.core.workspace import Source, Workspace
+from dnrpipe.stages.pipeline import STAGES
+from dnrpipe.stages.session import Session, resolve_settings
 
 
 def test_layers_win_in_order(tmp_path: Path) -> None:
@@ -204,3 +207,30 @@ def test_a_target_of_tracing_changes_no_fingerprint_where_there_is_none() -> Non
     assert tracing(noise=0.01)[0] != tracing(noise=0.02)[0]
     assert tracing(noise=0.01)[1] == plain[1]
     assert tracing(evaluation_noise=0.01)[0] == plain[0]
+
+
+def test_a_camera_file_counts_by_its_content_whoever_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An edited file is noticed without --cameras, too; one that is gone is remembered."""
+    monkeypatch.chdir(tmp_path)
+    workspace = Workspace.create(tmp_path / "w.dnr", Source(path="s.blend", sha256="0"))
+    views = tmp_path / "views.json"
+    views.write_text("first")
+    (tmp_path / "dnrpipe.toml").write_text('[cameras]\nsource = "views.json"\n')
+
+    def inputs(**cameras: str) -> object:
+        overrides = {"cameras": cameras} if cameras else {}
+        return STAGES["prepare"].settings(resolve_settings(Workspace.open(workspace.root), overrides, None))
+
+    options = {"workspace": str(workspace.root), "preset": None, "assignments": (), "as_json": False, "quiet": True}
+    with Session("finetune", options, None, {}) as session:
+        first = STAGES["prepare"].settings(session.settings)
+        session.workspace.save()
+    assert inputs() == first
+    views.write_text("second")
+    assert inputs() != first
+    views.unlink()
+    assert inputs() == first
+    assert inputs(source="elsewhere.json") != first
+    assert inputs(source="dome") != first
+    (tmp_path / "moved.json").write_text("first")
+    assert inputs(source="moved.json") == first

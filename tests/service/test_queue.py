@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 from collections import Counter
@@ -17,7 +18,9 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from dnrpipe.core.errors import UserError
 from dnrpipe.service.models import FINAL, JobRequest
-from dnrpipe.service.queue import MAX_STARTS, Queue, QueueFull, WrongState
+from dnrpipe.service.queue import MAX_LOSSES, Queue, QueueFull, WrongState
+from dnrpipe.service.root import ServiceRoot
+from dnrpipe.service.worker import job_command
 
 
 def _request(workspace: str, priority: int = 0) -> JobRequest:
@@ -98,12 +101,59 @@ def test_a_worker_whose_server_died_while_it_started_does_nothing(tmp_path: Path
 def test_a_job_that_kills_its_worker_is_given_up(tmp_path: Path) -> None:
     queue = Queue(tmp_path / "q.sqlite")
     job = queue.submit(_request("a")).id
-    for _ in range(MAX_STARTS):
+    for _ in range(MAX_LOSSES):
         assert queue.claim("cpu") is not None
         queue.recover()
     found = queue.get(job)
     assert found is not None and found.state == "failed" and found.error and "lost" in found.error
     assert queue.claim("cpu") is None
+
+
+def test_stops_in_order_are_no_losses(tmp_path: Path) -> None:
+    """A server that is restarted often, and then dies once, ends no job; a retry counts anew."""
+    queue = Queue(tmp_path / "q.sqlite")
+    job = queue.submit(_request("a")).id
+    for _ in range(MAX_LOSSES):
+        assert queue.claim("cpu") is not None
+        queue.requeue(job, crashed=False, why="its worker was stopped")
+    for _ in range(2):
+        for _ in range(MAX_LOSSES):
+            assert queue.get(job).state == "queued" and queue.claim("cpu") is not None
+            queue.recover()
+        found = queue.get(job)
+        assert found.state == "failed" and found.error == f"its process was lost {MAX_LOSSES} times"
+        queue.retry(job)
+
+
+def test_a_retry_throws_nothing_away(tmp_path: Path) -> None:
+    """A job with `force` that failed goes on from what it made; one of which nothing is left begins anew."""
+    queue, root = Queue(tmp_path / "q.sqlite"), ServiceRoot(tmp_path / "root").create()
+    job = queue.submit(_request("a").model_copy(update={"force": True})).id
+    first = queue.claim("cpu")
+    assert first is not None and "--force" in job_command(first, root)
+    queue.finish(job, "failed")
+    queue.retry(job)
+    again = queue.claim("cpu")
+    assert again is not None and again.starts == 2 and "--force" not in job_command(again, root)
+    queue.finish(job, "done")
+    job = queue.submit(_request("b").model_copy(update={"force": True})).id
+    queue.claim("box/cpu", lease="gone", seconds=-1)
+    queue.recover_lapsed()
+    queue.cancel(job)
+    queue.retry(job)
+    again = queue.claim("cpu")
+    assert again is not None and "--force" in job_command(again, root)
+
+
+def test_a_queue_of_before_is_taken_over(tmp_path: Path) -> None:
+    path = tmp_path / "q.sqlite"
+    job = Queue(path).submit(_request("a")).id
+    with sqlite3.connect(path) as db:
+        db.execute("ALTER TABLE jobs DROP COLUMN losses")
+        db.execute("PRAGMA user_version = 2")
+    queue = Queue(path)
+    queue.claim("cpu")
+    assert queue.recover() == [job] and queue.get(job).state == "queued"
 
 
 def test_limits_and_repeated_wishes(tmp_path: Path) -> None:

@@ -277,6 +277,7 @@ def test_other_sites_pages_are_kept_out(server: Server) -> None:
         ({"Host": f"{host}.evil.example"}, 421),
         ({"Origin": "https://evil.example"}, 403),
         ({"Origin": "null"}, 403),
+        ({"Origin": "http://["}, 403),
         ({"Origin": server.url}, 200),
     ):
         assert httpx.get(f"{server.url}/jobs", headers=headers).status_code == status

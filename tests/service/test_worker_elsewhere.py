@@ -21,15 +21,19 @@ import httpx
 import pytest
 from tests.service.harness import TINY, Server, empty_workspace, processes_of
 
-from dnrpipe.core.workspace import Workspace
+from dnrpipe.core.workspace import Source, Workspace
 from dnrpipe.service import archive
 from dnrpipe.service.client import Client, Refused
 from dnrpipe.service.lease_client import LeaseClient
 from dnrpipe.service.leases import SHA256_HEADER, Beat, Lease, LeaseGone
 from dnrpipe.service.models import End, Job, JobRequest, Limits
-from dnrpipe.service.queue import MAX_STARTS, Queue
+from dnrpipe.service.queue import MAX_LOSSES, Queue
+from dnrpipe.service.remote_worker import _move_source
 from dnrpipe.service.root import ServiceRoot
+from dnrpipe.service.routes_leases import _scene_of
 from dnrpipe.service.worker import job_command
+from dnrpipe.stages.pipeline import STAGES
+from dnrpipe.stages.session import resolve_settings
 
 SCENE = Path(__file__).parents[2] / "blender_scenes" / "hard" / "emissive_only.blend"
 JOBS = 40
@@ -390,6 +394,35 @@ def test_who_is_not_wanted_is_told_in_one_line(tmp_path: Path) -> None:
         server.stop()
 
 
+def test_a_shot_finds_its_scene_and_its_cameras_on_either_machine(tmp_path: Path) -> None:
+    """The lease names the file; paths of the manifest follow the workspace, and `prepare` is done there as here."""
+    here, there = (ServiceRoot(tmp_path / name).create() for name in ("here", "there"))
+    (tmp_path / "part").write_bytes(b"scene")
+    sha256 = hashlib.sha256(b"scene").hexdigest()
+    here.keep_scene(tmp_path / "part", "lamp.blend", sha256)
+    _, scene = here.submitted_scene("lamp.blend", sha256)
+    request = JobRequest(command="shot", workspace="lamp", scene="lamp.blend", scene_sha256=sha256)
+    found = _scene_of(Job(id=1, state="running", request=request, created=0), here)
+    assert found is not None and (found.name, found.sha256) == ("lamp.blend", sha256)
+    workspace = Workspace.create(here.folder / "lamp.dnr", Source(path=str(scene), sha256=sha256))
+    again = request.model_copy(update={"scene": None, "scene_sha256": None})
+    assert _scene_of(Job(id=2, state="running", request=again, created=0), here) == found
+    views = workspace.root / "shots" / "Camera" / "candidates.json"
+    workspace.manifest.overrides = {"cameras": {"source": str(views), "source_sha256": "1" * 64}}
+    workspace.save()
+    made_from = STAGES["prepare"].settings(resolve_settings(workspace, {}, None))
+    shutil.copytree(workspace.root, there.folder / "lamp.dnr")
+    copy = there.folder / "lamp.dnr"
+    _move_source(copy, here.folder, there.folder)
+    moved = Workspace.open(copy)
+    assert Path(moved.manifest.source.path) == there.folder / scene.relative_to(here.folder)
+    settings = resolve_settings(moved, {}, None)
+    assert Path(settings.cameras.source) == copy / "shots" / "Camera" / "candidates.json"
+    assert STAGES["prepare"].settings(settings) == made_from
+    _move_source(copy, there.folder, here.folder)
+    assert Workspace.open(copy).manifest == workspace.manifest
+
+
 def test_a_lease_in_the_queue(tmp_path: Path) -> None:
     """A restart leaves it alone, its end queues the job, and `--force` is for the first start that left something."""
     queue, root = Queue(tmp_path / "q.sqlite"), ServiceRoot(tmp_path / "root").create()
@@ -416,7 +449,7 @@ def test_a_lease_in_the_queue(tmp_path: Path) -> None:
     claimed = queue.claim("box/cpu", lease="third", seconds=-1)
     assert claimed is not None and (claimed.starts, claimed.lost) == (3, 1)
     assert "--force" not in job_command(claimed, root)
-    for _ in range(MAX_STARTS - 3):
+    for _ in range(MAX_LOSSES - 2):
         assert queue.recover_lapsed() == [job]
         assert queue.claim("box/cpu", lease="last", seconds=-1) is not None
     assert queue.recover_lapsed() == [job]

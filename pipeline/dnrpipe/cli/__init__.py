@@ -158,6 +158,8 @@ def explain(error: Exception) -> tuple[str, int] | None:
         return f"{where}: cannot be read or written ({error.strerror or error}); check the disk", 2
     if error.errno in (errno.EACCES, errno.EROFS, errno.EPERM):
         return f"{where}: cannot be written (read-only or not yours); choose another folder with -w", 2
+    if error.errno == errno.EEXIST:
+        return f"{where}: is there already, and no folder of ours; name another place", 2
     if error.errno in (errno.ENOTDIR, errno.EISDIR):
         return f"{where}: {os.strerror(error.errno).lower()}", 2
     return None

@@ -36,6 +36,8 @@ COMMANDS = [
     *("run", "prepare", "select", "raytrace-selected", "finetune", "evaluate", "render", "report", "shot"),
     *("export-nerf", "export-onnx", "export-gltf", "export-web"),
 ]
+MOST = 1_000_000
+"""Of what has no limit of its own."""
 STATES = ["queued", "running", "done", "failed", "cancelled"]
 
 
@@ -113,8 +115,8 @@ def serve(
     if days is not None and not 0 < days <= 36_500:
         raise UserError(f"--keep-days {days:g}: must be above 0, and 36500 at most")
     for name, value in (("--job-hours", job_hours), ("--rate", options["rate"])):
-        if value is not None and value <= 0:
-            raise UserError(f"{name} {value:g}: must be above 0")
+        if value is not None and not 0 < value <= MOST:  # nan is neither
+            raise UserError(f"{name} {value:g}: must be above 0, and {MOST} at most")
     limits = Limits(
         seconds=3600 * min(job_hours or 24.0, 720.0),
         memory_mb=job_memory_mb or default_memory_mb(),

@@ -14,6 +14,8 @@ from .errors import UserError
 from .scene_records import Census, Conversion, RasterChoice, SceneSummary
 from .workspace import Workspace, digest, sha256_now
 
+TAKES_SCENE = ("run", "prepare", "shot")
+"""Commands that read a scene file: the one they are given, else that of the workspace."""
 SCENE_VERSION = 9  # raise when the conversion or the G-buffer scene changes what it writes
 
 

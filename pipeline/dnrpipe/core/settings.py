@@ -40,7 +40,7 @@ class CameraSettings(Strict):
         description="auto (inside where the scene's own camera stands inside or is animated, else dome), dome, sphere,"
         " inside, scene, animation, or a transforms.json",
     )
-    source_sha256: str = Field(default="", description="set by --cameras FILE, so that a changed file is noticed")
+    source_sha256: str = Field(default="", description="set where source is a file, so that a changed one is noticed")
     train: int = Field(default=100, ge=1, le=100_000, description="candidate views")
     val: int = Field(default=100, ge=0, le=100_000)
     test: int = Field(default=200, ge=0, le=100_000)

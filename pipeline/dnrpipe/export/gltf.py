@@ -26,6 +26,8 @@ from ..core.images import eight_bit
 from ..core.scene_files import read_frame
 from ..core.workspace import Workspace
 from ..stages.base_images import light_path
+from ..stages.pipeline import STAGES, require_inputs
+from ..stages.session import resolve_settings
 from .meshes import BundleMesh, read_meshes
 
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -35,12 +37,17 @@ ARRAY, INDICES = 34962, 34963
 
 
 def export_gltf(workspace: Workspace, out: Path, console: Console, *, light: bool = True) -> dict[str, Any]:
-    """Write ``out`` (.glb). light: with the baked light as its texture, where the workspace has any."""
+    """Write ``out`` (.glb). light: with the baked light as its texture, where the workspace has any.
+
+    Raises UserError: not a .glb; with light, one that is out of date.
+    """
     if out.suffix != ".glb" or out.is_dir():
         raise UserError(f"--out {out}: name a file that ends in .glb")
     meshes = read_meshes(workspace.scene)
     picture = None
     if light and light_path(workspace).is_file():
+        settings = resolve_settings(workspace, {}, None)
+        require_inputs(STAGES["finetune"], workspace, settings, "export-gltf")  # else it is of another scene
         picture = light_picture(workspace, console)
     elif light:
         console.warn("no baked light in this workspace (model.base is not baked): the meshes are written without")

@@ -31,6 +31,9 @@ from ..core.errors import UserError
 from ..core.images import eight_bit
 from ..core.scene_files import read_frame, read_selection, split_views
 from ..core.workspace import Workspace
+from ..stages.pipeline import STAGES, require_inputs
+from ..stages.raytrace import reference_is_made
+from ..stages.session import resolve_settings
 from .folder import claim, finish
 
 POINTS = 100_000
@@ -44,7 +47,7 @@ def export_nerf(workspace: Workspace, out: Path, console: Console, *, normalise:
     normalise: move and scale the scene so that its bounding sphere is the unit sphere around the origin, which
     readers with a fixed box (nerfstudio's ``blender-data``: ±1.5) want; else poses stay in scene units.
 
-    Raises UserError: nothing ray-traced yet, or a folder that is not ours to write.
+    Raises UserError: nothing ray-traced yet, pictures that are out of date, or a folder that is not ours to write.
     """
     views = raytraced_views(workspace)
     frame = read_frame(workspace)
@@ -119,8 +122,10 @@ def write_points(path: Path, points: np.ndarray, colours: np.ndarray) -> None:
 def raytraced_views(workspace: Workspace) -> dict[str, list[View]]:
     """The ray-traced views, train: the selected ones in the order chosen; test: the held-out ones.
 
-    Raises UserError: some are not ray-traced yet.
+    Raises UserError: some are not ray-traced yet, or pictures are of other cameras or settings than those of now.
     """
+    settings = resolve_settings(workspace, {}, None)
+    require_inputs(STAGES["finetune"], workspace, settings, "export")  # it reads the same views
     cameras = split_views(workspace)
     by_name = {view.name: view for view in cameras["train"]}
     chosen = [by_name[name] for name in read_selection(workspace).views if name in by_name]
@@ -131,6 +136,12 @@ def raytraced_views(workspace: Workspace) -> dict[str, list[View]]:
             " `dnrpipe raytrace-selected` first"
         )
     test = [view for view in cameras["test"] if workspace.raytraced("test", view.name).is_file()]
+    old = [view.name for view in test if not reference_is_made(workspace, settings, view)]
+    if old:
+        raise UserError(
+            f"{workspace.root}: {len(old)} of {len(test)} held-out views were ray-traced for other cameras or settings;"
+            " run `dnrpipe evaluate` first"
+        )
     if not test:
         raise UserError(f"{workspace.root}: no held-out view is ray-traced; run `dnrpipe evaluate` first")
     return {"train": chosen, "test": test}

@@ -60,6 +60,7 @@ ORT_SHA256 = "d2228df7e4616bc3348bf504ee888f3bec43789a273f0a63f3e68d203ce3bf71"
 ORT_SCRIPT = "ort.wasm.bundle.min.mjs"
 ORT_BINARY = "ort-wasm-simd-threaded.wasm"
 """The smallest one in the package; those that know WebGPU, too, have 17 to 28 MB instead of 14."""
+NPM_SECONDS = 600.0
 START_ELEVATION = 20.0
 """Degrees above the horizon where the page's camera begins, if training views stand there."""
 
@@ -75,8 +76,8 @@ def export_web(
     Returns folder, the bytes of `folder_sizes`, the figures of `held_out`, `psnr_unpacked` (the same network before
     weights and light were packed, dB), and with `check` those of `check_page`.
 
-    Raises UserError: no baked light, no ray-traced views, no npm, or a folder that is not ours to write; with `check`
-    also no Chromium.
+    Raises UserError: no baked light, no ray-traced views or ones that are out of date, no npm, or a folder that is not
+    ours to write; with `check` also no Chromium.
     """
     settings = resolve_settings(workspace, {}, None)
     views = raytraced_views(workspace)
@@ -192,7 +193,14 @@ def runtime() -> Path:
         raise UserError("npm is not installed: the page needs onnxruntime-web from it, once; install Node.js")
     with tempfile.TemporaryDirectory(prefix="dnrpipe-") as scratch:
         command = [npm, "pack", f"onnxruntime-web@{ORT_VERSION}", "--silent"]
-        done = subprocess.run(command, cwd=scratch, capture_output=True, text=True, timeout=600, check=False)
+        try:
+            done = subprocess.run(
+                command, cwd=scratch, capture_output=True, text=True, timeout=NPM_SECONDS, check=False
+            )
+        except subprocess.TimeoutExpired:
+            raise UserError(
+                f"npm did not deliver onnxruntime-web {ORT_VERSION} within {NPM_SECONDS:g} s; try again with a network"
+            ) from None
         (archive,) = [*Path(scratch).glob("*.tgz")] or [None]
         if done.returncode != 0 or archive is None:
             reason = (done.stderr.strip().splitlines() or ["no reason given"])[-1]

@@ -103,7 +103,7 @@ def train(
     step2 = step2.model_copy(update={"epochs": epochs or max(step2.epochs, -(-STEPS // len(views)))})
     data = web_views(workspace, views, "train", maps, light)
     weights = perceptual_weights(console)
-    fingerprint = digest([sha256(light.codes.tobytes()).hexdigest(), [view.model_dump(mode="json") for view in views]])
+    fingerprint = training_fingerprint(workspace, views, light)
     events = run_step2(
         data, None, folder, model, step2,
         seed=settings.finetune.seed, device=torch_device(settings), checkpoints=folder, fingerprint=fingerprint,
@@ -119,6 +119,13 @@ def train(
     found = load_model(folder)
     found.use_bfloat16 = False
     return found
+
+
+def training_fingerprint(workspace: Workspace, views: Sequence[View], light: PageLight) -> str:
+    """Hash of what the page's network is trained on: the packed light, the views and their ray-traced pictures."""
+    traced = workspace.manifest.stages.get("raytrace")
+    placed = [view.model_dump(mode="json") for view in views]
+    return digest([sha256(light.codes.tobytes()).hexdigest(), placed, traced.output if traced else None])
 
 
 def check_page(out: Path, views: Sequence[View], data: ViewSet, model: DNR, console: Console) -> dict[str, Any]:

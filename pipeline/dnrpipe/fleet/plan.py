@@ -29,10 +29,12 @@ from pydantic import Field, ValidationError
 from dnrtrain.settings import Strict
 
 from ..core.errors import UserError
+from ..core.scene_files import TAKES_SCENE
 from ..core.settings import merge, resolve
 
-TAKES_SCENE = ("run", "prepare", "shot")
-TAKES_NO_FORCE = ("export-nerf", "export-onnx", "export-gltf", "export-web")
+TAKES_NO_FORCE = TAKES_NO_SETTINGS = ("export-nerf", "export-onnx", "export-gltf", "export-web")
+FORGETS = ("render", "report")
+"""Commands whose settings hold for themselves alone; the workspace does not remember them."""
 COMMANDS = (
     *TAKES_SCENE,
     *("select", "raytrace-selected", "finetune", "evaluate", "render", "report"),
@@ -104,8 +106,7 @@ def read_fleet(path: Path) -> Fleet:
             except UserError as error:
                 raise UserError(f"{path}: {error}") from None
             workspace = out / f"{name}.dnr"
-            flags = [*(["--preset", given.preset] if given.preset else []), *_assignments(settings)]
-            lines = [_line(words, scene, workspace, flags) for words in commands]
+            lines = _lines(commands, scene, workspace, given.preset, settings)
             jobs[name] = FleetJob(name, scene, workspace, tuple(lines))
     return Fleet(out, list(jobs.values()))
 
@@ -139,9 +140,23 @@ def _words(path: Path, command: str) -> list[str]:
     return words
 
 
-def _line(words: list[str], scene: Path, workspace: Path, flags: list[str]) -> tuple[str, ...]:
-    scene_words = [str(scene), *flags] if words[0] in TAKES_SCENE else []
-    return (words[0], *scene_words, *words[1:], "-w", str(workspace))
+def _lines(
+    commands: list[list[str]], scene: Path, workspace: Path, preset: str | None, settings: dict[str, Any]
+) -> list[tuple[str, ...]]:
+    """Command lines of a scene. Commands are given all settings until one has remembered them in the workspace for the
+    others; the executor, which is not remembered, is given to each."""
+    flags = [*(["--preset", preset] if preset else []), *_assignments(settings)]
+    own = _assignments({key: value for key, value in settings.items() if key == "executor"})
+    lines, told = [], False
+    for name, *more in commands:
+        scene_words = [str(scene)] if name in TAKES_SCENE else []
+        if name in TAKES_NO_SETTINGS:
+            given = []
+        else:
+            given = own if told and not scene_words else flags
+            told = told or name not in FORGETS
+        lines.append((name, *scene_words, *given, *more, "-w", str(workspace)))
+    return lines
 
 
 def _assignments(settings: Mapping[str, Any], prefix: str = "") -> list[str]:

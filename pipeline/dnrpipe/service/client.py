@@ -43,6 +43,9 @@ RETRY_SECONDS = 4.0
 RETRY_INTERVAL = 0.5
 MAX_WAIT = 60.0
 MAX_REFUSALS = 5
+PASSING = (500, 502, 503, 504)
+"""Statuses of a server, or of a proxy in front of it, that may answer in a moment: as good as no answer. Sending the
+request again is safe: submits carry an idempotency key. 507, a full disk, is no such status."""
 CHUNK = 1 << 20
 Answer = TypeVar("Answer")
 
@@ -110,18 +113,27 @@ class Client:
         return self._ask("GET", f"/jobs/{job}/logs", LogPage, params={"offset": offset})
 
     def events(self, job: int, after: int = 0) -> Iterator[JobEvent]:
-        """The job's events until it has ended; resumes a broken stream where it broke."""
-        last, deadline = after, time.monotonic() + self.retry_seconds
+        """The job's events until it has ended; resumes a broken stream where it broke.
+
+        Raises UserError: nothing came for ``retry_seconds`` after it broke.
+        """
+        last, failing = after, None
+
+        def heard() -> None:
+            nonlocal failing
+            failing = None
+
         while True:
             try:
-                for event in self._stream(job, last):
+                for event in self._stream(job, last, heard):
                     if event is None:
                         return
                     last = event.id
                     yield event
-                    deadline = time.monotonic() + self.retry_seconds
             except httpx.TransportError as error:
-                if time.monotonic() > deadline:
+                now = time.monotonic()
+                failing = failing or now
+                if now - failing > self.retry_seconds:
                     raise UserError(f"{self.server}: the event stream broke ({error})") from None
             time.sleep(RETRY_INTERVAL)
 
@@ -180,8 +192,8 @@ class Client:
         """What the last picture of a fine-tuning shows. Raises Refused (404) before there is one."""
         return self._ask("GET", f"/workspaces/{workspace}/preview", PreviewState)
 
-    def _stream(self, job: int, after: int) -> Iterator[JobEvent | None]:
-        """Events; None at the end of the job."""
+    def _stream(self, job: int, after: int, heard: Callable[[], None]) -> Iterator[JobEvent | None]:
+        """Events; None at the end of the job. heard: called at each line, a quiet job's signs of life, too."""
         headers = {"Last-Event-ID": str(after), "Accept": "text/event-stream"}
         with self._http.stream("GET", f"/jobs/{job}/events", headers=headers) as answer:
             if answer.is_error:
@@ -189,6 +201,7 @@ class Client:
             checked(answer)
             fields: dict[str, str] = {}
             for line in answer.iter_lines():
+                heard()
                 if line:
                     name, _, value = line.partition(":")
                     fields[name] = value.removeprefix(" ")
@@ -240,14 +253,14 @@ def _trust() -> ssl.SSLContext:
 
 
 def checked(answer: httpx.Response) -> httpx.Response:
-    """Raises Refused. Raises httpx.TransportError: a proxy in front of the server does not reach it."""
+    """Raises Refused. Raises httpx.TransportError: the server, or a proxy in front of it, fails for the moment."""
     if answer.is_success:
         return answer
-    if answer.status_code in (502, 504):
-        raise httpx.ProxyError(f"the proxy in front of it answers with {answer.status_code}")
     try:
         detail = str(answer.json()["detail"])
     except (ValueError, KeyError, TypeError):
         detail = f"{answer.request.method} {answer.request.url.path} was answered with {answer.status_code}"
+    if answer.status_code in PASSING:
+        raise httpx.TransportError(detail)
     wait = answer.headers.get("retry-after", "")
     raise Refused(answer.status_code, detail, float(wait) if wait.isdigit() else None)

@@ -148,8 +148,9 @@ class Guard:
         if forwarded is not None and _name_of(forwarded) not in {_name_of(host), self.public and self.public[1]}:
             return refused(421, f"this server does not answer to the host name {forwarded[:80]!r} (--public-url)")
         origin = headers.get("origin")
-        own = origin is None or urlsplit(origin).netloc.lower() == host.lower()
-        if not own and (self.public is None or _origin(origin or "") != self.public):
+        named = _origin(origin or "")  # None, too, where it is no address that `urlsplit` takes
+        own = origin is None or (named is not None and urlsplit(origin).netloc.lower() == host.lower())
+        if not own and (self.public is None or named != self.public):
             return refused(403, "requests of pages from other origins are refused")
         # The dashboard's files hold no data, and the dashboard asks for the token.
         is_open = scope["type"] == "http" and (scope["path"] in OPEN_PATHS or scope["path"].startswith("/static/"))

@@ -54,7 +54,7 @@ class LeaseClient(Client):
         return self._retrying(attempt)
 
     def beat(self, lease: Lease, beat: Beat) -> BeatAnswer | None:
-        """One attempt. None: the server does not answer now, or has too much to do."""
+        """One attempt. None: the server does not answer now, fails, or has too much to do."""
         content = TypeAdapter(Beat).dump_json(beat)
         headers = {"Content-Type": "application/json"}
         try:
@@ -62,7 +62,7 @@ class LeaseClient(Client):
         except httpx.TransportError:
             return None
         except Refused as refused:
-            if refused.status == 429:
+            if refused.status == 429 or refused.status >= 500:  # no reason to end a job
                 return None
             raise
         return self._read(answer, BeatAnswer)

@@ -95,7 +95,8 @@ class JobRequest(Strict):
 class Job(Strict):
     """A job in the queue. Times are unix seconds; None: not yet.
 
-    starts: how many processes were started for it; crashes: how many of those ended by a signal, a limit aside.
+    starts: how many processes were started for it; crashes: how many of those ended by a signal, a limit aside, since
+    it was submitted or retried.
     exit_code: of the last process, negative for a signal. error: why it failed, one line. progress: the last report.
     owner: whose token submitted it. device: what works on it, a device of the server or ``machine/device`` of a worker
     elsewhere. lost: those starts of which nothing came back, since such a worker was lost.

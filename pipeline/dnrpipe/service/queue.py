@@ -25,10 +25,11 @@ from .leases import LeaseGone
 from .models import FINAL, STATES, End, Job, JobEvent, JobRequest, State
 from .root import ServiceRoot, UnknownName
 
-SCHEMA = 2
+SCHEMA = 3
 DAY = 86_400.0
-MAX_STARTS = 6
-"""A job fails for good once its process or server has died this often."""
+MAX_LOSSES = 6
+"""A job fails for good once its worker or server has died this often since it was submitted or retried; stops in order
+do not count."""
 BATCH = 50
 """Jobs that one transaction prunes; other writers wait for it."""
 _TABLES = """
@@ -56,7 +57,8 @@ CREATE TABLE IF NOT EXISTS jobs (
     lease TEXT,
     lease_until REAL,
     lease_beat INTEGER,
-    lease_result INTEGER
+    lease_result INTEGER,
+    losses INTEGER NOT NULL DEFAULT 0
 );
 CREATE INDEX IF NOT EXISTS jobs_due ON jobs (state, priority DESC, id);
 CREATE TABLE IF NOT EXISTS events (
@@ -69,10 +71,12 @@ CREATE TABLE IF NOT EXISTS events (
 CREATE INDEX IF NOT EXISTS events_of_job ON events (job, id);
 CREATE UNIQUE INDEX IF NOT EXISTS jobs_leased ON jobs (lease) WHERE lease IS NOT NULL;
 """
-_SINCE_2 = (
+_ADDED = (
     *("owner TEXT", "hook_due REAL", "hook_tries INTEGER NOT NULL DEFAULT 0", "lost INTEGER NOT NULL DEFAULT 0"),
     *("lease TEXT", "lease_until REAL", "lease_beat INTEGER", "lease_result INTEGER"),
+    "losses INTEGER NOT NULL DEFAULT 0",
 )
+"""Columns that queues of before lack."""
 _COLUMNS = ", ".join(Job.model_fields)
 
 
@@ -99,8 +103,9 @@ class Queue:
                 version = db.execute("PRAGMA user_version").fetchone()[0]
                 if version > SCHEMA:
                     raise UserError(f"{path}: queue schema {version} is newer than this dnrpipe ({SCHEMA}); upgrade it")
-                if version == 1:
-                    for column in _SINCE_2:
+                present = {row["name"] for row in db.execute("PRAGMA table_info(jobs)")}
+                for column in _ADDED if present else ():
+                    if column.split()[0] not in present:
                         db.execute(f"ALTER TABLE jobs ADD COLUMN {column}")
                 for statement in _TABLES.split(";"):
                     db.execute(statement)
@@ -272,20 +277,21 @@ class Queue:
     def _recover(self, which: str, *values: Any) -> list[int]:
         with self._writing() as db:
             rows = db.execute(
-                "SELECT id, cancel_requested, starts, lost + (lease_result IS 0) AS lost FROM jobs"
+                "SELECT id, cancel_requested, losses + 1 AS losses, lost + (lease_result IS 0) AS lost FROM jobs"
                 f" WHERE state = 'running' AND {which}",
                 values,
             ).fetchall()
             for row in rows:
                 if row["cancel_requested"]:
                     state, error = "cancelled", None
-                elif row["starts"] >= MAX_STARTS:
-                    state, error = "failed", f"its process was lost {row['starts']} times"
+                elif row["losses"] >= MAX_LOSSES:
+                    state, error = "failed", f"its process was lost {row['losses']} times"
                 else:
                     state, error = "queued", None
                 finished = None if state == "queued" else time.time()
                 why = error or "its worker was lost"
-                _change(db, row["id"], state, why, error=error, finished=finished, lost=row["lost"])
+                counts = {"lost": row["lost"], "losses": row["losses"]}
+                _change(db, row["id"], state, why, error=error, finished=finished, **counts)
             return [row["id"] for row in rows]
 
     def cancel(self, job: int) -> Job:
@@ -307,7 +313,8 @@ class Queue:
             if state not in ("failed", "cancelled"):
                 raise WrongState(f"job {job} is {state}; only failed and cancelled jobs can be retried")
             blank = dict.fromkeys(("started", "finished", "exit_code", "error"))
-            _change(db, job, "queued", "retried", cancel_requested=False, starts=0, crashes=0, lost=0, **blank)
+            # Starts stay counted, and so do those of which nothing is left: what the others made is not thrown away.
+            _change(db, job, "queued", "retried", cancel_requested=False, crashes=0, losses=0, **blank)
             return self.get(job)
 
     def due_hooks(self) -> list[tuple[Job, int]]:

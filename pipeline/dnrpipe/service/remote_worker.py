@@ -249,12 +249,19 @@ def _signals(stop: Callable[..., None]) -> Iterator[None]:
 
 
 def _move_source(workspace: Path, old: Path, new: Path) -> None:
-    """The manifest has the path of its scene file: where that lay under one root, it lies there under the other."""
+    """The manifest has the paths of its scene file and of its shot's cameras, a file of the workspace: what lay under
+    one root lies there under the other."""
     with contextlib.suppress(UserError):  # no manifest yet, or a damaged one, as the job will say
         found = Workspace.open(workspace)
+        before = found.manifest.model_copy(deep=True)
         source = Path(found.manifest.source.path)
         if source.is_relative_to(old):
             found.manifest.source.path = str(new / source.relative_to(old))
+        cameras = found.manifest.overrides.get("cameras", {})
+        views = Path(cameras.get("source", ""))
+        if views.is_relative_to(old / workspace.name):
+            cameras["source"] = str(new / views.relative_to(old))
+        if found.manifest != before:
             found.save()
 
 

@@ -11,6 +11,7 @@ from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
 from ..core.cameras import KEYWORDS
+from ..core.scene_files import TAKES_SCENE
 from ..core.settings import merge, parse_assignment, resolve
 from ..core.shot_records import parse_frames
 from .models import EXPORTS, FINAL, Job, JobPage, JobRequest, LogPage, Name, Problem, State
@@ -209,8 +210,8 @@ def check_request(request: JobRequest, service: Service) -> None:
     if request.webhook is not None:
         check_webhook(request.webhook, service.config.webhooks)
     if request.scene is not None:
-        if request.command not in ("run", "prepare", "shot"):
-            raise HTTPException(422, f"scene: {request.command} takes none; only run, prepare and shot do")
+        if request.command not in TAKES_SCENE:
+            raise HTTPException(422, f"scene: {request.command} takes none; only {', '.join(TAKES_SCENE)} do")
         if request.scene_sha256 is None:
             service.root.scene(request.scene)
     path = service.root.workspace(request.workspace, must_exist=request.scene is None)

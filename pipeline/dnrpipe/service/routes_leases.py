@@ -22,6 +22,7 @@ from starlette.concurrency import run_in_threadpool
 
 from .. import __version__
 from ..core.errors import UserError
+from ..core.scene_files import TAKES_SCENE
 from ..core.workspace import Workspace, locked
 from . import archive
 from .config import tightest
@@ -222,9 +223,9 @@ def _require_same(version: str) -> None:
 
 
 def _scene_of(job: Job, root: ServiceRoot) -> SceneFile | None:
-    """What `run` and `prepare` read: the file that the job was submitted with, else that of the workspace."""
+    """What commands of scenes read: the file that the job was submitted with, else that of the workspace."""
     request = job.request
-    if request.command not in ("run", "prepare"):
+    if request.command not in TAKES_SCENE:
         return None
     if request.scene is not None and request.scene_sha256 is not None:
         return SceneFile(name=request.scene, sha256=request.scene_sha256)

@@ -39,7 +39,7 @@ from .models import (
     WorkspaceDetail,
     WorkspaceSummary,
 )
-from .results import pack, results
+from .results import pack, packed_mb, results
 from .root import UnknownName
 from .routes_jobs import REFUSED, refusals
 from .state import Shared, State
@@ -183,24 +183,42 @@ def list_results(name: NamePath, service: Shared) -> list[Result]:
 
 
 @router.get("/workspaces/{name}/results/{file:path}", response_class=FileResponse, responses=refusals(404, 507) | ANY)
-def download(name: NamePath, file: Annotated[str, Path(max_length=200)], service: Shared) -> FileResponse:
-    """One of the results; folders come as a zip."""
+async def download(name: NamePath, file: Annotated[str, Path(max_length=200)], service: Shared) -> FileResponse:
+    """One of the results; folders come as a zip, and are packed one at a time."""
+    found = await run_in_threadpool(_file_of, name, file, service)
+    if found is None:
+        async with service.packing:  # who waits here holds no thread that others need
+            return await run_in_threadpool(_folder_of, name, file, service)
+    return found
+
+
+def _file_of(name: str, file: str, service: State) -> FileResponse | None:
+    """A result that is a file; None: it is a folder, or gone. Raises HTTPException 404."""
     workspace = service.root.workspace(name)
     if file not in (found.file for found in results(workspace)):
         raise HTTPException(404, f"{name} has no result {file[:80]!r}; see GET /workspaces/{name}/results")
-    saved_as = f"{name}-{file.rpartition('/')[2]}"
-    if (workspace / file).is_file():
-        path = service.root.result(name, file, f"{name} has no result {file[:80]!r}")
-        return FileResponse(path, media_type="application/octet-stream", filename=saved_as)
-    service.require_space(service.root.private)
+    if not (workspace / file).is_file():
+        return None
+    path = service.root.result(name, file, f"{name} has no result {file[:80]!r}")
+    return FileResponse(path, media_type="application/octet-stream", filename=_saved_as(name, file))
+
+
+def _folder_of(name: str, file: str, service: State) -> FileResponse:
+    """A result that is a folder, as a zip. Raises HTTPException 507."""
+    folder = service.root.workspace(name) / file.removesuffix(".zip")
+    service.require_space(service.root.private, packed_mb(folder))
     packed = service.root.private / f"{secrets.token_hex(8)}.zip"
     try:
-        pack(workspace / file.removesuffix(".zip"), packed)
+        pack(folder, packed)
     except BaseException:
         packed.unlink(missing_ok=True)
         raise
     gone = BackgroundTask(packed.unlink, missing_ok=True)
-    return FileResponse(packed, media_type="application/zip", filename=saved_as, background=gone)
+    return FileResponse(packed, media_type="application/zip", filename=_saved_as(name, file), background=gone)
+
+
+def _saved_as(name: str, file: str) -> str:
+    return f"{name}-{file.rpartition('/')[2]}"
 
 
 @router.get("/workspaces/{name}/preview", responses=refusals(404, 409))

@@ -9,7 +9,7 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, MutableMapping
 from typing import Any
 
 import h11
@@ -26,6 +26,7 @@ from .root import ServiceRoot
 from .state import Feed, State
 from .supervisor import Supervisor
 from .users import User
+from .worker import MACHINE_VARIABLES
 
 HEAD_SECONDS, BODY_SECONDS = 20.0, 30.0
 """How long a client may take to send the head of a request, and its body."""
@@ -43,9 +44,7 @@ def serve(config: ServerConfig, users: Mapping[str, User] | None, *, ready: Call
         raise UserError("behind a proxy others can reach the server, so a token is needed; give --token-file FILE")
     if not config.root.parent.is_dir():
         raise UserError(f"--root {config.root}: {config.root.parent} does not exist")
-    # Jobs and the dashboard see the settings of workspaces, not those of whoever starts the server.
-    for name in [n for n in os.environ if n.startswith("DNRPIPE_") and n != "DNRPIPE_CACHE"]:
-        del os.environ[name]
+    forget_settings(os.environ)
     root = ServiceRoot(config.root).create()
     config = config.model_copy(update={"root": root.folder})
     os.chdir(root.folder)  # a dnrpipe.toml there counts for the pages as it does for the jobs, and no other
@@ -85,6 +84,12 @@ def serve(config: ServerConfig, users: Mapping[str, User] | None, *, ready: Call
         finally:
             supervisor.stop()
             queue.close()
+
+
+def forget_settings(environment: MutableMapping[str, str]) -> None:
+    """Jobs and the dashboard see the settings of workspaces, not those of whoever starts the server."""
+    for name in [n for n in environment if n.startswith("DNRPIPE_") and n not in MACHINE_VARIABLES]:
+        del environment[name]
 
 
 class _Patient(H11Protocol):

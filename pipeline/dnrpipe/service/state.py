@@ -95,11 +95,14 @@ class State:
     streams: int = 0
     details: Remembered = field(default_factory=Remembered)
     sizes: Remembered = field(default_factory=partial(Remembered, 30.0))
+    packing: asyncio.Lock = field(default_factory=asyncio.Lock)
+    """Held while a folder is packed: one at a time, so that each finds the space that it was promised."""
 
-    def require_space(self, folder: Path) -> None:
-        """Raises HTTPException 507: too little of the folder's disk is free."""
-        if shutil.disk_usage(folder).free < self.config.free_disk_mb * 2**20:
-            raise HTTPException(507, f"less than {self.config.free_disk_mb} MiB of disk are free; make space")
+    def require_space(self, folder: Path, mb: float = 0.0) -> None:
+        """Raises HTTPException 507: too little of the folder's disk is free. mb: what is to be written, MiB."""
+        least = self.config.free_disk_mb + math.ceil(mb)
+        if shutil.disk_usage(folder).free < least * 2**20:
+            raise HTTPException(507, f"less than {least} MiB of disk are free; make space")
 
     @contextlib.contextmanager
     def stream(self) -> Iterator[None]:

@@ -31,6 +31,9 @@ class Supervisor:
     def __init__(self, config: ServerConfig, queue: Queue, log: Path) -> None:
         self.config, self.queue, self.log = config, queue, log
         self.processes: dict[str, subprocess.Popen[str]] = {}
+        self._started: dict[str, float] = {}
+        self._due = dict.fromkeys(config.devices, 0.0)
+        self._pause = dict.fromkeys(config.devices, 1.0)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="supervisor", daemon=True)
 
@@ -47,29 +50,36 @@ class Supervisor:
         self._thread.join(timeout=2 * GRACE)
 
     def _run(self) -> None:
-        started: dict[str, float] = {}
-        due = dict.fromkeys(self.config.devices, 0.0)
-        pause = dict.fromkeys(self.config.devices, 1.0)
         while not self._stopping.is_set():
-            now = time.monotonic()
             for device in self.config.devices:
-                process = self.processes.get(device)
-                if process is not None and process.poll() is not None:
-                    LOG.error("worker died", extra={"facts": {"device": device, "code": process.returncode}})
-                    del self.processes[device]
-                    self.queue.recover(device)
-                    steady = now - started[device] > STEADY_SECONDS
-                    pause[device] = 1.0 if steady else min(2 * pause[device], LONGEST_PAUSE)
-                    due[device] = now + pause[device]
-                elif process is None and now >= due[device]:
-                    self.processes[device] = self._spawn(device)
-                    started[device] = now
+                if time.monotonic() < self._due[device]:
+                    continue
+                try:
+                    self._look_after(device)
+                except Exception:  # a full disk, a busy queue: the other workers live on, and this one is tried again
+                    LOG.exception("worker could not be started again", extra={"facts": {"device": device}})
+                    self._due[device] = time.monotonic() + LONGEST_PAUSE
             self._stopping.wait(POLL)
         for process in self.processes.values():
             process.terminate()
         for process in self.processes.values():
             end_group(process, grace=GRACE + 5)
         self.queue.close()
+
+    def _look_after(self, device: str) -> None:
+        """Start the device's worker if there is none; queue the job of one that died again, and say when to start the
+        next."""
+        now, process = time.monotonic(), self.processes.get(device)
+        if process is None:
+            self.processes[device] = self._spawn(device)
+            self._started[device] = now
+        elif process.poll() is not None:
+            LOG.error("worker died", extra={"facts": {"device": device, "code": process.returncode}})
+            self.queue.recover(device)
+            del self.processes[device]  # last: where that failed, it is done again
+            steady = now - self._started[device] > STEADY_SECONDS
+            self._pause[device] = 1.0 if steady else min(2 * self._pause[device], LONGEST_PAUSE)
+            self._due[device] = now + self._pause[device]
 
     def _spawn(self, device: str) -> subprocess.Popen[str]:
         with self.log.open("a") as sink:

@@ -32,7 +32,7 @@ from ..workers.processes import die_with_parent, how_ended, last_error
 from ..workers.task_list import TIMEOUT_VARIABLE
 from .config import ServerConfig, tightest
 from .models import End, Job, Limits
-from .queue import MAX_STARTS, Queue
+from .queue import MAX_LOSSES, Queue
 from .results import EXPORTED
 from .root import ServiceRoot
 
@@ -187,7 +187,7 @@ def _how_ended(job: Job, code: int, stopped: str | None, log: Path) -> End:
         return End(state="queued", error="its worker was stopped")
     if stopped is not None:
         return End(state="failed", exit_code=code, error=f"{stopped}; raise it and retry to go on")
-    if code < 0 and job.crashes < job.request.retries and job.starts < MAX_STARTS:
+    if code < 0 and job.crashes < min(job.request.retries, MAX_LOSSES - 1):
         return End(state="queued", error=f"its process {how_ended(code)}", crashed=True)
     return End(state="failed", exit_code=code, error=_reason(log, code))
 

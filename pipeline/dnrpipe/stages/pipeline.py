@@ -17,6 +17,7 @@ from typing import Any, Literal
 from dnrtrain.contract import DamagedFile
 
 from .. import __version__
+from ..core.cameras import KEYWORDS
 from ..core.console import clock
 from ..core.effect_names import NEURAL
 from ..core.errors import UserError
@@ -30,6 +31,14 @@ from .elsewhere import make_elsewhere, trains
 from .stage import Outcome, Run, Stage
 
 State = Literal["missing", "partial", "stale", "done"]
+
+
+def _cameras(settings: Settings) -> dict[str, Any]:
+    """Settings that decide which views there are. A camera file counts by its content, wherever it lies: a workspace
+    may be moved, and is worked in on several machines."""
+    cameras = settings.cameras
+    by_content = cameras.source_sha256 and cameras.source not in KEYWORDS
+    return cameras.model_dump(exclude={"source"} if by_content else None)
 
 
 def _light(settings: Settings) -> dict[str, Any]:
@@ -89,7 +98,7 @@ STAGES: dict[str, Stage] = {
             reads=("the scene file",),
             writes=("scene", "cameras", "passes"),
             settings=lambda s: [
-                s.cameras.model_dump(),
+                _cameras(s),
                 s.passes.model_dump(exclude={"workers"}),
                 *(["raster"] if s.model.base == "raster" else []),
             ],
@@ -260,16 +269,19 @@ def discard(path: Path, owner: Stage, workspace: Workspace) -> None:
         workspace.save()
 
 
-def require_inputs(stage: Stage, workspace: Workspace, settings: Settings) -> None:
-    """Raise UserError naming the first command that must run before this stage can."""
+def require_inputs(stage: Stage, workspace: Workspace, settings: Settings, asking: str | None = None) -> None:
+    """Raise UserError naming the first command that must run before this stage can.
+
+    asking: what reads the same inputs, where that is not the stage itself.
+    """
     for need in stage.needs:
         upstream = STAGES[need]
-        require_inputs(upstream, workspace, settings)
+        require_inputs(upstream, workspace, settings, asking)
         found = state(upstream, workspace, settings)
         if found != "done":
             why = {"missing": "has not run", "partial": "is not complete", "stale": "is out of date"}[found]
             raise UserError(
-                f"{stage.command}: {upstream.command} {why} for {workspace.root};"
+                f"{asking or stage.command}: {upstream.command} {why} for {workspace.root};"
                 f" run `dnrpipe {upstream.command}` first"
             )
 

@@ -15,7 +15,16 @@ from ..core.errors import UserError
 from ..core.ledger import StageName
 from ..core.scene_files import split_views
 from ..core.settings import Settings, merge, parse_assignment, resolve
-from ..core.workspace import DamagedManifest, Manifest, Source, Workspace, file_sha256, find_workspace, locked
+from ..core.workspace import (
+    DamagedManifest,
+    Manifest,
+    Source,
+    Workspace,
+    file_sha256,
+    find_workspace,
+    locked,
+    sha256_now,
+)
 from .inspect_scene import require_file
 from .pipeline import STAGES, require_inputs, run_stage, state
 from .select import check_budget
@@ -82,6 +91,8 @@ class Session:
         manifest = self.workspace.manifest
         self._check(self.settings, self.workspace)
         manifest.preset = preset or manifest.preset
+        if sha256 := self.settings.cameras.source_sha256:  # workspaces live on without their camera file
+            overrides = merge(overrides, {"cameras": {"source_sha256": sha256}})
         manifest.overrides = merge(manifest.overrides, {k: v for k, v in overrides.items() if k != "executor"})
         if self.settings.executor.engine != "local":
             self.workspace.root = self.workspace.root.resolve()  # paths in tasks say where files lie
@@ -192,4 +203,20 @@ def resolve_layers(root: Path, preset: str | None, stored: Workspace | None, ove
     """preset < ./dnrpipe.toml < workspace's dnrpipe.toml < environment < flags given before < flags."""
     files = [path for path in (Path("dnrpipe.toml"), root / "dnrpipe.toml") if path.is_file()]
     flags = merge(stored.manifest.overrides if stored else {}, overrides)
-    return resolve(preset, flags, toml_files=files)
+    cameras = overrides.get("cameras")
+    if isinstance(cameras, dict) and "source" in cameras and "source_sha256" not in cameras:
+        flags = merge(flags, {"cameras": {"source_sha256": ""}})  # the remembered one is another file's
+    return _with_camera_file(resolve(preset, flags, toml_files=files))
+
+
+def _with_camera_file(settings: Settings) -> Settings:
+    """With the hash of the camera file as it is now, whichever layer names it; the remembered one where it is gone.
+
+    Raises UserError: it cannot be read.
+    """
+    cameras, path = settings.cameras, Path(settings.cameras.source)
+    try:
+        found = "" if cameras.source in KEYWORDS else sha256_now(path) if path.is_file() else cameras.source_sha256
+    except OSError as error:
+        raise UserError(f"cameras.source = {path}: cannot be read ({error.strerror})") from None
+    return settings.model_copy(update={"cameras": cameras.model_copy(update={"source_sha256": found})})
