@@ -24,6 +24,7 @@ from dnrpipe.stages.shots.records import ShotFrame
 from dnrpipe.stages.shots.references import Truth
 from dnrpipe.stages.shots.render_frames import frame_tasks
 from dnrpipe.workers.task_list import TaskResult
+from dnrtrain.exr import write_exr
 
 
 def option(name: str, seconds: float, psnr: float | None, lpips: float | None = None, spp: int = 0) -> Option:
@@ -144,6 +145,16 @@ def test_what_is_rendered_does_not_depend_on_where_a_run_begins(tmp_path) -> Non
     shot = frames(30, cut=30)
     whole = frame_tasks(shot, tmp_path, Way(name="neural", spp=8), "inputs")
     assert frame_tasks(shot, tmp_path, Way(name="neural", spp=8), "inputs", [17]) == [whole[17]]
+
+
+def test_a_frame_is_whole_with_both_of_its_files(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    (task,) = frame_tasks(frames(1, cut=1), tmp_path, Way(name="path", spp=4), "inputs")
+    task.output.parent.mkdir()
+    write_exr(task.output, {"R": np.zeros((2, 2), np.float32)}, {"fingerprint": task.fingerprint})
+    assert not render_frames.is_whole(task), "an interruption between the two files"
+    task.picture.parent.mkdir()
+    task.picture.touch()
+    assert render_frames.is_whole(task)
 
 
 def test_outcomes_come_in_the_order_of_their_tasks(tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]

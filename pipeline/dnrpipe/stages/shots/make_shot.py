@@ -19,7 +19,6 @@ from ...core.scene_files import scene_fingerprint
 from ...core.units import duration
 from ...core.workspace import digest, file_sha256
 from ...workers.processes import KeptWorker
-from ...workers.view_tasks import is_made
 from ..base_images import BASE_VERSION, DENOISE_VERSION, LIGHT_VERSION, base_renderer, light_plan
 from ..effect_plan import resolve_plan
 from ..render import write_mp4
@@ -32,7 +31,7 @@ from .frame_tasks import Way
 from .options import Wanted, choose
 from .plan_shot import lines, moving_way, weigh
 from .records import PLAN, RECORD, ShotFrame, ShotPlan, ShotRecord, facts
-from .render_frames import be_ready, frame_tasks, pictures, render_frames
+from .render_frames import be_ready, frame_tasks, is_whole, pictures, render_frames
 from .renderers import Renderer, path_tracer, shipped_renderer, trained_renderer
 
 CHECKED = 2
@@ -178,7 +177,7 @@ def render_moving(
         return None
     folder, way = folder_of(run, shot), moving_way(plan.options, plan.chosen)
     tasks = dict(zip(moving, frame_tasks(shot.frames, folder, way, inputs, moving), strict=True))
-    due = [place for place in moving if place in checked or not is_made(tasks[place].data())]
+    due = [place for place in moving if place in checked or not is_whole(tasks[place])]
     if due and run.kept is not None:
         run.kept.close()  # conversion wants the memory, and each frame a process of its own
     for batch in (due[first : first + BATCH] for first in range(0, len(due), BATCH)):

@@ -13,7 +13,7 @@ from ...core.ledger import Purpose
 from ...core.workspace import digest
 from ...workers.placement import HERE
 from ...workers.task_list import TaskResult, run_tasks
-from ...workers.view_tasks import warn_of_retries
+from ...workers.view_tasks import is_made, warn_of_retries
 from ..base_images import CHUNK, WARM_UP
 from ..stage import Run
 from .frame_tasks import FrameTask, Way
@@ -82,6 +82,11 @@ def _goes_on(before: ShotFrame, after: ShotFrame) -> bool:
     """Whether two frames belong together: of one camera and one size, and nothing has moved."""
     same = (before.view.width, before.view.height) == (after.view.width, after.view.height)
     return same and before.camera == after.camera and before.moving == after.moving
+
+
+def is_whole(task: FrameTask) -> bool:
+    """Whether both files of a frame are there, made from the same inputs."""
+    return task.picture.exists() and is_made(task.data())
 
 
 def be_ready(run: Run, renderer: Renderer) -> None:
