@@ -58,8 +58,13 @@ def rolling(folder: Path) -> Path:
 
 
 def fading(folder: Path) -> Path:
-    """The rolling sphere, and a block whose roughness, noise by a keyed number, falls to a tenth at frame 5."""
+    """The rolling sphere, and a block whose roughness, noise by a keyed number, falls to a tenth at frame 5.
+
+    There the floor is gone, and another block has come, whose name is the first one.
+    """
     _roll()
+    keyed(bpy.data.objects["floor"], "hide_render", {4: False, 5: True})
+    keyed(cube("arch"), "hide_render", {4: True, 5: False})
     paint = material("paint")
     tree = paint.node_tree
     noise, factor = tree.nodes.new("ShaderNodeTexNoise"), tree.nodes.new("ShaderNodeMath")
