@@ -87,7 +87,5 @@ def shot(
         options["workspace"], scene = str(scene), None
     elif scene is not None and options["workspace"] is None:
         options["workspace"] = f"{scene.stem}.shot.dnr"
-    if options["preset"] is None and not (Path(options["workspace"] or "") / "manifest.json").exists():
-        options["preset"] = "standard"
     with open_session("shot", options, scene=scene) as session:
         session.console.result(carry_out(session, request))

@@ -25,6 +25,10 @@ UNTRAINED: tuple[StageName, ...] = ("select", "raytrace", "finetune")
 """Stages between `prepare` and frames; without views they take seconds."""
 
 
+FIRST_PRESET = {"shot": "standard"}
+"""What commands begin a workspace with, where nobody names a preset and it is not draft."""
+
+
 class Session:
     """One locked workspace with its settings, for the length of a command."""
 
@@ -55,7 +59,6 @@ class Session:
         overrides = self.overrides
         for text in self.options["assignments"]:
             overrides = merge(overrides, parse_assignment(text))
-        preset = self.options["preset"]
         if self.scene is not None:
             require_file(self.scene)
             source = Source(path=str(self.scene.resolve()), sha256=file_sha256(self.scene))
@@ -63,6 +66,7 @@ class Session:
             root = Path(named or f"{self.scene.stem}.dnr")
             # Bad settings are refused before a folder is made.
             stored = _stored(root, source, named=self.options["workspace"] is not None)
+            preset = self._preset(stored)
             planned = resolve_layers(root, preset or (stored.manifest.preset if stored else None), stored, overrides)
             self._check(planned, stored)
             self.fresh = stored is None and not root.exists()
@@ -74,6 +78,7 @@ class Session:
             Workspace.open(root)
             self.stack.enter_context(locked(root, self.command))
             self.workspace = Workspace.open(root)
+            preset = self._preset(self.workspace)
             self.before = self.workspace.manifest.model_copy(deep=True)
         self.settings = resolve_settings(self.workspace, overrides, preset)
         if self.late is not None:
@@ -86,6 +91,16 @@ class Session:
         if self.settings.executor.engine != "local":
             self.workspace.root = self.workspace.root.resolve()  # paths in tasks say where files lie
         return self
+
+    def _preset(self, stored: Workspace | None) -> str | None:
+        """The preset that the flag names, else the one that this command begins a workspace with; None: as it is.
+
+        stored: the workspace as it is on disk. One that was never prepared is as new: its first run was refused or
+        interrupted.
+        """
+        given = self.options["preset"]
+        begun = stored is not None and (stored.manifest.preset or stored.manifest.prepared)
+        return given or (FIRST_PRESET.get(self.command) if not begun else None)
 
     def __exit__(self, *exception: Any) -> None:
         self.stack.__exit__(*exception)

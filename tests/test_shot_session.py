@@ -1,0 +1,59 @@
+"""How `dnrpipe shot` takes hold of a workspace: its preset, its cameras, where it runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dnrpipe.core.workspace import StageRecord, Workspace
+from dnrpipe.stages.session import Session
+
+OPTIONS = {"as_json": True, "quiet": True, "force": False, "preset": None, "workspace": None}
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    path = tmp_path / "scene.blend"
+    path.write_bytes(b"BLENDER-v300")
+    return path
+
+
+def hold(scene: Path | None, *assignments: str, command: str = "shot", **options: Any) -> Session:
+    """A session, opened and closed."""
+    given = {**OPTIONS, "assignments": assignments, **options}
+    with Session(command, given, scene, {}) as session:
+        return session
+
+
+def prepared(session: Session) -> Workspace:
+    """The session's workspace with stage prepare done."""
+    detail = {"views": {"train": 2}}
+    record = StageRecord(fingerprint="", output="", finished=0.0, seconds=0.0, detail=detail)
+    session.workspace.manifest.stages["prepare"] = record
+    session.workspace.save()
+    return session.workspace
+
+
+def test_a_shot_that_is_refused_at_first_is_standard_all_the_same(scene: Path, tmp_path: Path) -> None:
+    root = str(tmp_path / "scene.shot.dnr")
+    assert hold(scene, workspace=root).settings.preset == "standard"
+    assert Workspace.open(Path(root)).manifest.preset is None, "nothing was done, as after --camera Typo"
+    again = hold(scene, workspace=root)
+    assert again.settings.preset == "standard"
+    prepared(again)
+    assert hold(scene, workspace=root).settings.preset == "standard"
+    assert hold(scene, workspace=root, preset="paper").settings.preset == "paper"
+
+
+def test_a_draft_workspace_stays_draft(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where a bare `dnrpipe shot` finds it."""
+    root = tmp_path / "scene.dnr"
+    workspace = prepared(hold(scene, workspace=str(root), command="prepare"))
+    assert workspace.manifest.preset is None
+    assert hold(scene, workspace=str(root)).settings.preset == "draft"
+    monkeypatch.chdir(tmp_path)
+    assert hold(None).settings.preset == "draft"
+    monkeypatch.setenv("DNRPIPE_WORKSPACE", str(root))
+    assert hold(None).settings.preset == "draft"
