@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from dnrpipe.core.errors import UserError
 from dnrpipe.core.workspace import StageRecord, Workspace
 from dnrpipe.stages.session import Session
 
@@ -57,3 +58,14 @@ def test_a_draft_workspace_stays_draft(scene: Path, tmp_path: Path, monkeypatch:
     assert hold(None).settings.preset == "draft"
     monkeypatch.setenv("DNRPIPE_WORKSPACE", str(root))
     assert hold(None).settings.preset == "draft"
+
+
+def test_a_shot_whose_folder_is_gone_is_made_again(scene: Path, tmp_path: Path) -> None:
+    """`rm -r scene.dnr/shots`, or a workspace that lies elsewhere now."""
+    root = str(tmp_path / "scene.dnr")
+    session = hold(scene, workspace=root)
+    source = str(session.workspace.root / "shots" / "wide" / "candidates.json")
+    session.adopt({"cameras": {"source": source}})
+    assert hold(scene, workspace=root).settings.cameras.source == source
+    with pytest.raises(UserError, match=r"candidates\.json"):  # other commands take the cameras that are there
+        hold(scene, workspace=root, command="run")

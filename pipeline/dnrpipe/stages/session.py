@@ -166,7 +166,8 @@ class Session:
     def _check(self, settings: Settings, workspace: Workspace | None) -> None:
         """Refuse bad camera files and a budget above the candidates before any work is done or folder made."""
         prepared = workspace.manifest.prepared if workspace else None
-        if settings.cameras.source not in KEYWORDS and (self.command == "prepare" or self.scene is not None):
+        reads = self.command == "prepare" or (self.scene is not None and self.command != "shot")
+        if settings.cameras.source not in KEYWORDS and reads:  # a shot brings cameras of its own
             read_camera_file(Path(settings.cameras.source), settings.cameras)
         if self.command == "run" and settings.cameras.source in ("auto", "dome", "sphere"):
             check_budget(settings.select.budget, settings.cameras.train)
