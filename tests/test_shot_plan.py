@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -23,6 +24,7 @@ from dnrpipe.stages.shots.plan_shot import Shape, baked_option, moving_way, path
 from dnrpipe.stages.shots.records import ShotFrame
 from dnrpipe.stages.shots.references import Truth
 from dnrpipe.stages.shots.render_frames import frame_tasks
+from dnrpipe.stages.shots.request import carry_out
 from dnrpipe.workers.task_list import TaskResult
 from dnrtrain.exr import write_exr
 
@@ -59,6 +61,22 @@ def test_path_tracing_that_is_as_good_and_cheaper_wins() -> None:
     assert choose([*ALL, quick], Wanted())[0] is quick
     blurred = option("path", 60, 31.5, 0.20, spp=16)  # PSNR alone is not enough
     assert choose([*ALL, blurred], Wanted())[0] is OURS
+
+
+def test_an_lpips_that_nobody_measured_is_not_the_one_that_is_wanted() -> None:
+    blind = [found.model_copy(update={"lpips": None}) for found in ALL]
+    assert choose(blind, Wanted(lpips=0.05)) == (blind[-1], "the best; none is expected to reach what is wanted")
+    assert choose(blind, Wanted(psnr=28.5))[0] is blind[1], "PSNR alone is wanted"
+    trained = option("neural", 150, 33.0).model_copy(update={"views": 4})
+    assert choose([CHEAP, trained], Wanted(lpips=0.01))[0] is trained, "tried, for nothing else has it"
+
+
+def test_an_lpips_that_cannot_be_measured_is_refused_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("DNRPIPE_CACHE", str(tmp_path))
+    asked: Any = SimpleNamespace(wanted=Wanted(lpips=0.05))
+    nothing: Any = None
+    with pytest.raises(UserError, match="dnrpipe weights"):
+        carry_out(nothing, asked)
 
 
 def test_as_few_rays_as_cost_next_to_nothing() -> None:

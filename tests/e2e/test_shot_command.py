@@ -76,6 +76,8 @@ def test_large_frames_fit_in_memory(tmp_path: Path, size: str, gib: float) -> No
         (("--size", "10"), "--size 10: expected WIDTHxHEIGHT"),
         (("--frames", "5-1"), "--frames 5-1"),
         (("--camera", "nobody"), "nobody"),
+        (("--target-psnr", "nan"), "--target-psnr nan: expected a number above 0"),
+        (("--target-lpips", "-1"), "--target-lpips -1: expected"),
         (("--time", "5m", "--target-psnr", "30"), "give --time or a target"),
     ],
 )

@@ -36,7 +36,7 @@ from .renderers import Renderer, path_tracer, shipped_renderer, trained_renderer
 
 CHECKED = 2
 """Frames of a shot that are traced to check it."""
-PLAN_VERSION = 11
+PLAN_VERSION = 12
 LIGHT_SIZES = (1024, 2048)
 """Texels of the light map's side: of few frames, of many."""
 BATCH = 8
@@ -69,7 +69,9 @@ def plan_shot(session: Session, shot: Shot, kept: KeptWorker) -> ShotPlan:
     choose_light(session, shot.frames)
     run = _run(session, kept)
     tracer, path = path_tracer(run, shot.background), folder_of(run, shot) / PLAN
+    lpips = lpips_of(run)
     inputs = [
+        lpips is not None,  # without it, PSNR alone decides
         BASE_VERSION,
         LIGHT_VERSION,
         DENOISE_VERSION,
@@ -82,7 +84,7 @@ def plan_shot(session: Session, shot: Shot, kept: KeptWorker) -> ShotPlan:
     plan = read(path, ShotPlan) if path.exists() and not session.options["force"] else None
     if plan is None or plan.fingerprint != fingerprint:
         be_ready(run, tracer)
-        options, trust = weigh(run, shot.frames, folder_of(run, shot) / "pilot", shot.wanted, tracer, lpips_of(run))
+        options, trust = weigh(run, shot.frames, folder_of(run, shot) / "pilot", shot.wanted, tracer, lpips)
         chosen, why = choose(options, shot.wanted)
         plan = ShotPlan(
             fingerprint=fingerprint,

@@ -210,4 +210,4 @@ def _wants_more(options: Sequence[Option], wanted: Wanted) -> bool:
     """Whether a quality is wanted that baked light is not expected to reach without training."""
     baked = [option for option in options if option.way.name != "path"]
     asked = wanted.psnr is not None or wanted.lpips is not None
-    return asked and not any(option.reaches(wanted.psnr, wanted.lpips) for option in baked)
+    return asked and not any(option.meets(wanted) for option in baked)

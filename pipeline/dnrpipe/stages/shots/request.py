@@ -8,8 +8,10 @@ from typing import Any
 
 from dnrtrain.contract import file_name
 
+from ...core.errors import UserError
 from ...workers.processes import KeptWorker
 from ..session import Session
+from ..trainer import perceptual_weights
 from .check import held_out
 from .make_shot import CHECKED, Shot, make_shot, plan_shot
 from .open_shot import prepare_for, shot_of_cameras, shot_of_scene
@@ -34,7 +36,12 @@ class ShotRequest:
 
 
 def carry_out(session: Session, request: ShotRequest) -> dict[str, Any]:
-    """Make the shot, or plan it -> the command's JSON answer. Raises UserError: as the stages do."""
+    """Make the shot, or plan it -> the command's JSON answer.
+
+    Raises UserError: as the stages do, and where an LPIPS is wanted that cannot be measured.
+    """
+    if request.wanted.lpips is not None and perceptual_weights(None) is None:
+        raise UserError("--target-lpips: there are no weights here to measure it by; fetch them with `dnrpipe weights`")
     workspace, console = session.workspace, session.console
     if request.camera_file is not None:
         file = shot_of_cameras(request.camera_file, session, request.size)
