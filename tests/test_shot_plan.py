@@ -20,7 +20,7 @@ from dnrpipe.stages.shots.frame_tasks import Way
 from dnrpipe.stages.shots.open_shot import parse_size, resized, told_frames
 from dnrpipe.stages.shots.options import Option, Wanted, choose
 from dnrpipe.stages.shots.pilot import Measured, Pilot, _Process, _Window, best_mix, reckoned
-from dnrpipe.stages.shots.plan_shot import Shape, baked_option, moving_way, path_option
+from dnrpipe.stages.shots.plan_shot import Shape, baked_option, moving_way, path_option, wants_training
 from dnrpipe.stages.shots.records import ShotFrame
 from dnrpipe.stages.shots.references import Truth
 from dnrpipe.stages.shots.render_frames import frame_tasks
@@ -61,6 +61,16 @@ def test_path_tracing_that_is_as_good_and_cheaper_wins() -> None:
     assert choose([*ALL, quick], Wanted())[0] is quick
     blurred = option("path", 60, 31.5, 0.20, spp=16)  # PSNR alone is not enough
     assert choose([*ALL, blurred], Wanted())[0] is OURS
+
+
+def test_training_is_tried_where_nothing_cheaper_is_good_enough() -> None:
+    shipped = [CHEAP, FINE, BASE, OURS]  # the last one is what training starts from
+    assert wants_training(shipped, Wanted(psnr=33)), "path tracing that has it takes three times as long"
+    assert not wants_training(shipped, Wanted(psnr=30)) and not wants_training(shipped, Wanted())
+    quick = option("path", 90, 33.5, 0.03, spp=16)
+    assert not wants_training([quick, *shipped], Wanted(psnr=33))
+    assert wants_training([quick, *shipped], Wanted(psnr=33, way="neural")), "path tracing is not wanted"
+    assert not wants_training(shipped, Wanted(psnr=33, way="base"))
 
 
 def test_an_lpips_that_nobody_measured_is_not_the_one_that_is_wanted() -> None:
