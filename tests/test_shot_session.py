@@ -10,6 +10,7 @@ import pytest
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.workspace import StageRecord, Workspace
 from dnrpipe.stages.session import Session
+from dnrpipe.stages.shot_scene import require_same_scene
 
 OPTIONS = {"as_json": True, "quiet": True, "force": False, "preset": None, "workspace": None}
 
@@ -69,3 +70,16 @@ def test_a_shot_whose_folder_is_gone_is_made_again(scene: Path, tmp_path: Path) 
     assert hold(scene, workspace=root).settings.cameras.source == source
     with pytest.raises(UserError, match=r"candidates\.json"):  # other commands take the cameras that are there
         hold(scene, workspace=root, command="run")
+
+
+def test_a_scene_file_that_has_changed_is_not_mixed_with_what_was_prepared(scene: Path, tmp_path: Path) -> None:
+    root = tmp_path / "scene.dnr"
+    workspace = prepared(hold(scene, workspace=str(root)))
+    require_same_scene(workspace)
+    scene.write_bytes(b"BLENDER-v301 edited")
+    with pytest.raises(UserError, match=r"scene.blend: has changed.*dnrpipe shot"):
+        require_same_scene(hold(None, workspace=str(root)).workspace)
+    require_same_scene(hold(scene, workspace=str(root)).workspace)  # named, it is taken over
+    scene.unlink()
+    with pytest.raises(UserError, match="is gone"):
+        require_same_scene(workspace)

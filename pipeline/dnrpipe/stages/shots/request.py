@@ -11,6 +11,7 @@ from dnrtrain.contract import file_name
 from ...core.errors import UserError
 from ...workers.processes import KeptWorker
 from ..session import Session
+from ..shot_scene import require_same_scene
 from ..trainer import perceptual_weights
 from .check import held_out
 from .make_shot import CHECKED, Shot, make_shot, plan_shot
@@ -48,6 +49,7 @@ def carry_out(session: Session, request: ShotRequest) -> dict[str, Any]:
     else:
         scene, log = Path(workspace.manifest.source.path), session.run.for_stage("prepare").log
         file = shot_of_scene(scene, request.numbers, request.camera, request.size, log)
+        require_same_scene(workspace)  # what has been looked at is what the workspace holds
     view = file.frames[0].view
     name = file_name(request.name or (request.camera_file.stem if request.camera_file else file.frames[0].camera))
     cameras = ", ".join(dict.fromkeys(frame.camera for frame in file.frames))
