@@ -77,6 +77,15 @@ def fading(folder: Path) -> Path:
     return save(folder / "fading.blend")
 
 
+def vanishing(folder: Path) -> Path:
+    """Floor and block are hidden in frames 3, 4 and 6."""
+    still()
+    for name in ("floor", "block"):
+        keyed(bpy.data.objects[name], "hide_render", {1: False, 3: True, 5: False, 6: True})
+    bpy.context.scene.frame_set(1)
+    return save(folder / "vanishing.blend")
+
+
 def _roll() -> None:
     scene, wide = still()
     bpy.ops.mesh.primitive_uv_sphere_add(segments=16, ring_count=8, radius=1, location=(0, 0, 1))

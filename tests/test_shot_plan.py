@@ -13,11 +13,12 @@ import torch
 from dnrpipe.core.cameras import look_at_view
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import CameraSettings
+from dnrpipe.core.shot_records import told_frames
 from dnrpipe.stages.base_images import CHUNK, WARM_UP
 from dnrpipe.stages.shots import render_frames
 from dnrpipe.stages.shots.check import held_out
 from dnrpipe.stages.shots.frame_tasks import Way
-from dnrpipe.stages.shots.open_shot import parse_size, resized, told_frames
+from dnrpipe.stages.shots.open_shot import parse_size, resized
 from dnrpipe.stages.shots.options import Option, Wanted, choose
 from dnrpipe.stages.shots.pilot import Measured, Pilot, _Process, _Window, best_mix, reckoned
 from dnrpipe.stages.shots.plan_shot import Shape, baked_option, moving_way, path_option, wants_training

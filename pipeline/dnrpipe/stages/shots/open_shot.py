@@ -13,6 +13,7 @@ from dnrtrain.contract import View
 
 from ...core.cameras import read_camera_file, shot_views, spread
 from ...core.errors import UserError
+from ...core.shot_records import told_frames
 from ...core.workspace import file_sha256
 from ..session import Session
 from ..shot_scene import look_at_shot
@@ -69,18 +70,6 @@ def shot_of_scene(
         found.film_transparent,
         tuple(found.warnings),
     )
-
-
-def told_frames(frames: Sequence[int]) -> str:
-    """``frames 2-5, 9`` of rising numbers."""
-    runs: list[list[int]] = []
-    for frame in frames:
-        if runs and frame == runs[-1][1] + 1:
-            runs[-1][1] = frame
-        else:
-            runs.append([frame, frame])
-    told = ", ".join(str(first) if first == last else f"{first}-{last}" for first, last in runs)
-    return f"frame{'s' if len(frames) > 1 else ''} {told}"
 
 
 def shot_of_cameras(path: Path, session: Session, size: tuple[int, int] | None) -> ShotFile:
