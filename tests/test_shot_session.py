@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,6 +12,7 @@ from dnrpipe.core.errors import UserError
 from dnrpipe.core.workspace import StageRecord, Workspace
 from dnrpipe.stages.session import Session
 from dnrpipe.stages.shot_scene import require_same_scene
+from dnrpipe.stages.shots import make_shot
 
 OPTIONS = {"as_json": True, "quiet": True, "force": False, "preset": None, "workspace": None}
 
@@ -83,3 +85,31 @@ def test_a_scene_file_that_has_changed_is_not_mixed_with_what_was_prepared(scene
     scene.unlink()
     with pytest.raises(UserError, match="is gone"):
         require_same_scene(workspace)
+
+
+def test_settings_that_a_shot_finds_keep_where_it_runs(scene: Path, tmp_path: Path) -> None:
+    session = hold(scene, "executor.engine=ray", workspace=str(tmp_path / "scene.dnr"))
+    session.adopt({"cameras": {"width": 64}})
+    assert session.settings.executor.engine == "ray" and session.settings.cameras.width == 64
+    assert "executor" not in session.workspace.manifest.overrides
+
+
+def test_the_size_of_the_light_is_chosen_for_each_shot(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = SimpleNamespace(pilot=None)
+    monkeypatch.setattr(make_shot, "resolve_plan", lambda run: plan)
+    root = str(tmp_path / "scene.dnr")
+    session = hold(scene, workspace=root)
+    view = SimpleNamespace(width=1280, height=720)
+    frames: Any = [SimpleNamespace(view=view, moving=())] * 240
+    found = []
+    for count in (240, 1):
+        session.adopt({})  # as `prepare_for` does
+        make_shot.choose_light(session, frames[:count])
+        found.append(session.settings.base.light_size)
+    assert found == [2048, 1024] and session.workspace.manifest.overrides == {}
+    (tmp_path / "scene.dnr" / "dnrpipe.toml").write_text("[base]\nlight_size = 512\n")
+    session = hold(scene, workspace=root)
+    make_shot.choose_light(session, frames)
+    assert session.settings.base.light_size == 512, "the user's, wherever it is written"

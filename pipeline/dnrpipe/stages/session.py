@@ -46,6 +46,8 @@ class Session:
         self.answers: dict[str, Any] = {}
         self.before: Manifest | None = None
         self.fresh = False
+        self.passing: dict[str, Any] = {}
+        """Of the overrides those that hold for this command alone."""
 
     def __enter__(self) -> Session:
         try:
@@ -88,6 +90,7 @@ class Session:
         self._check(self.settings, self.workspace)
         manifest.preset = preset or manifest.preset
         manifest.overrides = merge(manifest.overrides, {k: v for k, v in overrides.items() if k != "executor"})
+        self.passing = {k: v for k, v in overrides.items() if k == "executor"}
         if self.settings.executor.engine != "local":
             self.workspace.root = self.workspace.root.resolve()  # paths in tasks say where files lie
         return self
@@ -152,7 +155,7 @@ class Session:
         """Settings found by the command itself, remembered as flags are."""
         manifest = self.workspace.manifest
         manifest.overrides = merge(manifest.overrides, overrides)
-        self.settings = resolve_settings(self.workspace, {}, manifest.preset)
+        self.settings = resolve_settings(self.workspace, self.passing, manifest.preset)
         self.workspace.save()
 
     def _take_back(self) -> None:

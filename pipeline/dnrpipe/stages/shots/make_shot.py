@@ -16,6 +16,7 @@ from typing import Any
 from dnrtrain.records import read, write
 
 from ...core.scene_files import scene_fingerprint
+from ...core.settings import Settings
 from ...core.units import duration
 from ...core.workspace import digest, file_sha256
 from ...workers.processes import KeptWorker
@@ -31,7 +32,15 @@ from .frame_tasks import Way
 from .options import Wanted, choose
 from .plan_shot import lines, moving_way, weigh
 from .records import PLAN, RECORD, ShotFrame, ShotPlan, ShotRecord, facts
-from .render_frames import be_ready, frame_tasks, is_whole, pictures, render_frames
+from .render_frames import (
+    FRAMES_FOLDER,
+    PICTURES_FOLDER,
+    be_ready,
+    frame_tasks,
+    is_whole,
+    pictures,
+    render_frames,
+)
 from .renderers import Renderer, path_tracer, shipped_renderer, trained_renderer
 
 CHECKED = 2
@@ -101,15 +110,23 @@ def plan_shot(session: Session, shot: Shot, kept: KeptWorker) -> ShotPlan:
 
 
 def choose_light(session: Session, frames: Sequence[ShotFrame]) -> None:
-    """Set the light map's size where the user has not (figures: docs/experiments.md): finer where the shot has more
-    pixels than the light would have paths, so that these take a small part of the time."""
-    if "light_size" in session.workspace.manifest.overrides.get("base", {}):
+    """Choose the light map's size where no setting says one (figures: docs/experiments.md): finer where the shot has
+    more pixels than the light would have paths, so that these take a small part of the time.
+
+    The choice is not remembered as flags are: the next shot has other frames.
+    """
+    before = session.settings
+    if before.base.light_size != "auto":
         return
+
+    def sized(texels: int) -> Settings:
+        return before.model_copy(update={"base": before.base.model_copy(update={"light_size": texels})})
+
     few, many = LIGHT_SIZES
-    session.adopt({"base": {"light_size": many}})
+    session.settings = sized(many)
     pixels = sum(frame.view.width * frame.view.height for frame in frames if not frame.moving)
     if light_plan(session.settings, resolve_plan(session.run.for_stage("render"))).paths > pixels:
-        session.adopt({"base": {"light_size": few}})
+        session.settings = sized(few)
 
 
 def make_shot(session: Session, shot: Shot, plan: ShotPlan, kept: KeptWorker) -> ShotRecord:
@@ -122,6 +139,9 @@ def make_shot(session: Session, shot: Shot, plan: ShotPlan, kept: KeptWorker) ->
     started = time.monotonic()
     run, chosen = _run(session, kept), plan.chosen
     folder, tracer = folder_of(run, shot), path_tracer(run, shot.background)
+    if session.options["force"]:
+        for made in (FRAMES_FOLDER, PICTURES_FOLDER, "check"):
+            shutil.rmtree(folder / made, ignore_errors=True)
     if chosen.way.name == "path":
         renderer = tracer
     elif chosen.views:
