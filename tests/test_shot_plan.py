@@ -17,7 +17,7 @@ from dnrpipe.core.shot_records import told_frames
 from dnrpipe.stages.base_images import CHUNK, WARM_UP
 from dnrpipe.stages.shots import render_frames
 from dnrpipe.stages.shots.check import held_out
-from dnrpipe.stages.shots.frame_tasks import Way
+from dnrpipe.stages.shots.frame_tasks import FrameCommon, Way
 from dnrpipe.stages.shots.open_shot import parse_size, resized
 from dnrpipe.stages.shots.options import Option, Wanted, choose
 from dnrpipe.stages.shots.pilot import Measured, Pilot, _Process, _Window, best_mix, reckoned
@@ -25,8 +25,10 @@ from dnrpipe.stages.shots.plan_shot import Shape, baked_option, moving_way, path
 from dnrpipe.stages.shots.records import ShotFrame
 from dnrpipe.stages.shots.references import Truth
 from dnrpipe.stages.shots.render_frames import frame_tasks
+from dnrpipe.stages.shots.renderers import Renderer
 from dnrpipe.stages.shots.request import carry_out
 from dnrpipe.workers.task_list import TaskResult
+from dnrtrain.contract import SceneFrame
 from dnrtrain.exr import write_exr
 
 
@@ -168,6 +170,33 @@ def test_frames_remember_back_to_the_cut_and_no_further_than_a_chunk(tmp_path) -
     assert all(task.earlier is None for task in frame_tasks(shot, tmp_path, Way(name="path", spp=4), "inputs"))
     again = frame_tasks(shot, tmp_path, Way(name="neural", spp=8), "other inputs")
     assert {task.fingerprint for task in tasks}.isdisjoint(task.fingerprint for task in again)
+
+
+def test_a_frames_number_in_its_way_decides_its_rays(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    """The same frame after a cut, further on in the shot."""
+    shot = frames(12, cut=10)
+    (after,) = frame_tasks(shot, tmp_path, Way(name="base", spp=8), "inputs", [10])
+    (alone,) = frame_tasks(shot[10:], tmp_path, Way(name="base", spp=8), "inputs", [0])
+    assert (after.view, after.earlier, alone.earlier) == (alone.view, (), ())
+    assert (after.number, alone.number) == (10, 0) and after.fingerprint != alone.fingerprint
+    (after,) = frame_tasks(shot, tmp_path, Way(name="path", spp=8), "inputs", [10])
+    (alone,) = frame_tasks(shot[10:], tmp_path, Way(name="path", spp=8), "inputs", [0])
+    assert after.fingerprint == alone.fingerprint, "path tracing goes by the timeline's number"
+
+
+def test_folders_as_they_were_typed_decide_nothing() -> None:
+    def decided(folder: str, **other: Any) -> Any:
+        place = Path(folder)
+        base = {"bundle": f"{folder}/scene.xml", "light": f"{folder}/light.npz", "samples": 8}
+        common = {"bundle": place, "scene": place, "checkpoint": place, "base": base, "variant": "llvm"} | other
+        frame = SceneFrame(near=1, far=2, center=(0, 0, 0), radius=1)
+        facts: Any = {"integrator": "path", "max_depth": 5, "frame": frame} | common
+        run: Any = SimpleNamespace(effect_plan=SimpleNamespace(left_out=()))
+        return Renderer(FrameCommon(**facts), {}).decides(run)
+
+    assert decided("scene.dnr") == decided("/home/me/scene.dnr")
+    assert decided("scene.dnr") != decided("scene.dnr", variant="cuda")
+    assert decided("scene.dnr") != decided("scene.dnr", base=None)
 
 
 def test_what_is_rendered_does_not_depend_on_where_a_run_begins(tmp_path) -> None:  # type: ignore[no-untyped-def]

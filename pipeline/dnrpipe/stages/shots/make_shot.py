@@ -84,12 +84,13 @@ def plan_shot(session: Session, shot: Shot, kept: KeptWorker) -> ShotPlan:
         BASE_VERSION,
         LIGHT_VERSION,
         DENOISE_VERSION,
-        tracer.common.model_dump(mode="json"),
+        tracer.decides(run),
         run.scene_fingerprint,
         shot.wanted.model_dump(mode="json"),
     ]
     frames = [frame.model_dump(mode="json") for frame in shot.frames]
-    fingerprint = digest([PLAN_VERSION, *inputs, frames, run.settings.model_dump(mode="json")])
+    settings = run.settings.model_dump(mode="json", exclude={"executor": True, "cameras": {"source"}})  # not where
+    fingerprint = digest([PLAN_VERSION, *inputs, frames, settings])
     plan = read(path, ShotPlan) if path.exists() and not session.options["force"] else None
     if plan is None or plan.fingerprint != fingerprint:
         be_ready(run, tracer)
@@ -241,7 +242,6 @@ def lpips_of(run: Run) -> Any:
 
 def _inputs(run: Run, renderer: Renderer) -> str:
     """Hash of all that decides a frame but its view and way."""
-    common = renderer.common.model_dump(mode="json")
     model: list[str] = []
     if renderer.common.checkpoint is not None:
         model = [file_sha256(renderer.common.checkpoint / "model.safetensors")]
@@ -252,7 +252,7 @@ def _inputs(run: Run, renderer: Renderer) -> str:
     light = ""
     if renderer.common.base is not None:
         light = base_renderer(run.workspace, run.settings, run.effect_plan).fingerprint
-    return digest([BASE_VERSION, scene_fingerprint(run.workspace), common, model, light])
+    return digest([BASE_VERSION, scene_fingerprint(run.workspace), renderer.decides(run), model, light])
 
 
 def _tell(run: Run, record: ShotRecord) -> None:

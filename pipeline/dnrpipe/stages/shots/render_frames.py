@@ -60,7 +60,7 @@ def frame_tasks(
                 first -= 1
         earlier = None if way.name == "path" else tuple(other.view for other in frames[first:place])
         decided = [inputs, trust, frame.view.model_dump(mode="json"), way.model_dump(mode="json"), frame.lens]
-        known = None if earlier is None else [other.model_dump(mode="json") for other in earlier]
+        known = None if earlier is None else [first, *(other.model_dump(mode="json") for other in earlier)]
         tasks.append(
             FrameTask(
                 view=frame.view,
