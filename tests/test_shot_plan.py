@@ -199,6 +199,15 @@ def test_folders_as_they_were_typed_decide_nothing() -> None:
     assert decided("scene.dnr") != decided("scene.dnr", base=None)
 
 
+def test_frames_of_a_trained_renderer_remember_nothing(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    """As the frames that it was trained on."""
+    way = Way(name="neural", spp=8)
+    trained = frame_tasks(frames(6, cut=6), tmp_path, way, "inputs", alone=True)
+    assert all(task.earlier is None and task.number == 0 for task in trained)
+    shipped = frame_tasks(frames(6, cut=6), tmp_path, way, "inputs")
+    assert all(a.fingerprint != b.fingerprint for a, b in zip(trained, shipped, strict=True))
+
+
 def test_what_is_rendered_does_not_depend_on_where_a_run_begins(tmp_path) -> None:  # type: ignore[no-untyped-def]
     shot = frames(30, cut=30)
     whole = frame_tasks(shot, tmp_path, Way(name="neural", spp=8), "inputs")

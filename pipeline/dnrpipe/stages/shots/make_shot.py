@@ -156,7 +156,8 @@ def make_shot(session: Session, shot: Shot, plan: ShotPlan, kept: KeptWorker) ->
         renderer = shipped_renderer(run, shot.background, plan.trust)
     inputs = _inputs(run, renderer)
     still = [place for place, frame in enumerate(shot.frames) if not frame.moving]
-    tasks = frame_tasks(shot.frames, folder, chosen.way, inputs, still, renderer.trust)
+    trained = chosen.views > 0
+    tasks = frame_tasks(shot.frames, folder, chosen.way, inputs, still, renderer.trust, alone=trained)
     render_frames(run, renderer, tasks, label=f"frames by {chosen.way.told}")
     places = held_out(shot.frames, CHECKED)
     way_of_moving = render_moving(run, shot, plan, tracer, inputs, places)
