@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ import torch
 
 from dnrpipe.core.cameras import look_at_view
 from dnrpipe.core.errors import UserError
-from dnrpipe.core.settings import CameraSettings
+from dnrpipe.core.settings import CameraSettings, resolve
 from dnrpipe.core.shot_records import told_frames
 from dnrpipe.stages.base_images import CHUNK, WARM_UP
 from dnrpipe.stages.shots import render_frames
@@ -21,7 +21,15 @@ from dnrpipe.stages.shots.frame_tasks import FrameCommon, Way
 from dnrpipe.stages.shots.open_shot import parse_size, resized
 from dnrpipe.stages.shots.options import Option, Wanted, choose
 from dnrpipe.stages.shots.pilot import Measured, Pilot, _Process, _Window, best_mix, reckoned
-from dnrpipe.stages.shots.plan_shot import Shape, baked_option, moving_way, path_option, wants_training
+from dnrpipe.stages.shots.plan_shot import (
+    Shape,
+    _no_baked_light,
+    baked_option,
+    moving_way,
+    path_option,
+    require_baked_light,
+    wants_training,
+)
 from dnrpipe.stages.shots.records import ShotFrame
 from dnrpipe.stages.shots.references import Truth
 from dnrpipe.stages.shots.render_frames import frame_tasks
@@ -90,6 +98,18 @@ def test_an_lpips_that_cannot_be_measured_is_refused_at_once(monkeypatch: pytest
     nothing: Any = None
     with pytest.raises(UserError, match="dnrpipe weights"):
         carry_out(nothing, asked)
+
+
+@pytest.mark.parametrize("way", ["base", "neural"])
+def test_baked_light_that_is_asked_for(way: str) -> None:
+    wanted, run = Wanted(way=way), cast(Any, None)
+    require_baked_light(resolve(None, {}, environment={}), wanted)
+    settings = resolve(None, {"model": {"base": "path"}, "select": {"budget": 0}}, environment={})
+    require_baked_light(settings, Wanted(way="path"))
+    with pytest.raises(UserError, match=f"--way {way}: needs baked light, and model.base = path"):
+        require_baked_light(settings, wanted)
+    assert _no_baked_light(run, [], Shape(still=1, moving=1, pixels=1, convert=0.0), [], wanted) == ""
+    assert _no_baked_light(run, [], Shape(still=0, moving=2, pixels=1, convert=0.0), [], wanted)
 
 
 def test_as_few_rays_as_cost_next_to_nothing() -> None:

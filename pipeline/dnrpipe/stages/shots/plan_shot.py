@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ...core.errors import UserError
+from ...core.settings import Settings
 from ...core.units import duration
 from ..base_images import base_renderer, light_plan
 from ..stage import Run
@@ -30,6 +32,7 @@ glass; and the share of such light from which on baking does not pay. Base image
 does, and what shines through it onto matt surfaces is baked blurred. (`jewels` 7.6 %; the other example scenes have 0
 to 0.8 %.)
 """
+BAKED_WAYS = ("base", "neural")
 FEWEST_CANDIDATES = 2
 """Views to train on, below which training cannot be tried (`worth`)."""
 LIGHT_PATH = 2.5
@@ -160,6 +163,13 @@ def lines(options: Sequence[Option], chosen: Option, why: str) -> list[str]:
     return [*rows, f"{chosen.told}: {why}"]
 
 
+def require_baked_light(settings: Settings, wanted: Wanted) -> None:
+    """Raises UserError: a way by baked light is wanted, and the settings bake none."""
+    if wanted.way in BAKED_WAYS and settings.model.base != "baked":
+        base = settings.model.base
+        raise UserError(f"--way {wanted.way}: needs baked light, and model.base = {base}; type --set model.base=baked")
+
+
 def _conversion_seconds(run: Run) -> float:
     """Of the workspace's scene, by the ledger; a few where it does not say."""
     found = [record.seconds for record in run.workspace.ledger.read() if record.name == "convert"]
@@ -178,8 +188,8 @@ def _no_baked_light(
     run: Run, frames: Sequence[ShotFrame], shape: Shape, ladder: Sequence[Measured], wanted: Wanted
 ) -> str:
     """Why baked light is out of the question, or ""."""
-    if wanted.way in ("base", "neural"):
-        return ""
+    if wanted.way in BAKED_WAYS:
+        return "" if shape.still else "no frame stands still"
     if wanted.way == "path":
         return "path tracing is wanted"
     if any(frame.lens is not None for frame in frames):

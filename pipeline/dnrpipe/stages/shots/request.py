@@ -17,6 +17,7 @@ from .check import held_out
 from .make_shot import CHECKED, Shot, make_shot, plan_shot
 from .open_shot import prepare_for, shot_of_cameras, shot_of_scene
 from .options import Wanted
+from .plan_shot import BAKED_WAYS, require_baked_light
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,12 @@ class ShotRequest:
 def carry_out(session: Session, request: ShotRequest) -> dict[str, Any]:
     """Make the shot, or plan it -> the command's JSON answer.
 
-    Raises UserError: as the stages do, and where an LPIPS is wanted that cannot be measured.
+    Raises UserError: as the stages do, and where an LPIPS is wanted that cannot be measured, or baked light that the
+    settings do not bake.
     """
     if request.wanted.lpips is not None and perceptual_weights(None) is None:
         raise UserError("--target-lpips: there are no weights here to measure it by; fetch them with `dnrpipe weights`")
+    require_baked_light(session.settings, request.wanted)
     workspace, console = session.workspace, session.console
     if request.camera_file is not None:
         file = shot_of_cameras(request.camera_file, session, request.size)
@@ -56,6 +59,8 @@ def carry_out(session: Session, request: ShotRequest) -> dict[str, Any]:
     console.say(f"shot {name}: {len(file.frames)} frames, {view.width}x{view.height}, camera {cameras}")
     for warning in file.warnings:
         console.warn(warning)
+    if request.wanted.way in BAKED_WAYS and any(frame.lens is not None for frame in file.frames):
+        console.warn(f"--way {request.wanted.way}: the camera has depth of field, and its frames come out sharp")
     for thing, change in file.moving.items():
         console.say(f"  {thing} {change}: path-traced there")
     folder = workspace.root / "shots" / name
