@@ -58,8 +58,13 @@ def rolling(folder: Path) -> Path:
 
 
 def fading(folder: Path) -> Path:
-    """The rolling sphere, and a block whose roughness, noise by a keyed number, falls to a tenth at frame 5."""
+    """The rolling sphere, and a block whose roughness, noise by a keyed number, falls to a tenth at frame 5.
+
+    There the floor is gone, and another block has come, whose name is the first one.
+    """
     _roll()
+    keyed(bpy.data.objects["floor"], "hide_render", {4: False, 5: True})
+    keyed(cube("arch"), "hide_render", {4: True, 5: False})
     paint = material("paint")
     tree = paint.node_tree
     noise, factor = tree.nodes.new("ShaderNodeTexNoise"), tree.nodes.new("ShaderNodeMath")
@@ -70,6 +75,15 @@ def fading(folder: Path) -> Path:
     bpy.data.objects["block"].data.materials.append(paint)
     bpy.context.scene.frame_set(1)
     return save(folder / "fading.blend")
+
+
+def vanishing(folder: Path) -> Path:
+    """Floor and block are hidden in frames 3, 4 and 6."""
+    still()
+    for name in ("floor", "block"):
+        keyed(bpy.data.objects[name], "hide_render", {1: False, 3: True, 5: False, 6: True})
+    bpy.context.scene.frame_set(1)
+    return save(folder / "vanishing.blend")
 
 
 def _roll() -> None:

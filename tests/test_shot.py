@@ -87,6 +87,13 @@ def test_only_the_rolling_sphere_is_named(tmp_path: Path) -> None:
     assert (shot.converted, shot.still, shot.changing(2), shot.changing(3)) == (1, [1, 2], [], ["ball"])
 
 
+def test_frames_that_show_nothing_are_refused_by_number(tmp_path: Path) -> None:
+    path = shot_scenes.vanishing(tmp_path)
+    assert ask(path, "1-2").changing(1) == []
+    with pytest.raises(UserError, match=r"vanishing\.blend: no surface is visible in frames 3-4, 6; leave them out"):
+        ask(path, "1-6")
+
+
 def test_a_shot_of_which_only_the_cameras_move_evaluates_nothing(tmp_path: Path) -> None:
     shot = ask(shot_scenes.cameras(tmp_path))
     assert shot.changes == [] and shot.examined == 0 and shot.still == [1, 2, 3, 4, 5]

@@ -14,8 +14,10 @@ from tests import shot_scenes
 
 from dnrpipe.core.cameras import shot_views
 from dnrpipe.core.console import Console
+from dnrpipe.core.scene_files import read_summary
 from dnrpipe.core.settings import Settings
 from dnrpipe.core.workspace import Source, Workspace, file_sha256
+from dnrpipe.export.meshes import read_ply
 from dnrpipe.raytrace.variants import choose_variant
 from dnrpipe.stages.prepare import convert_scene
 from dnrpipe.stages.shot_scene import convert_frames, look_at_shot, scene_at
@@ -81,6 +83,22 @@ def test_bakes_serve_again_where_they_hold(rolled: Run) -> None:
     first, second = (scene_at(workspace, frame) / "textures" for frame in PLACES)
     own = {path.name for path in (workspace.scene / "textures").iterdir()}
     assert {path.name for path in first.iterdir()} == own != {path.name for path in second.iterdir()}
+
+
+def test_objects_keep_their_numbers(rolled: Run) -> None:
+    """Though at frame 5 an object has come that would have the first one; it has one of its own."""
+
+    def numbers(folder: Path) -> dict[str, int]:
+        found = {}
+        for path in (folder / "meshes").glob("*.ply"):
+            (number,) = np.unique(read_ply(path)[0]["atlas_z"])
+            found[path.stem.split("-")[0]] = int(number)
+        return found
+
+    names = {name: int(number) for number, name in read_summary(rolled.workspace.scene).object_names.items()}
+    assert names == {"ball": 1, "block": 2, "floor": 3}
+    assert numbers(scene_at(rolled.workspace, 2)) == names
+    assert numbers(scene_at(rolled.workspace, 5)) == {"ball": 1, "block": 2, "arch": 4}
 
 
 def test_a_frame_like_the_converted_one_has_its_bundle(rolled: Run) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -11,19 +12,32 @@ import torch
 
 from dnrpipe.core.cameras import look_at_view
 from dnrpipe.core.errors import UserError
-from dnrpipe.core.settings import CameraSettings
+from dnrpipe.core.settings import CameraSettings, resolve
+from dnrpipe.core.shot_records import told_frames
 from dnrpipe.stages.base_images import CHUNK, WARM_UP
 from dnrpipe.stages.shots import render_frames
 from dnrpipe.stages.shots.check import held_out
-from dnrpipe.stages.shots.frame_tasks import Way
-from dnrpipe.stages.shots.open_shot import parse_size, resized, told_frames
+from dnrpipe.stages.shots.frame_tasks import FrameCommon, Way
+from dnrpipe.stages.shots.open_shot import parse_size, resized
 from dnrpipe.stages.shots.options import Option, Wanted, choose
 from dnrpipe.stages.shots.pilot import Measured, Pilot, _Process, _Window, best_mix, reckoned
-from dnrpipe.stages.shots.plan_shot import Shape, baked_option, moving_way, path_option
+from dnrpipe.stages.shots.plan_shot import (
+    Shape,
+    _no_baked_light,
+    baked_option,
+    moving_way,
+    path_option,
+    require_baked_light,
+    wants_training,
+)
 from dnrpipe.stages.shots.records import ShotFrame
 from dnrpipe.stages.shots.references import Truth
 from dnrpipe.stages.shots.render_frames import frame_tasks
+from dnrpipe.stages.shots.renderers import Renderer
+from dnrpipe.stages.shots.request import carry_out
 from dnrpipe.workers.task_list import TaskResult
+from dnrtrain.contract import SceneFrame
+from dnrtrain.exr import write_exr
 
 
 def option(name: str, seconds: float, psnr: float | None, lpips: float | None = None, spp: int = 0) -> Option:
@@ -58,6 +72,44 @@ def test_path_tracing_that_is_as_good_and_cheaper_wins() -> None:
     assert choose([*ALL, quick], Wanted())[0] is quick
     blurred = option("path", 60, 31.5, 0.20, spp=16)  # PSNR alone is not enough
     assert choose([*ALL, blurred], Wanted())[0] is OURS
+
+
+def test_training_is_tried_where_nothing_cheaper_is_good_enough() -> None:
+    shipped = [CHEAP, FINE, BASE, OURS]  # the last one is what training starts from
+    assert wants_training(shipped, Wanted(psnr=33)), "path tracing that has it takes three times as long"
+    assert not wants_training(shipped, Wanted(psnr=30)) and not wants_training(shipped, Wanted())
+    quick = option("path", 90, 33.5, 0.03, spp=16)
+    assert not wants_training([quick, *shipped], Wanted(psnr=33))
+    assert wants_training([quick, *shipped], Wanted(psnr=33, way="neural")), "path tracing is not wanted"
+    assert not wants_training(shipped, Wanted(psnr=33, way="base"))
+
+
+def test_an_lpips_that_nobody_measured_is_not_the_one_that_is_wanted() -> None:
+    blind = [found.model_copy(update={"lpips": None}) for found in ALL]
+    assert choose(blind, Wanted(lpips=0.05)) == (blind[-1], "the best; none is expected to reach what is wanted")
+    assert choose(blind, Wanted(psnr=28.5))[0] is blind[1], "PSNR alone is wanted"
+    trained = option("neural", 150, 33.0).model_copy(update={"views": 4})
+    assert choose([CHEAP, trained], Wanted(lpips=0.01))[0] is trained, "tried, for nothing else has it"
+
+
+def test_an_lpips_that_cannot_be_measured_is_refused_at_once(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("DNRPIPE_CACHE", str(tmp_path))
+    asked: Any = SimpleNamespace(wanted=Wanted(lpips=0.05))
+    nothing: Any = None
+    with pytest.raises(UserError, match="dnrpipe weights"):
+        carry_out(nothing, asked)
+
+
+@pytest.mark.parametrize("way", ["base", "neural"])
+def test_baked_light_that_is_asked_for(way: str) -> None:
+    wanted, run = Wanted(way=way), cast(Any, None)
+    require_baked_light(resolve(None, {}, environment={}), wanted)
+    settings = resolve(None, {"model": {"base": "path"}, "select": {"budget": 0}}, environment={})
+    require_baked_light(settings, Wanted(way="path"))
+    with pytest.raises(UserError, match=f"--way {way}: needs baked light, and model.base = path"):
+        require_baked_light(settings, wanted)
+    assert _no_baked_light(run, [], Shape(still=1, moving=1, pixels=1, convert=0.0), [], wanted) == ""
+    assert _no_baked_light(run, [], Shape(still=0, moving=2, pixels=1, convert=0.0), [], wanted)
 
 
 def test_as_few_rays_as_cost_next_to_nothing() -> None:
@@ -140,10 +192,56 @@ def test_frames_remember_back_to_the_cut_and_no_further_than_a_chunk(tmp_path) -
     assert {task.fingerprint for task in tasks}.isdisjoint(task.fingerprint for task in again)
 
 
+def test_a_frames_number_in_its_way_decides_its_rays(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    """The same frame after a cut, further on in the shot."""
+    shot = frames(12, cut=10)
+    (after,) = frame_tasks(shot, tmp_path, Way(name="base", spp=8), "inputs", [10])
+    (alone,) = frame_tasks(shot[10:], tmp_path, Way(name="base", spp=8), "inputs", [0])
+    assert (after.view, after.earlier, alone.earlier) == (alone.view, (), ())
+    assert (after.number, alone.number) == (10, 0) and after.fingerprint != alone.fingerprint
+    (after,) = frame_tasks(shot, tmp_path, Way(name="path", spp=8), "inputs", [10])
+    (alone,) = frame_tasks(shot[10:], tmp_path, Way(name="path", spp=8), "inputs", [0])
+    assert after.fingerprint == alone.fingerprint, "path tracing goes by the timeline's number"
+
+
+def test_folders_as_they_were_typed_decide_nothing() -> None:
+    def decided(folder: str, **other: Any) -> Any:
+        place = Path(folder)
+        base = {"bundle": f"{folder}/scene.xml", "light": f"{folder}/light.npz", "samples": 8}
+        common = {"bundle": place, "scene": place, "checkpoint": place, "base": base, "variant": "llvm"} | other
+        frame = SceneFrame(near=1, far=2, center=(0, 0, 0), radius=1)
+        facts: Any = {"integrator": "path", "max_depth": 5, "frame": frame} | common
+        run: Any = SimpleNamespace(effect_plan=SimpleNamespace(left_out=()))
+        return Renderer(FrameCommon(**facts), {}).decides(run)
+
+    assert decided("scene.dnr") == decided("/home/me/scene.dnr")
+    assert decided("scene.dnr") != decided("scene.dnr", variant="cuda")
+    assert decided("scene.dnr") != decided("scene.dnr", base=None)
+
+
+def test_frames_of_a_trained_renderer_remember_nothing(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    """As the frames that it was trained on."""
+    way = Way(name="neural", spp=8)
+    trained = frame_tasks(frames(6, cut=6), tmp_path, way, "inputs", alone=True)
+    assert all(task.earlier is None and task.number == 0 for task in trained)
+    shipped = frame_tasks(frames(6, cut=6), tmp_path, way, "inputs")
+    assert all(a.fingerprint != b.fingerprint for a, b in zip(trained, shipped, strict=True))
+
+
 def test_what_is_rendered_does_not_depend_on_where_a_run_begins(tmp_path) -> None:  # type: ignore[no-untyped-def]
     shot = frames(30, cut=30)
     whole = frame_tasks(shot, tmp_path, Way(name="neural", spp=8), "inputs")
     assert frame_tasks(shot, tmp_path, Way(name="neural", spp=8), "inputs", [17]) == [whole[17]]
+
+
+def test_a_frame_is_whole_with_both_of_its_files(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    (task,) = frame_tasks(frames(1, cut=1), tmp_path, Way(name="path", spp=4), "inputs")
+    task.output.parent.mkdir()
+    write_exr(task.output, {"R": np.zeros((2, 2), np.float32)}, {"fingerprint": task.fingerprint})
+    assert not render_frames.is_whole(task), "an interruption between the two files"
+    task.picture.parent.mkdir()
+    task.picture.touch()
+    assert render_frames.is_whole(task)
 
 
 def test_outcomes_come_in_the_order_of_their_tasks(tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]

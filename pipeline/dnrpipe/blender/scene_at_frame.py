@@ -68,6 +68,7 @@ class Worker:
         if not self.common.lit:
             ensure_light(scene, meshes)
         earlier, facts = Earlier(self.earlier), read_summary(self.common.scene_dir).atlas
+        earlier.take_numbers(meshes)
         filled, strangers = earlier.take_places(meshes)
         converter = self._converter(meshes, filled, folder, options, earlier)
         if any(_materials(mesh) & converter.bakes.materials for mesh in strangers if converter.bakes is not None):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +68,9 @@ def shot(
         raise UserError("shot: --frames are of the file's animation; with --cameras, all views are rendered")
     if duration is not None and (target_psnr is not None or target_lpips is not None):
         raise UserError("shot: give --time or a target, not both")
+    for flag, target in (("--target-psnr", target_psnr), ("--target-lpips", target_lpips)):
+        if target is not None and not (math.isfinite(target) and target > 0):
+            raise UserError(f"{flag} {target:g}: expected a number above 0")
     from ..core.shot_records import parse_frames
     from ..core.units import parse_seconds
     from ..stages.shots.open_shot import parse_size
@@ -87,7 +91,5 @@ def shot(
         options["workspace"], scene = str(scene), None
     elif scene is not None and options["workspace"] is None:
         options["workspace"] = f"{scene.stem}.shot.dnr"
-    if options["preset"] is None and not (Path(options["workspace"] or "") / "manifest.json").exists():
-        options["preset"] = "standard"
     with open_session("shot", options, scene=scene) as session:
         session.console.result(carry_out(session, request))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import Literal
 
 from .errors import UserError
@@ -97,3 +98,15 @@ def parse_frames(text: str) -> tuple[int, ...]:
             raise UserError(f"--frames {text}: at most {MOST_FRAMES:,} frames up to number {LAST_FRAME:,}")
         frames.update(range(first, last + 1, step))
     return tuple(sorted(frames))
+
+
+def told_frames(frames: Sequence[int]) -> str:
+    """``frames 2-5, 9`` of rising numbers."""
+    runs: list[list[int]] = []
+    for frame in frames:
+        if runs and frame == runs[-1][1] + 1:
+            runs[-1][1] = frame
+        else:
+            runs.append([frame, frame])
+    told = ", ".join(str(first) if first == last else f"{first}-{last}" for first, last in runs)
+    return f"frame{'s' if len(frames) > 1 else ''} {told}"

@@ -34,6 +34,10 @@ UNTRAINED: tuple[StageName, ...] = ("select", "raytrace", "finetune")
 """Stages between `prepare` and frames; without views they take seconds."""
 
 
+FIRST_PRESET = {"shot": "standard"}
+"""What commands begin a workspace with, where nobody names a preset and it is not draft."""
+
+
 class Session:
     """One locked workspace with its settings, for the length of a command."""
 
@@ -51,6 +55,8 @@ class Session:
         self.answers: dict[str, Any] = {}
         self.before: Manifest | None = None
         self.fresh = False
+        self.passing: dict[str, Any] = {}
+        """Of the overrides those that hold for this command alone."""
 
     def __enter__(self) -> Session:
         try:
@@ -64,7 +70,6 @@ class Session:
         overrides = self.overrides
         for text in self.options["assignments"]:
             overrides = merge(overrides, parse_assignment(text))
-        preset = self.options["preset"]
         if self.scene is not None:
             require_file(self.scene)
             source = Source(path=str(self.scene.resolve()), sha256=file_sha256(self.scene))
@@ -72,6 +77,7 @@ class Session:
             root = Path(named or f"{self.scene.stem}.dnr")
             # Bad settings are refused before a folder is made.
             stored = _stored(root, source, named=self.options["workspace"] is not None)
+            preset = self._preset(stored)
             planned = resolve_layers(root, preset or (stored.manifest.preset if stored else None), stored, overrides)
             self._check(planned, stored)
             self.fresh = stored is None and not root.exists()
@@ -83,6 +89,7 @@ class Session:
             Workspace.open(root)
             self.stack.enter_context(locked(root, self.command))
             self.workspace = Workspace.open(root)
+            preset = self._preset(self.workspace)
             self.before = self.workspace.manifest.model_copy(deep=True)
         self.settings = resolve_settings(self.workspace, overrides, preset)
         if self.late is not None:
@@ -94,9 +101,20 @@ class Session:
         if sha256 := self.settings.cameras.source_sha256:  # workspaces live on without their camera file
             overrides = merge(overrides, {"cameras": {"source_sha256": sha256}})
         manifest.overrides = merge(manifest.overrides, {k: v for k, v in overrides.items() if k != "executor"})
+        self.passing = {k: v for k, v in overrides.items() if k == "executor"}
         if self.settings.executor.engine != "local":
             self.workspace.root = self.workspace.root.resolve()  # paths in tasks say where files lie
         return self
+
+    def _preset(self, stored: Workspace | None) -> str | None:
+        """The preset that the flag names, else the one that this command begins a workspace with; None: as it is.
+
+        stored: the workspace as it is on disk. One that was never prepared is as new: its first run was refused or
+        interrupted.
+        """
+        given = self.options["preset"]
+        begun = stored is not None and (stored.manifest.preset or stored.manifest.prepared)
+        return given or (FIRST_PRESET.get(self.command) if not begun else None)
 
     def __exit__(self, *exception: Any) -> None:
         self.stack.__exit__(*exception)
@@ -148,7 +166,7 @@ class Session:
         """Settings found by the command itself, remembered as flags are."""
         manifest = self.workspace.manifest
         manifest.overrides = merge(manifest.overrides, overrides)
-        self.settings = resolve_settings(self.workspace, {}, manifest.preset)
+        self.settings = resolve_settings(self.workspace, self.passing, manifest.preset)
         self.workspace.save()
 
     def _take_back(self) -> None:
@@ -162,7 +180,8 @@ class Session:
     def _check(self, settings: Settings, workspace: Workspace | None) -> None:
         """Refuse bad camera files and a budget above the candidates before any work is done or folder made."""
         prepared = workspace.manifest.prepared if workspace else None
-        if settings.cameras.source not in KEYWORDS and (self.command == "prepare" or self.scene is not None):
+        reads = self.command == "prepare" or (self.scene is not None and self.command != "shot")
+        if settings.cameras.source not in KEYWORDS and reads:  # a shot brings cameras of its own
             read_camera_file(Path(settings.cameras.source), settings.cameras)
         if self.command == "run" and settings.cameras.source in ("auto", "dome", "sphere"):
             check_budget(settings.select.budget, settings.cameras.train)

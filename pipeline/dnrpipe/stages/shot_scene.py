@@ -14,14 +14,14 @@ from ..core.errors import UserError
 from ..core.scene_files import read_conversion, read_summary
 from ..core.scene_records import Conversion
 from ..core.shot_records import ShotFacts
-from ..core.workspace import Workspace, digest
+from ..core.workspace import Workspace, digest, sha256_now
 from ..workers.task_list import run_tasks
 from ..workers.view_tasks import warn_of_retries, worker_count
 from .inspect_scene import require_file
 from .prepare import BAKES, MAX_BAKE_ROUNDS, bake, open_scene
 from .stage import Run
 
-FRAME_VERSION = 1
+FRAME_VERSION = 2
 
 
 def look_at_shot(scene: Path, frames: Sequence[int] | None, camera: str | None, log: Path) -> ShotFacts:
@@ -41,6 +41,15 @@ def look_at_shot(scene: Path, frames: Sequence[int] | None, camera: str | None, 
     return open_scene("dnrpipe.blender.shot", task, ShotFacts, log)[0]
 
 
+def require_same_scene(workspace: Workspace) -> None:
+    """Raises UserError: the scene file is no more the one that the workspace was made from, or it is gone."""
+    source = Path(workspace.manifest.source.path)
+    if not source.is_file():
+        raise UserError(f"{source}: the scene file is gone; moving things are converted from it, frame by frame")
+    if sha256_now(source) != workspace.manifest.source.sha256:
+        raise UserError(f"{source}: has changed since it was prepared; run `dnrpipe shot {source} -w {workspace.root}`")
+
+
 def scene_at(workspace: Workspace, frame: int) -> Path:
     """The folder of a frame's bundle: ``scene.xml``, meshes/ and textures/, as in scene/."""
     return workspace.root / "frames" / f"frame{frame:05d}"
@@ -52,7 +61,7 @@ def convert_frames(run: Run, frames: Sequence[int]) -> None:
     Only what path tracing needs. Baked textures of the conversion serve again where they hold: a value that does not
     depend on the surface's place is not baked again for an object that moves.
 
-    Raises UserError: nothing is visible at a frame, or the scene file is gone.
+    Raises UserError: nothing is visible at a frame, or the scene file is gone or has changed.
     """
     workspace = run.workspace
     prints = {frame: digest([FRAME_VERSION, run.scene_fingerprint, frame]) for frame in frames}
@@ -61,8 +70,7 @@ def convert_frames(run: Run, frames: Sequence[int]) -> None:
         return
     started = time.monotonic()
     source = Path(workspace.manifest.source.path)
-    if not source.is_file():
-        raise UserError(f"{source}: the scene file is gone; moving things are converted from it, frame by frame")
+    require_same_scene(workspace)
     size = run.settings.passes.bake_size
     common = SceneAtCommon(
         source=source.resolve(),
@@ -78,6 +86,7 @@ def convert_frames(run: Run, frames: Sequence[int]) -> None:
                 if answer.bakes is not None:
                     waiting.append((frame, answer.bakes))
                     continue
+                require_same_scene(workspace)  # it may have been saved since
                 folder = scene_at(workspace, frame)
                 shutil.rmtree(folder, ignore_errors=True)
                 _fresh(folder).rename(folder)

@@ -1,4 +1,5 @@
-"""What a frame takes over of the conversion of another one: places in the atlas, and the bakes that still hold."""
+"""What a frame takes over of the conversion of another one: the objects' numbers, places in the atlas, and the bakes
+that still hold."""
 
 from __future__ import annotations
 
@@ -6,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..geometry.freeze import MOST_IDS
 from ..geometry.frozen import FrozenMesh
 from ..shading.sockets import Source, resolve
 from ..tasks import ValueKind
@@ -26,6 +28,19 @@ class Earlier:
     def __init__(self, meshes: Sequence[FrozenMesh]) -> None:
         self.meshes = meshes
         self._before: dict[int, FrozenMesh] = {}
+
+    def take_numbers(self, meshes: Sequence[FrozenMesh]) -> None:
+        """Give objects their earlier numbers, which ``object_names`` of the scene's summary holds; new ones the next.
+
+        Else what appears or disappears would shift the numbers of all others.
+        """
+        numbers = {before.object_name: before.object_id for before in self.meshes}
+        last = max(numbers.values(), default=0)
+        for mesh in meshes:
+            if mesh.object_name not in numbers:
+                last = min(last + 1, MOST_IDS)
+                numbers[mesh.object_name] = last
+            mesh.object_id = numbers[mesh.object_name]
 
     def take_places(self, meshes: Sequence[FrozenMesh]) -> tuple[list[FrozenMesh], list[FrozenMesh]]:
         """Give meshes of the same name and number of triangles their earlier places in the atlas.

@@ -9,7 +9,8 @@ from typing import Any
 import bpy
 import numpy as np
 
-from dnrpipe.core.shot_records import Change, ChangeKind
+from dnrpipe.core.errors import UserError
+from dnrpipe.core.shot_records import Change, ChangeKind, told_frames
 
 from ..geometry.render_graph import with_render_graph
 from ..visible import freeze_visible
@@ -34,7 +35,7 @@ def find_changes(scene: Any, frames: Sequence[int]) -> tuple[list[Change], int]:
     Args:
         frames: rising.
 
-    Raises NothingVisible: no frame shows a surface.
+    Raises NothingVisible: no frame shows a surface. Raises UserError: some of those that are evaluated do not.
     """
     suspects = find_suspects(scene)
     if not suspects:
@@ -59,20 +60,26 @@ def find_changes(scene: Any, frames: Sequence[int]) -> tuple[list[Change], int]:
 def _compare(
     engine: Any, graph: Any, reader: StateReader, base: State, frames: Sequence[int]
 ) -> dict[int, Differences]:
-    """What differs at the frames, at all of them or at as many as there is time for."""
+    """What differs at the frames, at all of them or at as many as there is time for. Raises UserError: some show no
+    surface, and could not be converted."""
     scene = graph.scene
     now, subframe = scene.frame_current, scene.frame_subframe
     found: dict[int, Differences] = {}
+    empty: list[int] = []
     chosen = list(frames)
     try:
         while chosen:
             frame, started = chosen.pop(0), time.monotonic()
             engine.frame_set(frame, 0.0)
             found[frame] = _differences(base, reader.read(graph))
+            if not shows_anything(graph):
+                empty.append(frame)
             if len(found) == 2:  # the first one also loads what frames share
                 chosen = _affordable(chosen, max(LEAST, int(SECONDS / (time.monotonic() - started))))
     finally:
         engine.frame_set(now, subframe)
+    if empty:
+        raise UserError(f"no surface is visible in {told_frames(empty)}; leave them out with --frames")
     return found
 
 

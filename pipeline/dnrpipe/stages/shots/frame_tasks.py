@@ -23,7 +23,9 @@ from ...raytrace.tasks import Costs, Task
 
 LAYERS = (*"RGBA", "depth.Z", "normal.X", "normal.Y", "normal.Z", "albedo.R", "albedo.G", "albedo.B", "object.Id")
 """Channels of a frame. Normals are of world space; all but colour and albedo are of the ray through the pixel's
-centre; albedo is the diffuse reflectance."""
+centre. Albedo, a mean over the pixel, is of two kinds: of base images and the neural renderer the first surface's
+diffuse reflectance, 0 on what has none (metal, glass); of path tracing the denoiser's guide (`raytrace.auxiliary`), of
+what mirrors and glass show, and 1 where that has none."""
 HALF = ("R", "G", "B", "A", "normal.X", "normal.Y", "normal.Z", "albedo.R", "albedo.G", "albedo.B")
 """Of them, those that are written in 16 bits."""
 NETWORK = "network"

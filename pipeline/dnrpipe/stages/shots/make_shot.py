@@ -16,10 +16,10 @@ from typing import Any
 from dnrtrain.records import read, write
 
 from ...core.scene_files import scene_fingerprint
+from ...core.settings import Settings
 from ...core.units import duration
 from ...core.workspace import digest, file_sha256
 from ...workers.processes import KeptWorker
-from ...workers.view_tasks import is_made
 from ..base_images import BASE_VERSION, DENOISE_VERSION, LIGHT_VERSION, base_renderer, light_plan
 from ..effect_plan import resolve_plan
 from ..render import write_mp4
@@ -32,12 +32,20 @@ from .frame_tasks import Way
 from .options import Wanted, choose
 from .plan_shot import lines, moving_way, weigh
 from .records import PLAN, RECORD, ShotFrame, ShotPlan, ShotRecord, facts
-from .render_frames import be_ready, frame_tasks, pictures, render_frames
+from .render_frames import (
+    FRAMES_FOLDER,
+    PICTURES_FOLDER,
+    be_ready,
+    frame_tasks,
+    is_whole,
+    pictures,
+    render_frames,
+)
 from .renderers import Renderer, path_tracer, shipped_renderer, trained_renderer
 
 CHECKED = 2
 """Frames of a shot that are traced to check it."""
-PLAN_VERSION = 11
+PLAN_VERSION = 12
 LIGHT_SIZES = (1024, 2048)
 """Texels of the light map's side: of few frames, of many."""
 BATCH = 8
@@ -70,20 +78,23 @@ def plan_shot(session: Session, shot: Shot, kept: KeptWorker) -> ShotPlan:
     choose_light(session, shot.frames)
     run = _run(session, kept)
     tracer, path = path_tracer(run, shot.background), folder_of(run, shot) / PLAN
+    lpips = lpips_of(run)
     inputs = [
+        lpips is not None,  # without it, PSNR alone decides
         BASE_VERSION,
         LIGHT_VERSION,
         DENOISE_VERSION,
-        tracer.common.model_dump(mode="json"),
+        tracer.decides(run),
         run.scene_fingerprint,
         shot.wanted.model_dump(mode="json"),
     ]
     frames = [frame.model_dump(mode="json") for frame in shot.frames]
-    fingerprint = digest([PLAN_VERSION, *inputs, frames, run.settings.model_dump(mode="json")])
+    settings = run.settings.model_dump(mode="json", exclude={"executor": True, "cameras": {"source"}})  # not where
+    fingerprint = digest([PLAN_VERSION, *inputs, frames, settings])
     plan = read(path, ShotPlan) if path.exists() and not session.options["force"] else None
     if plan is None or plan.fingerprint != fingerprint:
         be_ready(run, tracer)
-        options, trust = weigh(run, shot.frames, folder_of(run, shot) / "pilot", shot.wanted, tracer, lpips_of(run))
+        options, trust = weigh(run, shot.frames, folder_of(run, shot) / "pilot", shot.wanted, tracer, lpips)
         chosen, why = choose(options, shot.wanted)
         plan = ShotPlan(
             fingerprint=fingerprint,
@@ -100,15 +111,23 @@ def plan_shot(session: Session, shot: Shot, kept: KeptWorker) -> ShotPlan:
 
 
 def choose_light(session: Session, frames: Sequence[ShotFrame]) -> None:
-    """Set the light map's size where the user has not (figures: docs/experiments.md): finer where the shot has more
-    pixels than the light would have paths, so that these take a small part of the time."""
-    if "light_size" in session.workspace.manifest.overrides.get("base", {}):
+    """Choose the light map's size where no setting says one (figures: docs/experiments.md): finer where the shot has
+    more pixels than the light would have paths, so that these take a small part of the time.
+
+    The choice is not remembered as flags are: the next shot has other frames.
+    """
+    before = session.settings
+    if before.base.light_size != "auto":
         return
+
+    def sized(texels: int) -> Settings:
+        return before.model_copy(update={"base": before.base.model_copy(update={"light_size": texels})})
+
     few, many = LIGHT_SIZES
-    session.adopt({"base": {"light_size": many}})
+    session.settings = sized(many)
     pixels = sum(frame.view.width * frame.view.height for frame in frames if not frame.moving)
     if light_plan(session.settings, resolve_plan(session.run.for_stage("render"))).paths > pixels:
-        session.adopt({"base": {"light_size": few}})
+        session.settings = sized(few)
 
 
 def make_shot(session: Session, shot: Shot, plan: ShotPlan, kept: KeptWorker) -> ShotRecord:
@@ -121,6 +140,9 @@ def make_shot(session: Session, shot: Shot, plan: ShotPlan, kept: KeptWorker) ->
     started = time.monotonic()
     run, chosen = _run(session, kept), plan.chosen
     folder, tracer = folder_of(run, shot), path_tracer(run, shot.background)
+    if session.options["force"]:
+        for made in (FRAMES_FOLDER, PICTURES_FOLDER, "check"):
+            shutil.rmtree(folder / made, ignore_errors=True)
     if chosen.way.name == "path":
         renderer = tracer
     elif chosen.views:
@@ -134,7 +156,8 @@ def make_shot(session: Session, shot: Shot, plan: ShotPlan, kept: KeptWorker) ->
         renderer = shipped_renderer(run, shot.background, plan.trust)
     inputs = _inputs(run, renderer)
     still = [place for place, frame in enumerate(shot.frames) if not frame.moving]
-    tasks = frame_tasks(shot.frames, folder, chosen.way, inputs, still, renderer.trust)
+    trained = chosen.views > 0
+    tasks = frame_tasks(shot.frames, folder, chosen.way, inputs, still, renderer.trust, alone=trained)
     render_frames(run, renderer, tasks, label=f"frames by {chosen.way.told}")
     places = held_out(shot.frames, CHECKED)
     way_of_moving = render_moving(run, shot, plan, tracer, inputs, places)
@@ -178,7 +201,7 @@ def render_moving(
         return None
     folder, way = folder_of(run, shot), moving_way(plan.options, plan.chosen)
     tasks = dict(zip(moving, frame_tasks(shot.frames, folder, way, inputs, moving), strict=True))
-    due = [place for place in moving if place in checked or not is_made(tasks[place].data())]
+    due = [place for place in moving if place in checked or not is_whole(tasks[place])]
     if due and run.kept is not None:
         run.kept.close()  # conversion wants the memory, and each frame a process of its own
     for batch in (due[first : first + BATCH] for first in range(0, len(due), BATCH)):
@@ -220,7 +243,6 @@ def lpips_of(run: Run) -> Any:
 
 def _inputs(run: Run, renderer: Renderer) -> str:
     """Hash of all that decides a frame but its view and way."""
-    common = renderer.common.model_dump(mode="json")
     model: list[str] = []
     if renderer.common.checkpoint is not None:
         model = [file_sha256(renderer.common.checkpoint / "model.safetensors")]
@@ -231,7 +253,7 @@ def _inputs(run: Run, renderer: Renderer) -> str:
     light = ""
     if renderer.common.base is not None:
         light = base_renderer(run.workspace, run.settings, run.effect_plan).fingerprint
-    return digest([BASE_VERSION, scene_fingerprint(run.workspace), common, model, light])
+    return digest([BASE_VERSION, scene_fingerprint(run.workspace), renderer.decides(run), model, light])
 
 
 def _tell(run: Run, record: ShotRecord) -> None:

@@ -13,6 +13,7 @@ from dnrtrain.contract import View
 
 from ...core.cameras import read_camera_file, shot_views, spread
 from ...core.errors import UserError
+from ...core.shot_records import told_frames
 from ...core.workspace import file_sha256
 from ..session import Session
 from ..shot_scene import look_at_shot
@@ -20,6 +21,8 @@ from .records import ShotFrame
 
 CANDIDATES = 40
 """Frames that may be traced to train on, at most."""
+CAMERAS = "candidates.json"
+"""The workspace's cameras, in the shot's folder."""
 SIZE = re.compile(r"(\d+)\s*[x×]\s*(\d+)")
 LEAST, MOST = 16, 16384
 FPS = 24.0
@@ -69,18 +72,6 @@ def shot_of_scene(
     )
 
 
-def told_frames(frames: Sequence[int]) -> str:
-    """``frames 2-5, 9`` of rising numbers."""
-    runs: list[list[int]] = []
-    for frame in frames:
-        if runs and frame == runs[-1][1] + 1:
-            runs[-1][1] = frame
-        else:
-            runs.append([frame, frame])
-    told = ", ".join(str(first) if first == last else f"{first}-{last}" for first, last in runs)
-    return f"frame{'s' if len(frames) > 1 else ''} {told}"
-
-
 def shot_of_cameras(path: Path, session: Session, size: tuple[int, int] | None) -> ShotFile:
     """The views of a NeRF ``transforms.json``, in their order, as frames from 1 on; nothing moves in them.
 
@@ -117,12 +108,7 @@ def prepare_for(session: Session, folder: Path, frames: Sequence[ShotFrame], hel
     """
     manifest = session.workspace.manifest
     selected = manifest.stages.get("select")
-    shots = session.workspace.root.resolve() / "shots"
-    if (
-        selected is not None
-        and selected.detail["views"]
-        and not Path(session.settings.cameras.source).is_relative_to(shots)
-    ):
+    if selected is not None and selected.detail["views"] and not _is_of_a_shot(session.settings.cameras.source):
         raise UserError(
             f"{session.workspace.root}: views of other cameras were chosen here (cameras.source ="
             f" {session.settings.cameras.source}); a shot needs a workspace of its own: name another with -w"
@@ -130,12 +116,19 @@ def prepare_for(session: Session, folder: Path, frames: Sequence[ShotFrame], hel
     still = [place for place, frame in enumerate(frames) if not frame.moving and place not in held_out]
     chosen = [(place, "train") for place in spread(still or range(len(frames)), CANDIDATES)]
     chosen += [(place, "test") for place in held_out]
-    path = folder / "candidates.json"
+    path = folder / CAMERAS
     write_json(path, {"camera_model": "OPENCV", "frames": [_entry(frames[place], split) for place, split in chosen]})
     view = frames[0].view
     cameras: dict[str, Any] = {"source": str(path.resolve()), "source_sha256": file_sha256(path)}
     session.adopt({"cameras": {**cameras, "width": view.width, "height": view.height}, "select": {"budget": 0}})
     session.stages("prepare")
+
+
+def _is_of_a_shot(source: str) -> bool:
+    """Whether a camera file is one that `prepare_for` wrote: ``shots/NAME/candidates.json``, of a workspace that may
+    have lain elsewhere then."""
+    path = Path(source)
+    return path.name == CAMERAS and path.parent.parent.name == "shots"
 
 
 def _entry(frame: ShotFrame, split: str) -> dict[str, Any]:

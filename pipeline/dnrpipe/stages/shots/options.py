@@ -68,6 +68,12 @@ class Option(Record):
         enough = psnr is None or (self.psnr is not None and self.psnr >= psnr)
         return enough and (lpips is None or self.lpips is None or self.lpips <= lpips)
 
+    def meets(self, wanted: Wanted) -> bool:
+        """Whether the quality that the user asked for is expected. An LPIPS that was not measured does not meet one:
+        else a single sample would. Training's, which nobody predicts, does: it is tried where nothing else meets it."""
+        measured = wanted.lpips is None or self.lpips is not None or self.views > 0
+        return measured and self.reaches(wanted.psnr, wanted.lpips)
+
 
 def choose(options: Sequence[Option], wanted: Wanted) -> tuple[Option, str]:
     """The option to carry out, and why.
@@ -93,7 +99,7 @@ def choose(options: Sequence[Option], wanted: Wanted) -> tuple[Option, str]:
             return min(options, key=lambda option: option.seconds), "the quickest; none fits in the time"
         return max(within, key=quality), "the best that fits in the time"
     if wanted.psnr is not None or wanted.lpips is not None:
-        enough = [option for option in options if option.reaches(wanted.psnr, wanted.lpips)]
+        enough = [option for option in options if option.meets(wanted)]
         if not enough:
             return max(options, key=quality), "the best; none is expected to reach what is wanted"
         return min(enough, key=lambda option: option.seconds), "the cheapest that is good enough"

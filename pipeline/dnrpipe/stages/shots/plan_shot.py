@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ...core.errors import UserError
+from ...core.settings import Settings
 from ...core.units import duration
 from ..base_images import base_renderer, light_plan
 from ..stage import Run
@@ -30,6 +32,9 @@ glass; and the share of such light from which on baking does not pay. Base image
 does, and what shines through it onto matt surfaces is baked blurred. (`jewels` 7.6 %; the other example scenes have 0
 to 0.8 %.)
 """
+BAKED_WAYS = ("base", "neural")
+FEWEST_CANDIDATES = 2
+"""Views to train on, below which training cannot be tried (`worth`)."""
 LIGHT_PATH = 2.5
 """Seconds of a path of baked light over those of a camera path: it sets out from everywhere, in all directions."""
 
@@ -83,10 +88,12 @@ def weigh(
         run.console.say(_trust_told(trust))
         ours += corrected if trust or wanted.way == "neural" else []
     options += [baked_option(found, options, shape) for found in ours]
-    if _wants_more(options, wanted) and wanted.way in (None, "neural"):
+    prepared = run.workspace.manifest.prepared
+    candidates = prepared.views["train"] if prepared else 0
+    if candidates >= FEWEST_CANDIDATES and wants_training(options, wanted):
         if run.kept is not None:
             run.kept.close()  # training on small views wants the memory
-        found = worth(run, shape.still)
+        found = worth(run, candidates)
         last = options[-1]  # of as many rays as a training's base images
         if found.views and last.psnr is not None:
             before = last.before + found.views * found.seconds
@@ -156,6 +163,13 @@ def lines(options: Sequence[Option], chosen: Option, why: str) -> list[str]:
     return [*rows, f"{chosen.told}: {why}"]
 
 
+def require_baked_light(settings: Settings, wanted: Wanted) -> None:
+    """Raises UserError: a way by baked light is wanted, and the settings bake none."""
+    if wanted.way in BAKED_WAYS and settings.model.base != "baked":
+        base = settings.model.base
+        raise UserError(f"--way {wanted.way}: needs baked light, and model.base = {base}; type --set model.base=baked")
+
+
 def _conversion_seconds(run: Run) -> float:
     """Of the workspace's scene, by the ledger; a few where it does not say."""
     found = [record.seconds for record in run.workspace.ledger.read() if record.name == "convert"]
@@ -174,8 +188,8 @@ def _no_baked_light(
     run: Run, frames: Sequence[ShotFrame], shape: Shape, ladder: Sequence[Measured], wanted: Wanted
 ) -> str:
     """Why baked light is out of the question, or ""."""
-    if wanted.way in ("base", "neural"):
-        return ""
+    if wanted.way in BAKED_WAYS:
+        return "" if shape.still else "no frame stands still"
     if wanted.way == "path":
         return "path tracing is wanted"
     if any(frame.lens is not None for frame in frames):
@@ -206,8 +220,17 @@ def _trust_told(share: float) -> str:
     return f"shipped corrector: {share:.0%} of it does best on the pilot's windows"
 
 
-def _wants_more(options: Sequence[Option], wanted: Wanted) -> bool:
-    """Whether a quality is wanted that baked light is not expected to reach without training."""
-    baked = [option for option in options if option.way.name != "path"]
+def wants_training(options: Sequence[Option], wanted: Wanted) -> bool:
+    """Whether a quality is wanted that is not expected of baked light without training, nor of path tracing that takes
+    no longer than baked light does, and so less than with training.
+
+    options: the last one is what training would start from.
+    """
     asked = wanted.psnr is not None or wanted.lpips is not None
-    return asked and not any(option.reaches(wanted.psnr, wanted.lpips) for option in baked)
+    if not asked or wanted.way not in (None, "neural"):
+        return False
+    untrained = options[-1].seconds
+    rivals = [option for option in options if option.way.name != "path"]
+    if wanted.way is None:
+        rivals += [option for option in options if option.way.name == "path" and option.seconds <= untrained]
+    return not any(option.meets(wanted) for option in rivals)

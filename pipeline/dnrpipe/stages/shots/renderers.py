@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from ...core.scene_files import read_frame
 from ...effects.bundle import write_without
@@ -22,6 +23,14 @@ class Renderer:
     common: FrameCommon
     environment: dict[str, str]
     trust: float = 1.0
+
+    def decides(self, run: Run) -> list[Any]:
+        """What of it decides pictures, JSON-able, for fingerprints: no paths, which are as they were typed. What lies
+        there is hashed as the scene (`scene_fingerprint`), the light and the weights."""
+        common = self.common.model_dump(mode="json", exclude={"bundle", "scene", "checkpoint"})
+        if common["base"] is not None:
+            common["base"] = {name: value for name, value in common["base"].items() if name not in ("bundle", "light")}
+        return [common, sorted(run.effect_plan.left_out)]  # these make the bundle another one
 
     def at_frame(self, run: Run, frame: int) -> Renderer:
         """Path traces the scene as it is at a frame, for which `convert_frames` has made a bundle."""

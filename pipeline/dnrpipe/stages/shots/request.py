@@ -8,12 +8,16 @@ from typing import Any
 
 from dnrtrain.contract import file_name
 
+from ...core.errors import UserError
 from ...workers.processes import KeptWorker
 from ..session import Session
+from ..shot_scene import require_same_scene
+from ..trainer import perceptual_weights
 from .check import held_out
 from .make_shot import CHECKED, Shot, make_shot, plan_shot
 from .open_shot import prepare_for, shot_of_cameras, shot_of_scene
 from .options import Wanted
+from .plan_shot import BAKED_WAYS, require_baked_light
 
 
 @dataclass(frozen=True)
@@ -34,19 +38,29 @@ class ShotRequest:
 
 
 def carry_out(session: Session, request: ShotRequest) -> dict[str, Any]:
-    """Make the shot, or plan it -> the command's JSON answer. Raises UserError: as the stages do."""
+    """Make the shot, or plan it -> the command's JSON answer.
+
+    Raises UserError: as the stages do, and where an LPIPS is wanted that cannot be measured, or baked light that the
+    settings do not bake.
+    """
+    if request.wanted.lpips is not None and perceptual_weights(None) is None:
+        raise UserError("--target-lpips: there are no weights here to measure it by; fetch them with `dnrpipe weights`")
+    require_baked_light(session.settings, request.wanted)
     workspace, console = session.workspace, session.console
     if request.camera_file is not None:
         file = shot_of_cameras(request.camera_file, session, request.size)
     else:
         scene, log = Path(workspace.manifest.source.path), session.run.for_stage("prepare").log
         file = shot_of_scene(scene, request.numbers, request.camera, request.size, log)
+        require_same_scene(workspace)  # what has been looked at is what the workspace holds
     view = file.frames[0].view
     name = file_name(request.name or (request.camera_file.stem if request.camera_file else file.frames[0].camera))
     cameras = ", ".join(dict.fromkeys(frame.camera for frame in file.frames))
     console.say(f"shot {name}: {len(file.frames)} frames, {view.width}x{view.height}, camera {cameras}")
     for warning in file.warnings:
         console.warn(warning)
+    if request.wanted.way in BAKED_WAYS and any(frame.lens is not None for frame in file.frames):
+        console.warn(f"--way {request.wanted.way}: the camera has depth of field, and its frames come out sharp")
     for thing, change in file.moving.items():
         console.say(f"  {thing} {change}: path-traced there")
     folder = workspace.root / "shots" / name

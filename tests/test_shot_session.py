@@ -1,0 +1,115 @@
+"""How `dnrpipe shot` takes hold of a workspace: its preset, its cameras, where it runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from dnrpipe.core.errors import UserError
+from dnrpipe.core.workspace import StageRecord, Workspace
+from dnrpipe.stages.session import Session
+from dnrpipe.stages.shot_scene import require_same_scene
+from dnrpipe.stages.shots import make_shot
+
+OPTIONS = {"as_json": True, "quiet": True, "force": False, "preset": None, "workspace": None}
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    path = tmp_path / "scene.blend"
+    path.write_bytes(b"BLENDER-v300")
+    return path
+
+
+def hold(scene: Path | None, *assignments: str, command: str = "shot", **options: Any) -> Session:
+    """A session, opened and closed."""
+    given = {**OPTIONS, "assignments": assignments, **options}
+    with Session(command, given, scene, {}) as session:
+        return session
+
+
+def prepared(session: Session) -> Workspace:
+    """The session's workspace with stage prepare done."""
+    detail = {"views": {"train": 2}}
+    record = StageRecord(fingerprint="", output="", finished=0.0, seconds=0.0, detail=detail)
+    session.workspace.manifest.stages["prepare"] = record
+    session.workspace.save()
+    return session.workspace
+
+
+def test_a_shot_that_is_refused_at_first_is_standard_all_the_same(scene: Path, tmp_path: Path) -> None:
+    root = str(tmp_path / "scene.shot.dnr")
+    assert hold(scene, workspace=root).settings.preset == "standard"
+    assert Workspace.open(Path(root)).manifest.preset is None, "nothing was done, as after --camera Typo"
+    again = hold(scene, workspace=root)
+    assert again.settings.preset == "standard"
+    prepared(again)
+    assert hold(scene, workspace=root).settings.preset == "standard"
+    assert hold(scene, workspace=root, preset="paper").settings.preset == "paper"
+
+
+def test_a_draft_workspace_stays_draft(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where a bare `dnrpipe shot` finds it."""
+    root = tmp_path / "scene.dnr"
+    workspace = prepared(hold(scene, workspace=str(root), command="prepare"))
+    assert workspace.manifest.preset is None
+    assert hold(scene, workspace=str(root)).settings.preset == "draft"
+    monkeypatch.chdir(tmp_path)
+    assert hold(None).settings.preset == "draft"
+    monkeypatch.setenv("DNRPIPE_WORKSPACE", str(root))
+    assert hold(None).settings.preset == "draft"
+
+
+def test_a_shot_whose_folder_is_gone_is_made_again(scene: Path, tmp_path: Path) -> None:
+    """`rm -r scene.dnr/shots`, or a workspace that lies elsewhere now."""
+    root = str(tmp_path / "scene.dnr")
+    session = hold(scene, workspace=root)
+    source = str(session.workspace.root / "shots" / "wide" / "candidates.json")
+    session.adopt({"cameras": {"source": source}})
+    assert hold(scene, workspace=root).settings.cameras.source == source
+    with pytest.raises(UserError, match=r"candidates\.json"):  # other commands take the cameras that are there
+        hold(scene, workspace=root, command="run")
+
+
+def test_a_scene_file_that_has_changed_is_not_mixed_with_what_was_prepared(scene: Path, tmp_path: Path) -> None:
+    root = tmp_path / "scene.dnr"
+    workspace = prepared(hold(scene, workspace=str(root)))
+    require_same_scene(workspace)
+    scene.write_bytes(b"BLENDER-v301 edited")
+    with pytest.raises(UserError, match=r"scene.blend: has changed.*dnrpipe shot"):
+        require_same_scene(hold(None, workspace=str(root)).workspace)
+    require_same_scene(hold(scene, workspace=str(root)).workspace)  # named, it is taken over
+    scene.unlink()
+    with pytest.raises(UserError, match="is gone"):
+        require_same_scene(workspace)
+
+
+def test_settings_that_a_shot_finds_keep_where_it_runs(scene: Path, tmp_path: Path) -> None:
+    session = hold(scene, "executor.engine=ray", workspace=str(tmp_path / "scene.dnr"))
+    session.adopt({"cameras": {"width": 64}})
+    assert session.settings.executor.engine == "ray" and session.settings.cameras.width == 64
+    assert "executor" not in session.workspace.manifest.overrides
+
+
+def test_the_size_of_the_light_is_chosen_for_each_shot(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan = SimpleNamespace(pilot=None)
+    monkeypatch.setattr(make_shot, "resolve_plan", lambda run: plan)
+    root = str(tmp_path / "scene.dnr")
+    session = hold(scene, workspace=root)
+    view = SimpleNamespace(width=1280, height=720)
+    frames: Any = [SimpleNamespace(view=view, moving=())] * 240
+    found = []
+    for count in (240, 1):
+        session.adopt({})  # as `prepare_for` does
+        make_shot.choose_light(session, frames[:count])
+        found.append(session.settings.base.light_size)
+    assert found == [2048, 1024] and session.workspace.manifest.overrides == {}
+    (tmp_path / "scene.dnr" / "dnrpipe.toml").write_text("[base]\nlight_size = 512\n")
+    session = hold(scene, workspace=root)
+    make_shot.choose_light(session, frames)
+    assert session.settings.base.light_size == 512, "the user's, wherever it is written"
