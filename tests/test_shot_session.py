@@ -74,6 +74,18 @@ def test_a_shot_whose_folder_is_gone_is_made_again(scene: Path, tmp_path: Path) 
         hold(scene, workspace=root, command="run")
 
 
+def test_a_shot_has_a_workspace_of_its_own_name_and_file(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert hold(scene).workspace.root.name == "scene.shot.dnr"
+    other = tmp_path / "other" / scene.name
+    other.parent.mkdir()
+    other.write_bytes(b"BLENDER-v301 other")
+    with pytest.raises(UserError, match=r"scene\.shot\.dnr: belongs to .*; name another workspace with -w"):
+        hold(other)
+
+
 def test_a_scene_file_that_has_changed_is_not_mixed_with_what_was_prepared(scene: Path, tmp_path: Path) -> None:
     root = tmp_path / "scene.dnr"
     workspace = prepared(hold(scene, workspace=str(root)))

@@ -89,7 +89,5 @@ def shot(
     )
     if scene is not None and (scene / "manifest.json").exists():
         options["workspace"], scene = str(scene), None
-    elif scene is not None and options["workspace"] is None:
-        options["workspace"] = f"{scene.stem}.shot.dnr"
     with open_session("shot", options, scene=scene) as session:
         session.console.result(carry_out(session, request))

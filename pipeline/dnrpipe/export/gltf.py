@@ -27,7 +27,7 @@ from ..core.scene_files import read_frame
 from ..core.workspace import Workspace
 from ..stages.base_images import light_path
 from ..stages.pipeline import STAGES, require_inputs
-from ..stages.session import resolve_settings
+from ..stages.session import settings_of_last_run
 from .meshes import BundleMesh, read_meshes
 
 Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -46,7 +46,7 @@ def export_gltf(workspace: Workspace, out: Path, console: Console, *, light: boo
     meshes = read_meshes(workspace.scene)
     picture = None
     if light and light_path(workspace).is_file():
-        settings = resolve_settings(workspace, {}, None)
+        settings = settings_of_last_run(workspace)
         require_inputs(STAGES["finetune"], workspace, settings, "export-gltf")  # else it is of another scene
         picture = light_picture(workspace, console)
     elif light:

@@ -33,7 +33,7 @@ from ..core.scene_files import read_frame, read_selection, split_views
 from ..core.workspace import Workspace
 from ..stages.pipeline import STAGES, require_inputs
 from ..stages.raytrace import reference_is_made
-from ..stages.session import resolve_settings
+from ..stages.session import settings_of_last_run
 from .folder import claim, finish
 
 POINTS = 100_000
@@ -124,7 +124,7 @@ def raytraced_views(workspace: Workspace) -> dict[str, list[View]]:
 
     Raises UserError: some are not ray-traced yet, or pictures are of other cameras or settings than those of now.
     """
-    settings = resolve_settings(workspace, {}, None)
+    settings = settings_of_last_run(workspace)
     require_inputs(STAGES["finetune"], workspace, settings, "export")  # it reads the same views
     cameras = split_views(workspace)
     by_name = {view.name: view for view in cameras["train"]}

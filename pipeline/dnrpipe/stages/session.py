@@ -9,6 +9,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from ..core.cameras import KEYWORDS, read_camera_file
 from ..core.console import Console
 from ..core.errors import UserError
@@ -34,6 +36,8 @@ UNTRAINED: tuple[StageName, ...] = ("select", "raytrace", "finetune")
 """Stages between `prepare` and frames; without views they take seconds."""
 
 
+OWN_ENDING = {"shot": ".shot.dnr"}
+"""Of commands whose workspaces, where nobody names one, are not those of the others: their cameras differ."""
 FIRST_PRESET = {"shot": "standard"}
 """What commands begin a workspace with, where nobody names a preset and it is not draft."""
 
@@ -74,7 +78,7 @@ class Session:
             require_file(self.scene)
             source = Source(path=str(self.scene.resolve()), sha256=file_sha256(self.scene))
             named = self.options["workspace"] or os.environ.get("DNRPIPE_WORKSPACE")
-            root = Path(named or f"{self.scene.stem}.dnr")
+            root = Path(named or f"{self.scene.stem}{OWN_ENDING.get(self.command, '.dnr')}")
             # Bad settings are refused before a folder is made.
             stored = _stored(root, source, named=self.options["workspace"] is not None)
             preset = self._preset(stored)
@@ -216,6 +220,15 @@ def _stored(root: Path, source: Source, *, named: bool) -> Workspace | None:
 
 def resolve_settings(workspace: Workspace, overrides: dict[str, Any], preset: str | None) -> Settings:
     return resolve_layers(workspace.root, preset or workspace.manifest.preset, workspace, overrides)
+
+
+def settings_of_last_run(workspace: Workspace) -> Settings:
+    """The settings that the workspace was last worked with, wherever this command runs and whatever files lie there:
+    for who reads what stages have made. Those of now where they are of another version."""
+    try:
+        return Settings.model_validate(workspace.manifest.settings or None)
+    except ValidationError:
+        return resolve_settings(workspace, {}, None)
 
 
 def resolve_layers(root: Path, preset: str | None, stored: Workspace | None, overrides: dict[str, Any]) -> Settings:

@@ -170,15 +170,9 @@ class Ablation(Study[tuple[str, str, int]]):
             "budget": self.base.select.most,
             "device": self.device,
             "threads": self.threads,
-            "precision": sorted({self._precision(row) for row in self.rows}),
+            "precision": sorted({self.precision_of(self.settings_of(row)) for row in self.rows}),
             "rows": {row.name: row.what for row in self.rows},
         }
-
-    def _precision(self, row: Row) -> str:
-        from dnrtrain.precision import decide_bfloat16  # imports torch
-
-        wanted = self.settings_of(row).finetune.step2.precision
-        return "bfloat16" if decide_bfloat16(wanted, self.device) else "float32"
 
     def line(self, place: tuple[str, str, int], task: CellTask) -> dict[str, Any]:
         cell = task.result()

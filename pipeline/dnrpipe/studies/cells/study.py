@@ -187,6 +187,12 @@ class Study(ABC, Generic[Place]):
             label=f"{scene.name} step 1",
         )
 
+    def precision_of(self, settings: Settings) -> str:
+        """What step 2's convolutions are in, on this device: float32 or bfloat16."""
+        from dnrtrain.precision import decide_bfloat16  # imports torch
+
+        return "bfloat16" if decide_bfloat16(settings.finetune.step2.precision, self.device) else "float32"
+
     def cell_task(
         self,
         scene: Scene,

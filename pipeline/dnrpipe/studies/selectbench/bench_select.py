@@ -256,6 +256,7 @@ class Bench(Study[Place]):
             "budgets": self.budgets,
             "device": self.device,
             "threads": self.threads,
+            "precision": [self.precision_of(self.base)],
             "policies": {contender.name: contender.what for contender in self.policies},
         }
 
