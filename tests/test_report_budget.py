@@ -70,7 +70,9 @@ def test_sentences_say_why_and_whether_to_train(tmp_path: Path) -> None:
         "frame": 0.1,
         "reaches": True,
     }
-    asked = {"routes": [route | {"total": 20.0, "psnr": 30.0}], "routes_psnr": 30.0, "break_even": None, "train": False}
+    traced = route | {"total": 20.0, "psnr": 30.0}
+    trained = route | {"name": "neural renderer", "what": "6 views", "upfront": 60.0, "total": 90.0, "psnr": 30.0}
+    asked = {"routes": [traced, trained], "routes_psnr": 30.0, "break_even": None, "train": False}
     wanted = {"seconds": None, "psnr": None, "frames": 200}
     found = build_budget(planned(tmp_path, wanted=wanted, **asked), None, None)
     assert found is not None
@@ -78,7 +80,8 @@ def test_sentences_say_why_and_whether_to_train(tmp_path: Path) -> None:
     assert "60.0 s more would buy 1.0 dB." in found.why
     assert found.routes[0] == "200 frames at 30.0 dB:"
     assert found.routes[1].startswith("path tracing + denoiser · 20.0 s ·")
-    assert found.routes[2:] == [
+    assert found.routes[2].startswith("neural renderer · 90.0 s ·")
+    assert found.routes[3:] == [
         "Do not train: path tracing + denoiser is cheaper.",
         "The neural renderer never pays for itself against path tracing at that PSNR.",
     ]
