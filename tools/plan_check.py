@@ -30,7 +30,7 @@ from dnrpipe.studies.frames.pareto_front import crossover, frontier
 from dnrpipe.studies.frontier.records import FrontierResults, Point, read_frontier
 from dnrpipe.studies.planning.choose import VIEWS, Predictor
 from dnrpipe.studies.planning.records import Choice, Interval, Route
-from dnrpipe.studies.planning.routes import as_reported, routes
+from dnrpipe.studies.planning.routes import BASE_ALONE, PATH_TRACING, TRAINED, as_reported, routes
 from dnrtrain.atomic import write_json
 
 FRAMES = (200, 2000)
@@ -135,14 +135,14 @@ def _actual(results: FrontierResults, neural: list[Point], wanted: float, frames
     def total(point: Point) -> float:
         return point.upfront - point.parts["passes"] + frames * point.frame_ms / 1000
 
-    found = {"neural renderer": min(total(point) for point in neural if point.psnr >= wanted)}
+    found = {TRAINED: min(total(point) for point in neural if point.psnr >= wanted)}
     points = {one.name: (one.ms, one.psnr) for one in results.baselines}
     ms = crossover([points[name] for name in frontier(points)], wanted)
     if ms is not None:
-        found["path tracing + denoiser"] = frames * ms / 1000
+        found[PATH_TRACING] = frames * ms / 1000
     base = next(point for point in results.points if point.kind == "base")
     if base.psnr >= wanted:
-        found["base image alone"] = total(base)
+        found[BASE_ALONE] = total(base)
     return found
 
 
@@ -185,7 +185,7 @@ def _ratio(rows: list[dict[str, Any]], name: str) -> float:
 
 
 def _routes_table(found: list[dict[str, Any]]) -> list[str]:
-    names = {"path tracing + denoiser": "path tracing", "base image alone": "base image", "neural renderer": "neural"}
+    names = {PATH_TRACING: "path tracing", BASE_ALONE: "base image", TRAINED: "neural"}
     lines = [
         "| scene | frames | dB wanted | plan names | cheapest | right | expected, s | measured, s |",
         "|---|---|---|---|---|---|---|---|",

@@ -19,7 +19,7 @@ from .choose import Predictor, best_within, budgets, cheapest_reaching
 from .pilot import run_pilot
 from .quality import Prior, Quality, load_prior, measured_gains, scene_gain, views_error, with_noise
 from .records import Pilot, PilotFacts, Plan, Prediction, PriorFacts, Route, Wanted, read_plan, write_plan
-from .routes import as_reported, break_even, routes
+from .routes import TRAINED, as_reported, break_even, routes
 from .seconds import Costs, Work, noise_at
 
 
@@ -40,7 +40,7 @@ def make_plan(run: Run, wanted: Wanted, prior: Prior | None = None) -> Plan:
     asked: dict[str, Any] = {}
     if wanted.frames is not None:
         found, at = whether_to_train(predictor, grid, wanted, chosen)
-        train = found[0].reaches and found[0].name == "neural renderer"
+        train = found[0].reaches and found[0].name == TRAINED
         asked = {"routes": found, "routes_psnr": at, "break_even": break_even(found), "train": train}
     plan = Plan(
         made=time.time(),

@@ -18,7 +18,8 @@ from ..frames.pareto_front import crossover, frontier
 from .quality import with_noise
 from .records import FramePart, FramePoint, Prediction, Route
 
-PATH_TRACING, UNTRAINED, TRAINED = "path tracing + denoiser", "neural renderer, untrained", "neural renderer"
+PATH_TRACING, BASE_ALONE = "path tracing + denoiser", "base image alone"
+UNTRAINED, TRAINED = "neural renderer, untrained", "neural renderer"
 FURTHEST = 64.0
 """How many times the last baseline's time the slope is followed beyond it."""
 
@@ -88,7 +89,7 @@ def routes(
         what = "beyond the pilot's samples, extrapolated" if beyond else _between(line, seconds)
         add(PATH_TRACING, what, 0.0, seconds * scale, psnr, True)
     base, alone = part.base.psnr, part.base.ms / 1000 * scale
-    add("base image alone", "baked light, no network", light_seconds, alone, base, base >= psnr)
+    add(BASE_ALONE, "baked light, no network", light_seconds, alone, base, base >= psnr)
     if part.shipped is not None:
         quality, frame = part.shipped.psnr, part.shipped.ms / 1000 * scale
         add(UNTRAINED, "baked light, shipped corrector", untrained_seconds, frame, quality, quality >= psnr)

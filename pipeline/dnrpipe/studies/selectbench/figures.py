@@ -54,16 +54,9 @@ class Figures:
         found = {name: self.values(pool, budget, name, "psnr") for name in SIMPLE}
         found = {name: values for name, values in found.items() if values}
         shared = set.intersection(*(set(values) for values in found.values())) if found else set()
-        if not shared:
-            return None
-        by_scene: dict[str, set[tuple[str, int]]] = {}
-        for place in shared:
-            by_scene.setdefault(place[0], set()).add(place)
-
-        def mean(name: str) -> float:
-            return statistics.fmean(statistics.fmean(found[name][p] for p in places) for places in by_scene.values())
-
-        return max(found, key=mean)
+        over = {name: summarise({place: values[place] for place in shared}) for name, values in found.items()}
+        means = {name: known.mean for name, known in over.items() if known is not None}
+        return max(means, key=means.__getitem__, default=None)
 
     def against(self, policy: str, kind: str, pools: Sequence[str], budget: int) -> Difference | None:
         """PSNR: policy - baseline, each pool with its own: ``random``, or its best simple rule for kind ``simple``.
