@@ -141,12 +141,11 @@ def scene_overrides(options: dict[str, Any]) -> dict[str, Any]:
     source = options.pop("cameras")
     if source is not None:
         from ..core.cameras import KEYWORDS
-        from ..core.workspace import file_sha256
 
         if source in KEYWORDS:
             cameras |= {"source": source, "source_sha256": ""}
         elif Path(source).is_file():
-            cameras |= {"source": str(Path(source).resolve()), "source_sha256": file_sha256(Path(source))}
+            cameras |= {"source": str(Path(source).resolve())}
         else:
             raise UserError(f"--cameras {source}: neither {', '.join(KEYWORDS)} nor a camera file")
     views, resolution, raster = options.pop("views"), options.pop("resolution"), options.pop("raster")
