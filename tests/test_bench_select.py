@@ -287,6 +287,24 @@ def test_quality_against_the_number_of_views_has_pairs_and_the_price_of_choosing
     assert "| 25 | `random` | +0.20 [-0.21, +0.61] | – |" in markdown(results(two))
 
 
+def test_seconds_of_several_devices_are_the_processors() -> None:
+    values = {
+        (scene, "dome", budget, policy, 0): 20.0 + budget / 10
+        for scene, budget, policy in itertools.product("ab", (5, 10, 25), ("random", "rl-paper"))
+    }
+    mixed = results(values)
+    for cell in mixed["cells"]:
+        cell["device"] = "cuda" if cell["scene"] == "a" else "cpu"
+        if cell["scene"] == "a":
+            cell["select_seconds"] = 1e6
+    text = markdown(mixed)
+    assert "Trained: a on cuda; b on cpu" in text
+    assert "| 10 | +0.00 [+0.00, +0.00] | – | 0.8 |" in text  # 1.5 s where ten views take 20 s
+    for cell in mixed["cells"]:
+        cell["device"] = "cuda"
+    assert "Trained:" not in markdown(mixed) and "250000.4" in markdown(mixed)
+
+
 def test_runs_on_several_scenes_make_one_table() -> None:
     def run(scene: str, gains: dict[str, float]) -> dict[str, Any]:
         pairs = ((pool, policy, gain) for pool in ("dome", "path") for policy, gain in gains.items())

@@ -64,10 +64,14 @@ def _provenance(results: Mapping[str, Any], figures: Figures) -> str:
         time = f"about {results['seconds']:g} s of training for every cell"
     elif results.get("step2_steps"):
         time = f"{results['step2_steps']} steps of step 2 for every cell"
+    mixed = ""
+    if len(figures.devices) > 1:
+        named = [f"{', '.join(scenes)} on {device}" for device, scenes in figures.devices.items()]
+        mixed = f" Trained: {'; '.join(named)}; seconds are the CPU's."
     return (
         f"{made_line(results)}, {results['candidates']}"
         f" candidates a pool, {len(figures.scenes)} scene(s) ({', '.join(figures.scenes)}), {len(figures.seeds)}"
-        f" seed(s), {time}, {len(results['cells'])} cells."
+        f" seed(s), {time}, {len(results['cells'])} cells.{mixed}"
     )
 
 

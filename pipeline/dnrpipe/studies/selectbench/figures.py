@@ -21,13 +21,26 @@ Choice = tuple[str, int]
 """A policy, and how many views it chose."""
 
 
+SECONDS = ("select_seconds", "view_seconds", "train_seconds", "total_seconds")
+
+
 class Figures:
-    """Cells by pool, budget, policy; then by (scene, seed)."""
+    """Cells by pool, budget, policy; then by (scene, seed).
+
+    devices: scenes by what their cells were trained on. Of several, a CPU's cells alone have seconds: those are of the
+    processor, a GPU's of the wall, with whatever shared it.
+    """
 
     def __init__(self, results: Mapping[str, Any]) -> None:
         self.cells: dict[tuple[str, int, str], dict[tuple[str, int], dict[str, Any]]] = {}
+        self.devices: dict[str, list[str]] = {}
+        for cell in results["cells"]:
+            scenes = self.devices.setdefault(cell.get("device", results.get("device", "")), [])
+            scenes += [cell["scene"]] if cell["scene"] not in scenes else []
         for cell in results["cells"]:
             place = (cell["pool"], cell["budget"], cell["policy"])
+            if len(self.devices) > 1 and cell.get("device") != "cpu":
+                cell = {**cell, **dict.fromkeys(SECONDS)}
             self.cells.setdefault(place, {})[cell["scene"], cell["seed"]] = cell
         present = {(cell["scene"]) for cell in results["cells"]}
         self.scenes = [name for name in results["scenes"] if name in present]
