@@ -12,6 +12,8 @@ pytest.importorskip("mitsuba")
 
 from tests import shot_scenes
 
+from dnrpipe.blender.baking.earlier import Earlier
+from dnrpipe.blender.geometry.frozen import FrozenMesh
 from dnrpipe.core.cameras import shot_views
 from dnrpipe.core.console import Console
 from dnrpipe.core.scene_files import read_summary
@@ -99,6 +101,18 @@ def test_objects_keep_their_numbers(rolled: Run) -> None:
     assert names == {"ball": 1, "block": 2, "floor": 3}
     assert numbers(scene_at(rolled.workspace, 2)) == names
     assert numbers(scene_at(rolled.workspace, 5)) == {"ball": 1, "block": 2, "arch": 4}
+
+
+def test_what_comes_in_different_frames_has_different_numbers() -> None:
+    def mesh(name: str, number: int = 0) -> FrozenMesh:
+        corners = np.eye(3, dtype=np.float32)
+        return FrozenMesh(name, name, number, corners, corners, np.zeros(1, np.int32), [None])
+
+    earlier = Earlier([mesh("ball", 1), mesh("floor", 2)])
+    frames = [[mesh("ball"), mesh("arch")], [mesh("ball"), mesh("tower"), mesh("not in the file")]]
+    for meshes in frames:
+        earlier.take_numbers(meshes, ["arch", "ball", "floor", "tower"])
+    assert [[mesh.object_id for mesh in meshes] for meshes in frames] == [[1, 3], [1, 4, 5]]
 
 
 def test_a_frame_like_the_converted_one_has_its_bundle(rolled: Run) -> None:

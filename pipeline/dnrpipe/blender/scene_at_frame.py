@@ -27,6 +27,8 @@ from .shading.materials import MaterialConverter
 from .shading.textures import ImageReader, TextureStore
 from .tasks import BakeOptions, PendingBakes, PrepareAnswer, SceneAtCommon, SceneAtTask
 
+WITHOUT_SURFACE = {"ARMATURE", "CAMERA", "EMPTY", "LATTICE", "LIGHT", "LIGHT_PROBE", "SPEAKER"}
+
 
 class Worker:
     """Opens a scene file once, and converts it at one frame per task.
@@ -39,6 +41,7 @@ class Worker:
         open_scene(self.common.source)
         self.scene: Any = bpy.context.scene
         self.world = render_layer(self.scene).world_override or self.scene.world
+        self.objects = sorted(obj.name_full for obj in bpy.data.objects if obj.type not in WITHOUT_SURFACE)
         self.played: int | None = None
         self.simulated = is_simulated(self.scene)
         self.earlier = load_geometry(self.common.scene_dir / "geometry.npz")
@@ -68,7 +71,7 @@ class Worker:
         if not self.common.lit:
             ensure_light(scene, meshes)
         earlier, facts = Earlier(self.earlier), read_summary(self.common.scene_dir).atlas
-        earlier.take_numbers(meshes)
+        earlier.take_numbers(meshes, self.objects)
         filled, strangers = earlier.take_places(meshes)
         converter = self._converter(meshes, filled, folder, options, earlier)
         if any(_materials(mesh) & converter.bakes.materials for mesh in strangers if converter.bakes is not None):

@@ -21,7 +21,7 @@ from .inspect_scene import require_file
 from .prepare import BAKES, MAX_BAKE_ROUNDS, bake, open_scene
 from .stage import Run
 
-FRAME_VERSION = 2
+FRAME_VERSION = 3
 
 
 def look_at_shot(scene: Path, frames: Sequence[int] | None, camera: str | None, log: Path) -> ShotFacts:

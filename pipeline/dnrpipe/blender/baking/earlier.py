@@ -29,17 +29,19 @@ class Earlier:
         self.meshes = meshes
         self._before: dict[int, FrozenMesh] = {}
 
-    def take_numbers(self, meshes: Sequence[FrozenMesh]) -> None:
-        """Give objects their earlier numbers, which ``object_names`` of the scene's summary holds; new ones the next.
+    def take_numbers(self, meshes: Sequence[FrozenMesh], known: Sequence[str]) -> None:
+        """Give objects their earlier numbers, which ``object_names`` of the scene's summary holds, and those that were
+        not there numbers above these: the same at every frame.
 
-        Else what appears or disappears would shift the numbers of all others.
+        known: names of all objects of the file, in an order that all frames share.
         """
         numbers = {before.object_name: before.object_id for before in self.meshes}
         last = max(numbers.values(), default=0)
-        for mesh in meshes:
-            if mesh.object_name not in numbers:
+        for name in (*known, *(mesh.object_name for mesh in meshes)):
+            if name not in numbers:
                 last = min(last + 1, MOST_IDS)
-                numbers[mesh.object_name] = last
+                numbers[name] = last
+        for mesh in meshes:
             mesh.object_id = numbers[mesh.object_name]
 
     def take_places(self, meshes: Sequence[FrozenMesh]) -> tuple[list[FrozenMesh], list[FrozenMesh]]:
