@@ -1,8 +1,12 @@
-"""Curves of quality against the number of views, and against all seconds that the views and the model took."""
+"""Curves of quality against the number of views, and against all seconds that the views and the model took.
+
+python -m dnrpipe.studies.selectbench.bench_plots results.json views.png
+"""
 
 from __future__ import annotations
 
 import statistics
+import sys
 from collections.abc import Mapping
 from itertools import cycle
 from pathlib import Path
@@ -10,6 +14,7 @@ from typing import Any
 
 from dnrtrain.atomic import atomic_path
 
+from .bench_tables import read_results
 from .figures import Figures
 from .policies import CONTENDERS
 
@@ -47,9 +52,9 @@ def plot(results: Mapping[str, Any], path: Path, across: str) -> None:
                 points = []
                 for budget in figures.budgets:
                     means = figures.means(pool, budget, policy, metric)
-                    seconds = figures.means(pool, budget, policy, "total_seconds")
-                    if means and seconds:
-                        x = budget if across == "views" else statistics.fmean(seconds)
+                    places = [budget] if across == "views" else figures.means(pool, budget, policy, across)
+                    if means and places:
+                        x = statistics.fmean(places)
                         points.append((x, statistics.fmean(means), statistics.stdev(means) if len(means) > 1 else 0.0))
                 if points:
                     x, y, error = zip(*points, strict=True)
@@ -64,3 +69,7 @@ def plot(results: Mapping[str, Any], path: Path, across: str) -> None:
     figure.legend(handles, labels, loc="outside right upper", fontsize=9)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=110)
+
+
+if __name__ == "__main__":
+    plot(read_results(Path(sys.argv[1])), Path(sys.argv[2]), "views")
