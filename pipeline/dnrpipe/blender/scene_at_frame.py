@@ -22,12 +22,10 @@ from .motion.simulations import is_simulated, play
 from .motion.suspects import find_suspects
 from .reading.light import ensure_light
 from .reading.names import find_material
-from .reading.opening import open_scene
+from .reading.opening import BODILESS, open_scene
 from .shading.materials import MaterialConverter
 from .shading.textures import ImageReader, TextureStore
 from .tasks import BakeOptions, PendingBakes, PrepareAnswer, SceneAtCommon, SceneAtTask
-
-WITHOUT_SURFACE = {"ARMATURE", "CAMERA", "EMPTY", "LATTICE", "LIGHT", "LIGHT_PROBE", "SPEAKER"}
 
 
 class Worker:
@@ -41,7 +39,7 @@ class Worker:
         open_scene(self.common.source)
         self.scene: Any = bpy.context.scene
         self.world = render_layer(self.scene).world_override or self.scene.world
-        self.objects = sorted(obj.name_full for obj in bpy.data.objects if obj.type not in WITHOUT_SURFACE)
+        self.objects = sorted(obj.name_full for obj in bpy.data.objects if obj.type not in BODILESS)
         self.played: int | None = None
         self.simulated = is_simulated(self.scene)
         self.earlier = load_geometry(self.common.scene_dir / "geometry.npz")

@@ -25,6 +25,8 @@ BLEND_MAGIC = (b"BLENDER", b"\x28\xb5\x2f\xfd", b"\x1f\x8b")  # plain, zstd, gzi
 BLEND_SUFFIX = re.compile(r"\.blend\d*", re.IGNORECASE)  # .blend1 and so on are Blender's backups
 OWN_SCENES = "dnrpipe."  # scenes of a source.blend that is converted once more
 UNNODED = "Versioning: Use Nodes was removed"  # Blender 5's label on nodes it made for materials without any
+BODILESS = {"EMPTY", "CAMERA", "LIGHT", "LIGHT_PROBE", "SPEAKER", "ARMATURE", "LATTICE"}
+"""Types of objects without a surface of their own; an empty may instance some."""
 
 
 def _import_gltf(path: str) -> None:
@@ -190,7 +192,6 @@ def _choose_scene(path: Path) -> list[str]:
 
 def _may_show(scene: bpy.types.Scene) -> bool:
     """Whether any object, of the background set too, could give a surface: it carries geometry, or instances some."""
-    bodiless = {"EMPTY", "CAMERA", "LIGHT", "LIGHT_PROBE", "SPEAKER", "ARMATURE", "LATTICE"}
-    if any(obj.type not in bodiless or obj.instance_type == "COLLECTION" for obj in scene.objects):
+    if any(obj.type not in BODILESS or obj.instance_type == "COLLECTION" for obj in scene.objects):
         return True
     return scene.background_set is not None and _may_show(scene.background_set)

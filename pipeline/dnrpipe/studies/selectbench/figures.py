@@ -21,9 +21,6 @@ Choice = tuple[str, int]
 """A policy, and how many views it chose."""
 
 
-SECONDS = ("select_seconds", "view_seconds", "train_seconds", "total_seconds")
-
-
 class Figures:
     """Cells by pool, budget, policy; then by (scene, seed).
 
@@ -33,14 +30,14 @@ class Figures:
 
     def __init__(self, results: Mapping[str, Any]) -> None:
         self.cells: dict[tuple[str, int, str], dict[tuple[str, int], dict[str, Any]]] = {}
-        self.devices: dict[str, list[str]] = {}
-        for cell in results["cells"]:
-            scenes = self.devices.setdefault(cell.get("device", results.get("device", "")), [])
-            scenes += [cell["scene"]] if cell["scene"] not in scenes else []
-        for cell in results["cells"]:
+        devices = [cell.get("device", results.get("device", "")) for cell in results["cells"]]
+        self.devices: dict[str, list[str]] = {name: [] for name in devices}
+        for device, cell in zip(devices, results["cells"], strict=True):
+            if cell["scene"] not in self.devices[device]:
+                self.devices[device].append(cell["scene"])
+            if len(self.devices) > 1 and device != "cpu":
+                cell = {**cell, **{name: None for name in cell if name.endswith("_seconds")}}
             place = (cell["pool"], cell["budget"], cell["policy"])
-            if len(self.devices) > 1 and cell.get("device") != "cpu":
-                cell = {**cell, **dict.fromkeys(SECONDS)}
             self.cells.setdefault(place, {})[cell["scene"], cell["seed"]] = cell
         present = {(cell["scene"]) for cell in results["cells"]}
         self.scenes = [name for name in results["scenes"] if name in present]
