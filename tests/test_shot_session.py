@@ -106,10 +106,11 @@ def test_settings_that_a_shot_finds_keep_where_it_runs(scene: Path, tmp_path: Pa
     assert "executor" not in session.workspace.manifest.overrides
 
 
-def test_the_size_of_the_light_is_chosen_for_each_shot(
-    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("bounced", "lights"), [(0.1, [(2048, 16), (1024, 16)]), (0.6, [(1024, 128), (1024, 32)])])
+def test_light_is_chosen_for_each_shot(
+    bounced: float, lights: list[tuple[int, int]], scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    plan = SimpleNamespace(pilot=None)
+    plan = SimpleNamespace(pilot=SimpleNamespace(beyond=lambda depth: bounced))
     monkeypatch.setattr(make_shot, "resolve_plan", lambda run: plan)
     root = str(tmp_path / "scene.dnr")
     session = hold(scene, workspace=root)
@@ -119,9 +120,12 @@ def test_the_size_of_the_light_is_chosen_for_each_shot(
     for count in (240, 1):
         session.adopt({})  # as `prepare_for` does
         make_shot.choose_light(session, frames[:count])
-        found.append(session.settings.base.light_size)
-    assert found == [2048, 1024] and session.workspace.manifest.overrides == {}
-    (tmp_path / "scene.dnr" / "dnrpipe.toml").write_text("[base]\nlight_size = 512\n")
+        base = session.settings.base
+        found.append((base.light_size, base.light_spp))
+        assert base.light_where == "seen"
+    assert found == lights and session.workspace.manifest.overrides == {}
+    (tmp_path / "scene.dnr" / "dnrpipe.toml").write_text('[base]\nlight_size = 512\nlight_where = "everywhere"\n')
     session = hold(scene, workspace=root)
     make_shot.choose_light(session, frames)
-    assert session.settings.base.light_size == 512, "the user's, wherever it is written"
+    base = session.settings.base
+    assert (base.light_size, base.light_where) == (512, "everywhere"), "the user's, wherever it is written"

@@ -3,7 +3,7 @@
 python -m tools.bench_shots FOLDER [SCENE.blend ...] [--size 640x360] [--frames 48] [--out RESULTS.json]
 
 The file's own camera moves on an arc about what it looks at, half a degree a frame. Seconds are wall-clock of a machine
-that does nothing else; those of REEL frames are reckoned from the parts that were measured. FOLDER keeps workspaces and
+that does nothing else; those of REEL frames, whose light is baked, are reckoned from the parts that were measured. FOLDER keeps workspaces and
 references; a scene that is in the results is not measured again. Quality is over white, against the mean of two
 pictures of 64 samples, each denoised, on pairs of frames one after the other; flicker is what changes between the two
 of a pair beyond what the references change by (`tools.bench_frames.motion`). Path tracing climbs the ladder until it is
@@ -34,10 +34,11 @@ from dnrpipe.core.machine import processor
 from dnrpipe.core.scene_files import read_summary
 from dnrpipe.core.settings import CameraSettings
 from dnrpipe.core.workspace import Workspace
+from dnrpipe.stages.effect_plan import resolve_plan
 from dnrpipe.stages.session import resolve_settings
 from dnrpipe.stages.shot_scene import look_at_shot
 from dnrpipe.stages.shots.frame_tasks import FrameTask, Way
-from dnrpipe.stages.shots.make_shot import lpips_of
+from dnrpipe.stages.shots.make_shot import lpips_of, shot_light
 from dnrpipe.stages.shots.open_shot import parse_size
 from dnrpipe.stages.shots.references import compared, display_of, shown
 from dnrpipe.stages.shots.render_frames import FRAMES_FOLDER, frame_outcomes
@@ -107,11 +108,12 @@ def save(path: Path, rows: list[dict[str, Any]]) -> None:
 def measured(scene: Path, root: Path, size: tuple[int, int], frames: int) -> dict[str, Any]:
     """A row of the results."""
     root.mkdir(parents=True, exist_ok=True)
-    views = arc(scene, root, size, frames)
+    looked_at = root.with_name(f"arc-{root.name}")  # the shot converts the scene itself
+    views = arc(scene, looked_at, size, frames)
     cameras = root.with_suffix(".json")
     write_cameras(cameras, views, "arc")
     named = ("--cameras", str(cameras), "-w", str(root), "--name", "arc", "--preset", "standard")
-    words = ("shot", str(scene), *named, "--json")
+    words = ("shot", str(scene), *named, *light_of_reel(looked_at, size), "--json")
     started = time.monotonic()
     answer = subprocess.run([sys.executable, "-m", "dnrpipe.cli", *words], check=True, stdout=subprocess.PIPE)
     seconds = time.monotonic() - started
@@ -136,9 +138,18 @@ def measured(scene: Path, root: Path, size: tuple[int, int], frames: int) -> dic
     }
 
 
-def arc(scene: Path, root: Path, size: tuple[int, int], frames: int) -> list[View]:
-    """The scene's own camera, moved about the point that it looks at as far away as the middle of the scene."""
-    looked_at = root.with_name(f"arc-{root.name}")  # the shot converts the scene itself
+def light_of_reel(looked_at: Path, size: tuple[int, int]) -> list[str]:
+    """Flags for the light that a shot of REEL frames would take, not so few as are rendered. looked_at: see `arc`."""
+    run = opened(looked_at)
+    base = shot_light(run.settings, resolve_plan(run), REEL * size[0] * size[1]).base
+    return ["--set", f"base.light_size={base.light_size}", "--set", f"base.light_spp={base.light_spp}"]
+
+
+def arc(scene: Path, looked_at: Path, size: tuple[int, int], frames: int) -> list[View]:
+    """The scene's own camera, moved about the point that it looks at as far away as the middle of the scene.
+
+    looked_at: a workspace of the scene, which this prepares.
+    """
     words = ("prepare", str(scene), "-w", str(looked_at), "-q", "--set", "select.budget=0")
     subprocess.run([sys.executable, "-m", "dnrpipe.cli", *words], check=True)
     own = shot_views(look_at_shot(scene, (1,), None, looked_at / "logs" / "arc.log"), *size)[0]

@@ -83,6 +83,21 @@ def test_a_view_in_memory_is_as_one_from_files(scene: Scene, base: str) -> None:
         view_in_memory(channels, synthetic.FRAME, view.model_copy(update={"width": 16}), display=display, base="none")
 
 
+@pytest.mark.parametrize("output", ["log", "display"])
+def test_where_none_of_the_correction_is_applied_no_network_runs(baked: ViewSet, output: str) -> None:
+    settings = ModelSettings.model_validate({**WHOLE.model_dump(), "output": output, "trust": 0.0})
+    model = DNR(settings, seed=0)
+    torch.nn.init.normal_(model.renderer.head.weight)
+    with torch.inference_mode():
+        expected = model(baked.tensors)
+    model._render = None  # type: ignore[method-assign, assignment]
+    found = render(model, baked)
+    assert torch.equal(found.rgb, expected.rgb.clamp(0, 1))
+    if output == "log":
+        assert found.radiance is not None and expected.radiance is not None
+        assert torch.equal(found.radiance, expected.radiance)
+
+
 def test_the_raster_colour_as_base(scene: Scene) -> None:
     batch = load(scene, "raster").batch([1])
     assert scene.raster.tensors.target is not None

@@ -64,18 +64,31 @@ def correct(batch: Batch, outputs: Tensor, settings: ModelSettings) -> tuple[Ten
     """
     base, display = require_base(batch)
     added, scaled = outputs[:, :6].chunk(2, dim=1)
-
-    def f(radiance: Tensor) -> Tensor:
-        return to_log(display.scale * radiance) if settings.output == "log" else display(radiance)
-
-    value = start = f(base)
+    value = start = _encode(base, display, settings)
     if batch.fresh is not None and settings.guides == "camera":
-        value = torch.lerp(start, f(batch.fresh), torch.sigmoid(outputs[:, -1:] + OWN))
+        own = _encode(batch.fresh, display, settings)
+        value = torch.lerp(start, own, torch.sigmoid(outputs[:, -1:] + OWN))
     kernels = outputs[:, 6 : 6 + settings.filter**2]
     value = filter_by(value, kernels) if settings.filter else value
     value = torch.addcmul(value + added, value, scaled)
     if settings.trust < 1:
         value = torch.lerp(start, value, settings.trust)
+    return _decode(value, display, settings)
+
+
+def uncorrected(batch: Batch, settings: ModelSettings) -> tuple[Tensor, Tensor | None]:
+    """What `correct` gives at t = 0, where no network is asked."""
+    base, display = require_base(batch)
+    return _decode(_encode(base, display, settings), display, settings)
+
+
+def _encode(radiance: Tensor, display: Display, settings: ModelSettings) -> Tensor:
+    """f."""
+    return to_log(display.scale * radiance) if settings.output == "log" else display(radiance)
+
+
+def _decode(value: Tensor, display: Display, settings: ModelSettings) -> tuple[Tensor, Tensor | None]:
+    """The picture of f(picture), as `correct` returns it."""
     if settings.output == "display":
         return value, None
     radiance = from_log(value).clamp_min(0.0) / display.scale

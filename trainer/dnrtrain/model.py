@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from .aggregator import Aggregator
-from .correction import correct, guide_channels, guide_maps, require_base
+from .correction import correct, guide_channels, guide_maps, require_base, uncorrected
 from .dataset import Batch, ViewSet
 from .graphs import Graph
 from .renderer import SLOPE, build_renderer
@@ -92,6 +92,11 @@ class DNR(nn.Module):
         rgb, radiance = correct(batch, outputs, settings)
         return Output(compose(rgb, batch.coverage), texture, radiance)
 
+    def uncorrected(self, batch: Batch) -> Output:
+        """What `forward` gives where none of the correction is applied, without the network's time."""
+        rgb, radiance = uncorrected(batch, self.settings)
+        return Output(compose(rgb, batch.coverage), None, radiance)
+
     def record(self) -> None:
         """Train with CUDA graphs where they pay (see `dnrtrain.graphs`), until `forget`: each forward pass needs its
         backward pass before the next one."""
@@ -139,8 +144,10 @@ def render(model: DNR, views: ViewSet, *, batch: int = 1) -> Output:
     """Render all views, large ones in tiles: rgb in [0, 1], and radiance where the model has it, on the CPU.
 
     The pictures of tiles are those of the whole bit for bit where convolutions of other sizes round alike, as oneDNN's
-    do; else as close as rounding. texture is None.
+    do; else as close as rounding. texture is None. Where ``settings.trust`` is 0, no network runs.
     """
+    idle = model.settings.base != "none" and model.settings.trust == 0
+    draw = model.uncorrected if idle else model
     device = next(model.parameters()).device
     height, width = views.size
     rgb = torch.empty(len(views), 3, height, width)
@@ -150,8 +157,8 @@ def render(model: DNR, views: ViewSet, *, batch: int = 1) -> Output:
         part = slice(start, min(start + batch, len(views)))
         maps = views.batch(range(part.start, part.stop))
         for tile in plan:
-            output = model(maps.window(tile.seen_rows, tile.seen_columns).to(device))
+            output = draw(maps.window(tile.seen_rows, tile.seen_columns).to(device))
             rgb[part, :, tile.rows, tile.columns] = output.rgb[(..., *tile.inner)].clamp(0.0, 1.0)
-            if radiance is not None:
+            if radiance is not None and output.radiance is not None:
                 radiance[part, :, tile.rows, tile.columns] = output.radiance[(..., *tile.inner)]
     return Output(rgb, None, radiance)

@@ -121,6 +121,10 @@ class BaseSettings(Strict):
         default="auto",
         description="paths or rays per texel of the baked light; auto: 16 paths, 32 gathered rays",
     )
+    light_where: Literal["auto", "everywhere", "seen"] = Field(
+        default="auto",
+        description="texels that get most of these: all alike, or those that views see; auto: the latter in shots",
+    )
     samples: int = Field(default=8, ge=1, le=64, description="rays per pixel of a base image")
     denoise: bool = Field(
         default=True, description="take the grain off base images of kind baked, before the network sees them"

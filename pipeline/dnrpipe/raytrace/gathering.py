@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from .lightmap import LEAST_RHO, LightBaker, light_texture
+from .lightmap import FEWER, LEAST_RHO, LightBaker, light_texture
 from .lobes import media_of
 from .sequence import GOLDEN, fraction
 
@@ -35,6 +35,8 @@ COARSE, COARSE_PATHS = 256, 1 << 22
 """Least side of the coarse map, and its paths: 64 per texel of that side."""
 FINER = 8
 """Sides of the light map per side of the coarse one, at most."""
+MORE = 1.25
+"""Rays that a texel may have over those it is to have."""
 DIRECT = 2
 """Samples of emitters per gathered ray: one costs a quarter of it, and half the noise is theirs."""
 
@@ -49,6 +51,7 @@ class GatheringBaker(LightBaker):
 
     Args:
         integrator, gloss: of the coarse map, as `LightBaker`'s, but one bounce less: gathering adds it.
+        seen: of the fine map; all of the coarse one lights it.
         caustics: False: light that comes from mirror-like lobes is left out.
     """
 
@@ -61,15 +64,17 @@ class GatheringBaker(LightBaker):
         *,
         gloss: bool = True,
         caustics: bool,
+        seen: np.ndarray | None = None,
     ) -> None:
-        super().__init__(mi, scene, integrator, groups, gloss=gloss)
+        super().__init__(mi, scene, integrator, groups, gloss=gloss, seen=seen)
         self.caustics, self.gathers = caustics, False
 
     def bake(self, size: int, spp: int, seed: int) -> np.ndarray:
         """As `LightBaker.bake`. spp: gathered rays per texel."""
         side = min(size, max(COARSE, size // FINER))
+        seen, self.seen = self.seen, None
         coarse = super().bake(side, max(1, COARSE_PATHS // side**2), 2 * seed)
-        traced, lost = self.integrator, self.lost
+        traced, lost, self.seen = self.integrator, self.lost, seen
         self.integrator, self.gathers = self._gathered(coarse), True
         try:
             emitters = functools.partial(self._light, indirect=False)
@@ -83,6 +88,14 @@ class GatheringBaker(LightBaker):
 
     def _gathered(self, coarse: np.ndarray) -> Gathered:
         return Gathered(self.mi, self.scene, coarse, gloss=self.glossy, caustics=self.caustics)
+
+    def _shares(self, texels: np.ndarray, size: int, spp: int) -> list[tuple[np.ndarray, int]]:
+        """As `LightBaker._shares`; of gathered rays a power of two, which is spread best, a quarter more at most."""
+        shares = super()._shares(texels, size, spp)
+        if not self.gathers or len(shares) < 2:
+            return shares
+        most = 1 << int(MORE * shares[0][1]).bit_length() - 1
+        return [(which, count) for (which, _), count in zip(shares, (most, max(1, most // FEWER)), strict=True)]
 
     def _numbers(self, sampler: Any, texel: Any, index: Any, count: int, seed: Any) -> Any:
         return SpreadNumbers(self.mi, sampler, texel, index, count, seed) if self.gathers else sampler
@@ -127,7 +140,10 @@ class SpreadNumbers:
     """
 
     def __init__(self, mi: Any, sampler: Any, texel: Any, index: Any, count: int, seed: Any) -> None:
-        self.mi, self.sampler, self.texel, self.index, self.count = mi, sampler, texel, index, count
+        import drjit as dr
+
+        self.mi, self.sampler, self.texel, self.index = mi, sampler, texel, index
+        self.last = dr.opaque(mi.UInt32, (1 << (count - 1).bit_length()) - 1)  # as data: one kernel for all counts
         self.seed, self.drawn = seed << 8, 0
 
     def next_1d(self) -> Any:
@@ -138,8 +154,9 @@ class SpreadNumbers:
         mi = self.mi
         self.drawn += 1
         shifts = mi.sample_tea_32(self.texel, self.seed + self.drawn)
-        place = mi.Float(mi.permute_kensler(self.index, self.count, shifts[0] ^ shifts[1]))
-        pair = (fraction(mi.Float(s >> 8) * 2**-24 + place * step) for s, step in zip(shifts, GOLDEN, strict=True))
+        start, step = mi.sample_tea_32(self.texel, ~(self.seed + self.drawn))
+        place = mi.Float((start + self.index * (step | 1)) & self.last)  # an odd step comes by all places of 2^n
+        pair = (fraction(mi.Float(s >> 8) * 2**-24 + place * each) for s, each in zip(shifts, GOLDEN, strict=True))
         return mi.Point2f(*pair)
 
 

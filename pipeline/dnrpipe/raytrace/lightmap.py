@@ -45,6 +45,8 @@ MOST_BURIED = 0.5
 """Share of the sides that can be seen above which none counts as buried."""
 LEAST_RHO = 1e-3
 """Texels that reflect less hold no light worth knowing."""
+FEWER = 8
+"""Samples of a texel that views see over those of one that none does."""
 
 
 def light_texture(mi: Any, light: np.ndarray, *, gloss: bool) -> tuple[Any, Any, Any]:
@@ -80,6 +82,7 @@ class LightBaker:
             direct light alone.
         groups: see `texels.AtlasSurface`.
         gloss: S is wanted; otherwise it is 0.
+        seen: see `seen_texels.seen_cells`: texels elsewhere get few of the samples. None: all get as many.
 
     ``lost`` counts the samples of the last bake that were not finite; each is left out of its texel's mean.
     """
@@ -92,8 +95,9 @@ class LightBaker:
         groups: Sequence[tuple[Path, np.ndarray]] = (),
         *,
         gloss: bool = True,
+        seen: np.ndarray | None = None,
     ) -> None:
-        self.mi, self.scene, self.integrator = mi, scene, integrator
+        self.mi, self.scene, self.integrator, self.seen = mi, scene, integrator, seen
         self.surface = AtlasSurface(mi, scene, groups)
         self.lift = float(LIFT * scene.bbox().bounding_sphere().radius)
         self.lets_through = lets_through(mi, scene)
@@ -107,6 +111,7 @@ class LightBaker:
     def bake(self, size: int, spp: int, seed: int) -> np.ndarray:
         """E and S of the front and of the back, float32 [2, 2, size, size, 3], row 0 at V = 0; no noise, no gaps.
 
+        spp: samples per texel, in the mean over all where only some are seen.
         The denoiser is shown where in space each texel lies and where it faces, so that charts that are neighbours in
         the atlas alone stay apart. Of closed meshes one side is traced: the other cannot be seen.
         """
@@ -126,9 +131,9 @@ class LightBaker:
             if not wanted.any():
                 continue
             guides = place[wanted], normal[wanted] * side
-            total, weight = self._sums(sample, texels[wanted], size, spp, seed + number, side)
-            found = weight.max(axis=1) > least * spp
-            whole[number] = self._smooth(total, weight, 1e-3 * least * spp, texels[wanted], found, guides, size)
+            total, weight = self._means(sample, texels[wanted], size, spp, seed + number, side)
+            found = weight.max(axis=1) > least
+            whole[number] = self._smooth(total, weight, 1e-3 * least, texels[wanted], found, guides, size)
             whole[number].reshape(-1, 3)[texels[closed[:, number]]] = 0
         return whole
 
@@ -181,13 +186,27 @@ class LightBaker:
             parts.append(np.array(share) > 0.5)
         return np.concatenate(parts)
 
-    def _sums(
+    def _means(
         self, sample: Any, texels: np.ndarray, size: int, spp: int, seed: int, side: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Numerator and denominator, [T, 3] each, of `_traced`; counts what was lost."""
-        sums = self._traced(sample, texels, size, spp, seed, side)
-        self.lost += round(float(sums[:, 6].sum(dtype=np.float64)))
-        return sums[:, :3], sums[:, 3:6]
+        """Numerator and denominator, [T, 3] each, means of each texel's samples; counts what was lost."""
+        means = np.zeros((len(texels), 6), np.float32)
+        for which, count in self._shares(texels, size, spp):
+            sums = self._traced(sample, texels[which], size, count, seed, side)
+            self.lost += round(float(sums[:, 6].sum(dtype=np.float64)))
+            means[which] = sums[:, :6] / count
+        return means[:, :3], means[:, 3:]
+
+    def _shares(self, texels: np.ndarray, size: int, spp: int) -> list[tuple[np.ndarray, int]]:
+        """Which of the texels get how many samples: as many in all as if each had ``spp``."""
+        if self.seen is None:
+            return [(np.ones(len(texels), bool), spp)]
+        rows, columns = ((at * len(self.seen)) // size for at in (texels // size, texels % size))
+        seen = self.seen[rows, columns]
+        share = float(seen.mean())
+        least = max(1, round(spp / (share * FEWER + 1 - share)))
+        most = round((spp - (1 - share) * least) / share) if share else least
+        return [(which, count) for which, count in ((seen, most), (~seen, least)) if which.any()]
 
     @staticmethod
     def _smooth(

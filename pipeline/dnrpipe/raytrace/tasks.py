@@ -183,6 +183,7 @@ class LightTask(Task):
     """Bake a light map of size² texels with ``spp`` paths each into ``output``, an ``npz``: see `light_worker`.
 
     gather: rays instead of paths, as far as the scene allows (`gathering`). gloss: what rough lobes see is baked, too.
+    views: what they see gets most of the paths, as many in all; empty: all texels get as many.
     """
 
     output: Path
@@ -193,6 +194,7 @@ class LightTask(Task):
     integrator: str
     max_depth: int
     seed: int
+    views: tuple[View, ...] = ()
     fingerprint: str
 
 

@@ -15,9 +15,10 @@ import numpy as np
 
 from dnrtrain.contract import NPZ_ERRORS, View
 
+from ..core.cameras import spread
 from ..core.errors import UserError
 from ..core.ledger import Purpose
-from ..core.scene_files import scene_fingerprint
+from ..core.scene_files import scene_fingerprint, split_views
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest
 from ..effects.plan import DIRECT_DEPTH, EffectPlan
@@ -45,6 +46,8 @@ does not at 0.21 (`materials`)."""
 CHUNK, WARM_UP = 64, 8
 """Frames of a sequence that remember one another; those before a chunk's first that are rendered for it once more, so
 that no seam is seen. A chunk is what an interrupted run does again at most."""
+LOOKED_FROM = 16
+"""Views of the workspace that say what is seen, where light is baked for that."""
 RAY = 0.6
 """Seconds of a gathered ray, with its samples of emitters, over those of a path of E and one of S."""
 
@@ -214,9 +217,10 @@ def base_renderer(workspace: Workspace, settings: Settings, plan: EffectPlan) ->
             "integrator": config["integrator"],
             "max_depth": config["max_depth"],
             "seed": settings.raytrace.seed,
+            "views": _looked_from(workspace) if chosen.light_where == "seen" else [],
         }
         # Without what was the only choice once: light that was baked then stays.
-        usual = {"gather": False, "gloss": True}
+        usual = {"gather": False, "gloss": True, "views": []}
         decides = {k: v for k, v in light.items() if k != "output" and usual.get(k) != v}
         light["fingerprint"] = digest([LIGHT_VERSION, inputs, decides])
         fingerprint = digest([light["fingerprint"], chosen.samples, DENOISE_VERSION if chosen.denoise else False])
@@ -230,6 +234,13 @@ def base_renderer(workspace: Workspace, settings: Settings, plan: EffectPlan) ->
     }
     fingerprint = digest([kind, inputs, chosen.spp, chosen.samples, settings.raytrace.seed])
     return BaseRenderer(common, choice.environment, None, fingerprint)
+
+
+def _looked_from(workspace: Workspace) -> list[dict[str, Any]]:
+    """Views that say what is seen, JSON-able."""
+    views = split_views(workspace)
+    chosen = (*spread(views.get("train", []), LOOKED_FROM), *views.get("test", []))
+    return [view.model_dump(mode="json") for view in chosen]
 
 
 def bake_light(run: Run, renderer: BaseRenderer) -> dict[str, Any] | None:

@@ -19,6 +19,7 @@ from ...core.scene_files import scene_fingerprint
 from ...core.settings import Settings
 from ...core.units import duration
 from ...core.workspace import digest, file_sha256
+from ...effects.plan import EffectPlan
 from ...workers.processes import KeptWorker
 from ..base_images import BASE_VERSION, DENOISE_VERSION, LIGHT_VERSION, base_renderer, light_plan
 from ..effect_plan import resolve_plan
@@ -46,8 +47,8 @@ from .renderers import Renderer, path_tracer, shipped_renderer, trained_renderer
 CHECKED = 2
 """Frames of a shot that are traced to check it."""
 PLAN_VERSION = 12
-LIGHT_SIZES = (1024, 2048)
-"""Texels of the light map's side: of few frames, of many."""
+LIGHTS = {"traced": ((1024, 16), (2048, 16)), "gathered": ((1024, 32), (1024, 64), (1024, 128))}
+"""Texels of the light map's side and paths or rays a texel, coarser ones first (figures: docs/experiments.md)."""
 BATCH = 8
 """Bundles of single frames that are on disk at once."""
 
@@ -111,23 +112,28 @@ def plan_shot(session: Session, shot: Shot, kept: KeptWorker) -> ShotPlan:
 
 
 def choose_light(session: Session, frames: Sequence[ShotFrame]) -> None:
-    """Choose the light map's size where no setting says one (figures: docs/experiments.md): finer where the shot has
-    more pixels than the light would have paths, so that these take a small part of the time.
+    """Choose what no setting says of the light map (`shot_light`).
 
     The choice is not remembered as flags are: the next shot has other frames.
     """
-    before = session.settings
-    if before.base.light_size != "auto":
-        return
-
-    def sized(texels: int) -> Settings:
-        return before.model_copy(update={"base": before.base.model_copy(update={"light_size": texels})})
-
-    few, many = LIGHT_SIZES
-    session.settings = sized(many)
     pixels = sum(frame.view.width * frame.view.height for frame in frames if not frame.moving)
-    if light_plan(session.settings, resolve_plan(session.run.for_stage("render"))).paths > pixels:
-        session.settings = sized(few)
+    plan = resolve_plan(session.run.for_stage("render"))
+    session.settings = shot_light(session.settings, plan, pixels)
+
+
+def shot_light(settings: Settings, plan: EffectPlan, pixels: int) -> Settings:
+    """The settings with what suits a shot of so many pixels where they leave the light map's to us.
+
+    Its paths go where the shot looks. The finest of LIGHTS that has no more paths than the shot has pixels, so that
+    light takes a small part of the time, else the first.
+    """
+    way = "gathered" if light_plan(settings, plan).gathered else "traced"
+    found = []
+    for size, spp in LIGHTS[way]:
+        chosen = {"light_where": "seen", "light_size": size, "light_spp": spp}
+        left = {name: value for name, value in chosen.items() if getattr(settings.base, name) == "auto"}
+        found.append(settings.model_copy(update={"base": settings.base.model_copy(update=left)}))
+    return [each for each in found if each is found[0] or light_plan(each, plan).paths <= pixels][-1]
 
 
 def make_shot(session: Session, shot: Shot, plan: ShotPlan, kept: KeptWorker) -> ShotRecord:

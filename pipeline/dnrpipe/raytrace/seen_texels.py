@@ -1,0 +1,38 @@
+"""Which parts of the scene's atlas views look at: at once, in mirrors, and through glass."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from dnrtrain.contract import View
+
+from ..core.cameras import scaled_to
+from .base_renderer import BaseRenderer
+from .sensors import scaled_view
+
+CELLS = 256
+"""Of the atlas' side: fine enough to tell its charts apart, and large enough that small pictures leave no gaps."""
+SIDE = 512
+"""Pixels of the pictures' longer side."""
+
+
+def seen_cells(mi: Any, scene: Any, views: Sequence[View], unit_scale: float) -> np.ndarray:
+    """bool [CELLS, CELLS], row 0 at V = 0: what lies in a cell that a pixel sees, or beside one.
+
+    views: in scene units; unit_scale: the bundle's units per scene unit. One path a pixel says what mirrors and glass
+    show: other paths in each view.
+    """
+    renderer = BaseRenderer(mi, scene, np.zeros((2, 2, 2, 2, 3), np.float32), gloss=False)
+    cells = np.zeros((CELLS, CELLS), bool)
+    for number, view in enumerate(views):
+        channels = renderer.frame(scaled_view(scaled_to(view, SIDE), unit_scale), 1, number)
+        for mask, *place in (("mask", "uv.U", "uv.V"), ("chain.mask", "chain.U", "chain.V")):
+            hit = channels[mask] > 0.5
+            column, row = ((channels[name][hit] * CELLS).astype(int).clip(0, CELLS - 1) for name in place)
+            cells[row, column] = True
+    wide = np.pad(cells, 1)
+    shifts = [(i, j) for i in range(3) for j in range(3)]
+    return np.any([wide[i : i + CELLS, j : j + CELLS] for i, j in shifts], axis=0)
