@@ -3,10 +3,11 @@
 python -m tools.bench_shots FOLDER [SCENE.blend ...] [--size 640x360] [--frames 48] [--out RESULTS.json]
 
 The file's own camera moves on an arc about what it looks at, half a degree a frame. Seconds are wall-clock of a machine
-that does nothing else; those of REEL frames, whose light is baked, are reckoned from the parts that were measured. FOLDER keeps workspaces and
-references; a scene that is in the results is not measured again. Quality is over white, against the mean of two
-pictures of 64 samples, each denoised, on pairs of frames one after the other; flicker is what changes between the two
-of a pair beyond what the references change by (`tools.bench_frames.motion`). Path tracing climbs the ladder until it is
+that does nothing else; those of REEL frames are reckoned from the parts that were measured, among them the light that
+so many frames would have. FOLDER keeps workspaces and references; a scene that is in the results is not measured again.
+Quality is over white, against the mean of two pictures of 64 samples, each denoised, on pairs of frames one after the
+other; flicker is what changes between the two of a pair beyond what the references change by
+(`tools.bench_frames.motion`). Path tracing climbs the ladder until it is
 as good: Mitsuba's, and Blender's Cycles, which is measured against pictures of its own. A row that lacks Cycles gets it
 where FOLDER still has the shot.
 """
