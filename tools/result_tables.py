@@ -1,8 +1,7 @@
 """Write the generated parts of docs: rows from the code, tables from committed results.
 
 A part stands between ``<!-- rows -->`` or ``<!-- KIND FILE -->``, FILE in docs/, and ``<!-- end -->``.
-Kinds: results (of `dnrpipe ablate`), frames (of tools.bench_frames),
-frames-overview (its tables over all scenes), noise (of tools.bench_noise),
+Kinds: results (of `dnrpipe ablate`), frames (of tools.bench_frames), noise (of tools.bench_noise),
 frontier (of `dnrpipe frontier`), plan-check (of tools.plan_check), selection (of `dnrpipe bench-select`),
 selections (of several of its runs together: FILE,FILE), plan-equal (of tools.plan_equal),
 untrained (of tools.bench_untrained), device (of tools.bench_device), scaling (of tools.bench_ray).
@@ -20,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 from tools.bench_device import markdown as device_markdown
-from tools.bench_frames.document import markdown as frames_markdown
 from tools.bench_frames.document import overview as frames_overview
 from tools.bench_noise.document import markdown as noise_markdown
 from tools.bench_ray import markdown as scaling_markdown
@@ -39,7 +37,7 @@ from dnrpipe.studies.selectbench.bench_tables import read_results as selection_r
 from dnrpipe.studies.selectbench.bench_tables import together as selections_markdown
 
 KINDS = (
-    "rows|device|results|frames(?:-overview)?|noise|frontier|plan-check|plan-equal|selections?|untrained|scaling|shots"
+    "rows|device|results|frames|noise|frontier|plan-check|plan-equal|selections?|untrained|scaling|shots"
 )
 PART = re.compile(rf"(<!-- ({KINDS})(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
@@ -78,8 +76,7 @@ def generate(text: str, folder: Path) -> str:
 
 
 OF_JSON: dict[str, Callable[[Any], str]] = {
-    "frames": lambda found: lowered(frames_markdown(found)),
-    "frames-overview": lambda found: "\n".join(frames_overview(found)),
+    "frames": lambda found: "\n".join(frames_overview(found)),
     "noise": noise_markdown,
     "device": device_markdown,
     "shots": shots_markdown,

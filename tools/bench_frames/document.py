@@ -135,26 +135,6 @@ def _scene(scene: dict[str, Any]) -> list[str]:
         )
     for move, found in scene.get("moving", {}).items():
         lines += ["", *_moving(move, found)]
-    if "stability" in scene:
-        lines += ["", *_stability(scene)]
-    return lines
-
-
-def _stability(scene: dict[str, Any]) -> list[str]:
-    found = scene["stability"]
-    rows = found["rows"]
-    lines = [
-        f"Orbit of {found['frames']} frames, {found['degrees']:g} degrees apart, each reprojected into the next. Mean"
-        f" absolute change x 1000; the reference ({found['reference_spp']} spp, {found['reference']}; its own noise"
-        f" {1000 * found['reference_noise']:.2f}) changes by {1000 * next(iter(rows.values()))['reference']:.2f}."
-        " Flicker: mean absolute difference of the change from the reference's.",
-        "",
-        "| renderer | change | flicker |",
-        "|---|---|---|",
-    ]
-    for name, row in sorted(rows.items(), key=lambda item: item[1]["flicker"]):
-        label = f"**{name}**" if _own(name) else name
-        lines.append(f"| {label} | {1000 * row['change']:.2f} | {1000 * row['flicker']:.2f} |")
     return lines
 
 
