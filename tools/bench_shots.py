@@ -142,7 +142,8 @@ def measured(scene: Path, root: Path, size: tuple[int, int], frames: int) -> dic
 def light_of_reel(looked_at: Path, size: tuple[int, int]) -> list[str]:
     """Flags for the light that a shot of REEL frames would take, not so few as are rendered. looked_at: see `arc`."""
     run = opened(looked_at)
-    base = shot_light(run.settings, resolve_plan(run), REEL * size[0] * size[1]).base
+    small, pixels = read_summary(run.workspace.scene).atlas.has_small_charts, REEL * size[0] * size[1]
+    base = shot_light(run.settings, resolve_plan(run), pixels, small_charts=small).base
     return ["--set", f"base.light_size={base.light_size}", "--set", f"base.light_spp={base.light_spp}"]
 
 

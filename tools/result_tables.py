@@ -36,9 +36,7 @@ from dnrpipe.studies.selectbench.bench_tables import markdown as selection_markd
 from dnrpipe.studies.selectbench.bench_tables import read_results as selection_results
 from dnrpipe.studies.selectbench.bench_tables import together as selections_markdown
 
-KINDS = (
-    "rows|device|results|frames|noise|frontier|plan-check|plan-equal|selections?|untrained|scaling|shots"
-)
+KINDS = "rows|device|results|frames|noise|frontier|plan-check|plan-equal|selections?|untrained|scaling|shots"
 PART = re.compile(rf"(<!-- ({KINDS})(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 

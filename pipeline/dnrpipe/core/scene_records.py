@@ -108,6 +108,11 @@ class AtlasFacts(SceneRecord):
     triangles_without_texel: float
     texels_per_unit: dict[str, float]
 
+    @property
+    def has_small_charts(self) -> bool:
+        """Whether the scene is of more parts than Blender unwraps: few texels each."""
+        return self.method == "charts"
+
 
 class SceneSummary(SceneRecord):
     """What later stages and the report need to know of a converted scene.

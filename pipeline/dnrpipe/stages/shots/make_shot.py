@@ -6,6 +6,7 @@ Everything lies in ``shots/NAME`` of the workspace: ``frames/`` (EXR), ``picture
 
 from __future__ import annotations
 
+import math
 import shutil
 import time
 from collections.abc import Sequence
@@ -15,13 +16,13 @@ from typing import Any
 
 from dnrtrain.records import read, write
 
-from ...core.scene_files import scene_fingerprint
+from ...core.scene_files import read_summary, scene_fingerprint
 from ...core.settings import Settings
 from ...core.units import duration
 from ...core.workspace import digest, file_sha256
 from ...effects.plan import EffectPlan
 from ...workers.processes import KeptWorker
-from ..base_images import BASE_VERSION, DENOISE_VERSION, LIGHT_VERSION, base_renderer, light_plan
+from ..base_images import BASE_VERSION, DENOISE_VERSION, LIGHT_VERSION, SPP, base_renderer, light_plan
 from ..effect_plan import resolve_plan
 from ..render import write_mp4
 from ..session import Session
@@ -47,8 +48,8 @@ from .renderers import Renderer, path_tracer, shipped_renderer, trained_renderer
 CHECKED = 2
 """Frames of a shot that are traced to check it."""
 PLAN_VERSION = 12
-LIGHTS = {"traced": ((1024, 16), (2048, 16)), "gathered": ((1024, 32), (1024, 64), (1024, 128))}
-"""Texels of the light map's side and paths or rays a texel, coarser ones first (figures: docs/experiments.md)."""
+LIGHT_SIDE, MORE = 1024, (1, 2, 4)
+"""Texels of the light map's side, and times as many paths, or texels where charts are small, for more pixels."""
 BATCH = 8
 """Bundles of single frames that are on disk at once."""
 
@@ -118,19 +119,22 @@ def choose_light(session: Session, frames: Sequence[ShotFrame]) -> None:
     """
     pixels = sum(frame.view.width * frame.view.height for frame in frames if not frame.moving)
     plan = resolve_plan(session.run.for_stage("render"))
-    session.settings = shot_light(session.settings, plan, pixels)
+    atlas = read_summary(session.workspace.scene).atlas
+    session.settings = shot_light(session.settings, plan, pixels, small_charts=atlas.has_small_charts)
 
 
-def shot_light(settings: Settings, plan: EffectPlan, pixels: int) -> Settings:
+def shot_light(settings: Settings, plan: EffectPlan, pixels: int, *, small_charts: bool) -> Settings:
     """The settings with what suits a shot of so many pixels where they leave the light map's to us.
 
-    Its paths go where the shot looks. The finest of LIGHTS that has no more paths than the shot has pixels, so that
-    light takes a small part of the time, else the first.
+    Its paths go where the shot looks. There are more of them (MORE) as long as the shot has as many pixels, so that
+    light takes a small part of the time: more a texel, or as many of more texels where the atlas has small charts,
+    which are blurred before they are noisy (figures: docs/experiments.md).
     """
-    way = "gathered" if light_plan(settings, plan).gathered else "traced"
+    spp = SPP["gathered" if light_plan(settings, plan).gathered else "traced"]
     found = []
-    for size, spp in LIGHTS[way]:
-        chosen = {"light_where": "seen", "light_size": size, "light_spp": spp}
+    for more in MORE:
+        side = LIGHT_SIDE * (math.isqrt(more) if small_charts else 1)
+        chosen = {"light_where": "seen", "light_size": side, "light_spp": spp * (1 if small_charts else more)}
         left = {name: value for name, value in chosen.items() if getattr(settings.base, name) == "auto"}
         found.append(settings.model_copy(update={"base": settings.base.model_copy(update=left)}))
     return [each for each in found if each is found[0] or light_plan(each, plan).paths <= pixels][-1]
