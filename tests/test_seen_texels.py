@@ -66,8 +66,8 @@ def test_samples_go_where_views_look_and_are_as_many(tmp_path: Path, gathered: b
             return GatheringBaker(mi, scene, onwards(7), caustics=True, seen=seen)
         return LightBaker(mi, scene, onwards(7), seen=seen)
 
-    texels = np.flatnonzero(np.ones(32 * 32, bool))
-    counted = {count: int(which.sum()) for which, count in baker(cells)._shares(texels, 32, 16)}
+    paths, texels = LightBaker(mi, scene, onwards(7), seen=cells), np.arange(32 * 32)
+    counted = {count: int(which.sum()) for which, count in paths._shares(texels, 32, 16)}
     assert max(counted) > 2.5 * 16 and max(counted) >= 0.8 * FEWER * min(counted)
     assert sum(count * size for count, size in counted.items()) == pytest.approx(16 * len(texels), rel=0.05)
 

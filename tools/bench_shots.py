@@ -7,9 +7,8 @@ that does nothing else; those of REEL frames are reckoned from the parts that we
 so many frames would have. FOLDER keeps workspaces and references; a scene that is in the results is not measured again.
 Quality is over white, against the mean of two pictures of 64 samples, each denoised, on pairs of frames one after the
 other; flicker is what changes between the two of a pair beyond what the references change by
-(`tools.bench_frames.motion`). Path tracing climbs the ladder until it is
-as good: Mitsuba's, and Blender's Cycles, which is measured against pictures of its own. A row that lacks Cycles gets it
-where FOLDER still has the shot.
+(`tools.bench_frames.motion`). Path tracing climbs the ladder until it is as good: Mitsuba's, and Blender's Cycles,
+which is measured against pictures of its own. A row that lacks Cycles gets it where FOLDER still has the shot.
 """
 
 from __future__ import annotations
@@ -35,7 +34,6 @@ from dnrpipe.core.machine import processor
 from dnrpipe.core.scene_files import read_summary
 from dnrpipe.core.settings import CameraSettings
 from dnrpipe.core.workspace import Workspace
-from dnrpipe.stages.effect_plan import resolve_plan
 from dnrpipe.stages.session import resolve_settings
 from dnrpipe.stages.shot_scene import look_at_shot
 from dnrpipe.stages.shots.frame_tasks import FrameTask, Way
@@ -141,9 +139,7 @@ def measured(scene: Path, root: Path, size: tuple[int, int], frames: int) -> dic
 
 def light_of_reel(looked_at: Path, size: tuple[int, int]) -> list[str]:
     """Flags for the light that a shot of REEL frames would take, not so few as are rendered. looked_at: see `arc`."""
-    run = opened(looked_at)
-    small, pixels = read_summary(run.workspace.scene).atlas.has_small_charts, REEL * size[0] * size[1]
-    base = shot_light(run.settings, resolve_plan(run), pixels, small_charts=small).base
+    base = shot_light(opened(looked_at), REEL * size[0] * size[1]).base
     return ["--set", f"base.light_size={base.light_size}", "--set", f"base.light_spp={base.light_spp}"]
 
 

@@ -75,7 +75,7 @@ def filled(light: np.ndarray, valid: np.ndarray) -> np.ndarray:
     """
     light, valid = light.astype(np.float32), valid.copy()
     for _ in range(BORDER):
-        grown = _beside(np.concatenate([light * valid[..., None], valid[..., None]], axis=-1))
+        grown = beside(np.concatenate([light * valid[..., None], valid[..., None]], axis=-1))
         new = ~valid & (grown[..., -1] > 0)
         light[new] = grown[new][:, :-1] / grown[new][:, -1:]
         valid |= new
@@ -83,7 +83,7 @@ def filled(light: np.ndarray, valid: np.ndarray) -> np.ndarray:
     return np.where(valid[..., None], light, _pull_push(light * weight, weight)).astype(np.float32)
 
 
-def _beside(texels: np.ndarray) -> np.ndarray:
+def beside(texels: np.ndarray) -> np.ndarray:
     """Sums over 3x3 texels."""
     for axis in (0, 1):
         padded = np.pad(texels, [(1, 1) if i == axis else (0, 0) for i in range(3)])

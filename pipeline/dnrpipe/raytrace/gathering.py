@@ -72,9 +72,8 @@ class GatheringBaker(LightBaker):
     def bake(self, size: int, spp: int, seed: int) -> np.ndarray:
         """As `LightBaker.bake`. spp: gathered rays per texel."""
         side = min(size, max(COARSE, size // FINER))
-        seen, self.seen = self.seen, None
         coarse = super().bake(side, max(1, COARSE_PATHS // side**2), 2 * seed)
-        traced, lost, self.seen = self.integrator, self.lost, seen
+        traced, lost = self.integrator, self.lost
         self.integrator, self.gathers = self._gathered(coarse), True
         try:
             emitters = functools.partial(self._light, indirect=False)
@@ -91,8 +90,10 @@ class GatheringBaker(LightBaker):
 
     def _shares(self, texels: np.ndarray, size: int, spp: int) -> list[tuple[np.ndarray, int]]:
         """As `LightBaker._shares`; of gathered rays a power of two, which is spread best, a quarter more at most."""
+        if not self.gathers:
+            return [(np.ones(len(texels), bool), spp)]
         shares = super()._shares(texels, size, spp)
-        if not self.gathers or len(shares) < 2:
+        if len(shares) < 2:
             return shares
         most = 1 << int(MORE * shares[0][1]).bit_length() - 1
         return [(which, count) for (which, _), count in zip(shares, (most, max(1, most // FEWER)), strict=True)]

@@ -11,6 +11,7 @@ from dnrtrain.contract import View
 
 from ..core.cameras import scaled_to
 from .base_renderer import BaseRenderer
+from .denoise import beside
 from .sensors import scaled_view
 
 CELLS = 256
@@ -33,6 +34,4 @@ def seen_cells(mi: Any, scene: Any, views: Sequence[View], unit_scale: float) ->
             hit = channels[mask] > 0.5
             column, row = ((channels[name][hit] * CELLS).astype(int).clip(0, CELLS - 1) for name in place)
             cells[row, column] = True
-    wide = np.pad(cells, 1)
-    shifts = [(i, j) for i in range(3) for j in range(3)]
-    return np.any([wide[i : i + CELLS, j : j + CELLS] for i, j in shifts], axis=0)
+    return beside(cells[..., None].astype(np.float32))[..., 0] > 0

@@ -20,7 +20,6 @@ from ...core.scene_files import read_summary, scene_fingerprint
 from ...core.settings import Settings
 from ...core.units import duration
 from ...core.workspace import digest, file_sha256
-from ...effects.plan import EffectPlan
 from ...workers.processes import KeptWorker
 from ..base_images import BASE_VERSION, DENOISE_VERSION, LIGHT_VERSION, SPP, base_renderer, light_plan
 from ..effect_plan import resolve_plan
@@ -118,18 +117,18 @@ def choose_light(session: Session, frames: Sequence[ShotFrame]) -> None:
     The choice is not remembered as flags are: the next shot has other frames.
     """
     pixels = sum(frame.view.width * frame.view.height for frame in frames if not frame.moving)
-    plan = resolve_plan(session.run.for_stage("render"))
-    atlas = read_summary(session.workspace.scene).atlas
-    session.settings = shot_light(session.settings, plan, pixels, small_charts=atlas.has_small_charts)
+    session.settings = shot_light(session.run.for_stage("render"), pixels)
 
 
-def shot_light(settings: Settings, plan: EffectPlan, pixels: int, *, small_charts: bool) -> Settings:
-    """The settings with what suits a shot of so many pixels where they leave the light map's to us.
+def shot_light(run: Run, pixels: int) -> Settings:
+    """The run's settings with what suits a shot of so many pixels where they leave the light map's to us.
 
     Its paths go where the shot looks. There are more of them (MORE) as long as the shot has as many pixels, so that
     light takes a small part of the time: more a texel, or as many of more texels where the atlas has small charts,
     which are blurred before they are noisy (figures: docs/experiments.md).
     """
+    settings, plan = run.settings, resolve_plan(run)
+    small_charts = read_summary(run.workspace.scene).atlas.has_small_charts
     spp = SPP["gathered" if light_plan(settings, plan).gathered else "traced"]
     found = []
     for more in MORE:
