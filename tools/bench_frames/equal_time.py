@@ -50,7 +50,7 @@ def at_equal_time(scene: Mapping[str, Any], frames: int) -> dict[str, Any]:
     line = _line(scene)
     found = []
     for name in scene["standing"]:
-        if name.startswith(NEURAL):
+        if name.startswith((NEURAL, BASE)):
             row = scene["rows"][name]
             ms = row["ms"] + 1000 * scene["upfront"]["total"] / frames
             traced = quality_at(line, ms)
@@ -68,7 +68,7 @@ def break_even(scene: Mapping[str, Any], figure: Figure = "psnr") -> tuple[str, 
     rows, line = scene["rows"], _line(scene, figure)
     found = []
     for name in scene["standing"]:
-        if not (line and name.startswith(NEURAL)):
+        if not (line and name.startswith((NEURAL, BASE))):
             continue
         level = crossover(line, BETTER[figure] * rows[name][figure])
         traced = line[-1][0] if level is None else level
@@ -97,7 +97,7 @@ def lines(scenes: Sequence[Mapping[str, Any]]) -> list[str]:
         for count in COUNTS:
             one = at_equal_time(scene, count)
             lead = one["psnr"] - one["rival"]
-            cells += [f"{one['psnr']:.1f}, {one['rival']:.1f}, {lead:+.1f} dB ({_rays(one['name'])})"]
+            cells += [f"{one['psnr']:.1f}, {one['rival']:.1f}, {lead:+.1f} dB ({short(one['name'])})"]
             cells += [f"{one['ms']:.0f}"]
         cells += [_told(break_even(scene, figure)) for figure in figures]
         table.append(f"| {' | '.join(cells)} |")
@@ -108,7 +108,7 @@ def _told(even: tuple[str, int, bool] | None) -> str:
     if even is None:
         return "never"
     name, frames, bound = even
-    return f"{'at most ' if bound else ''}{frames} frames ({_rays(name)})"
+    return f"{'at most ' if bound else ''}{frames} frames ({short(name)})"
 
 
 def _line(scene: Mapping[str, Any], figure: Figure = "psnr") -> list[Point]:
@@ -121,5 +121,7 @@ def _line(scene: Mapping[str, Any], figure: Figure = "psnr") -> list[Point]:
     return [points[name] for name in frontier(points)]
 
 
-def _rays(name: str) -> str:
-    return name.partition(", ")[2] or name
+def short(name: str) -> str:
+    """What a cell of a table has room for: "3 rays" of our frames, "base, 3 rays" where nothing is neural."""
+    kind, _, rays = name.partition(", ")
+    return (f"base, {rays}" if kind == BASE else rays) or name

@@ -63,8 +63,8 @@ class Engine:
         self.scenes = {str(bundle): mi.load_file(str(bundle), parallel=False) for bundle in bundles}
         self.load_seconds = time.monotonic() - started
         self.unit_scale = unit_scale(bundles[0])
-        if threads > 0:  # the caller's thread works too
-            dr.set_thread_count(threads - 1)
+        if threads > 0:  # with an empty pool the caller's thread works, with any other it only waits
+            dr.set_thread_count(threads if threads > 1 else 0)
         self._integrators: dict[tuple[str, str, int, bool], tuple[Any, str]] = {}
         self._sizes: set[tuple[int, int]] = set()
 

@@ -32,6 +32,8 @@ VIEWS, SIDE, SPP = 4, 128, 32
 SHARES = tuple(i / 10 for i in range(11))
 ENOUGH = 0.95
 """Of the most that any share gains."""
+LEAST_GAIN = 0.3
+"""dB. The network takes about as long as one ray and a half of each pixel, and of eight that brings as much."""
 
 
 class Trust(BaseModel, frozen=True):
@@ -45,7 +47,7 @@ class Trust(BaseModel, frozen=True):
         """One line for the user."""
         base, ours = self.psnr
         if self.share == 0:
-            return f"the shipped corrector does no good here: frames are base images ({base:.1f} dB on small views)"
+            return f"the shipped corrector gains too little here: frames are base images ({base:.1f} dB on small views)"
         return f"shipped corrector, {self.share:.0%} of it: {base:.1f} -> {ours:.1f} dB on {VIEWS} small traced views"
 
 
@@ -63,11 +65,15 @@ def traced_small(run: Run) -> list[View]:
 
 
 def measure_trust(run: Run, model: DNR) -> Trust:
-    """Find the share that does best on the small views. ``model`` is left with it."""
+    """Find the share that does best on the small views; 0 where it gains less than LEAST_GAIN. ``model`` is left with
+    it."""
     views, base = traced_small(run), run.settings.model.base
     noisy, clean = (load(run.workspace, views, SPLIT, raytraced=True, raw=raw, base=base) for raw in (True, False))
     share = best_share(model, noisy, clean)
     before, after = mean_psnr(model, clean)
+    if share and after - before < LEAST_GAIN:
+        _apply(model, 0)
+        share, after = 0, before
     return Trust(share=share, psnr=(before, after))
 
 
