@@ -52,6 +52,8 @@ def bench(root: Path, options: Options, tell: Callable[[str], None]) -> dict[str
     clock = Clock(options.clock, options.threads)
     folder = options.cache / scene.name
     ours = Ours(scene, options.rays)
+    if ours.model is not None and ours.model.settings.trust == 0:
+        ours.model = None  # no network runs: frames are base images
     reference = make_references(scene, scene.views, "test", options.reference_spp, options.reference, folder, tell)
     for turn in range(WARM):
         render_baselines(scene, scene.views[0], turn, clock, make_baselines(options.samples))

@@ -98,17 +98,38 @@ def measure(
 
 
 def moves(scene: BenchScene, frames: int) -> dict[str, list[View]]:
-    """An orbit, a degree a frame, and a walk towards the scene."""
+    """An orbit, a degree a frame, and a walk towards the scene.
+
+    Where the test views stand inside the scene, so do these cameras: both go about what the first test view looks at.
+    """
     width, height = scene.size
     cameras = scene.settings.cameras.model_copy(update={"width": width, "height": height})
     focal, distance = framing(scene.summary, cameras)
-    centre, walk = np.asarray(scene.summary.bounds.center), []
-    for number in range(frames):
-        turn, rise = math.radians(200 + SIDEWAYS * number), math.radians(18)
-        away = np.array([math.cos(rise) * math.cos(turn), math.cos(rise) * math.sin(turn), math.sin(rise)])
-        eye = centre + away * distance * 0.85 * (1 - CLOSER) ** number
-        walk.append(look_at_view(f"{number:04d}", eye, centre, focal, cameras))
-    return {"orbit": orbit_views(scene.summary, cameras, STEPS)[:frames], "walk": walk}
+    middle = np.asarray(scene.summary.bounds.center)
+    rise, turn = math.radians(18), math.radians(200)
+    away = np.array([math.cos(rise) * math.cos(turn), math.cos(rise) * math.sin(turn), math.sin(rise)])
+    orbit, eye = orbit_views(scene.summary, cameras, STEPS)[:frames], middle + away * distance * 0.85
+    around = scene.summary.surroundings
+    for standpoint in () if around is None else around.standpoints:
+        if np.allclose(standpoint.place, scene.views[0].position):
+            eye, middle = np.array(standpoint.place), np.array(standpoint.target)
+            orbit = [
+                look_at_view(f"{i:04d}", middle + _turned(eye - middle, i - frames // 2), middle, focal, cameras)
+                for i in range(frames)
+            ]
+    walk = [
+        look_at_view(
+            f"{i:04d}", middle + _turned(eye - middle, SIDEWAYS * i) * (1 - CLOSER) ** i, middle, focal, cameras
+        )
+        for i in range(frames)
+    ]
+    return {"orbit": orbit, "walk": walk}
+
+
+def _turned(way: np.ndarray, degrees: float) -> np.ndarray:
+    """About the upright axis."""
+    cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return np.array([cos * way[0] - sin * way[1], sin * way[0] + cos * way[1], way[2]])
 
 
 def surface_of(view: View, gbuffer: dict[str, np.ndarray]) -> Surface:
