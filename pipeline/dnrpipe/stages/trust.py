@@ -69,11 +69,15 @@ def measure_trust(run: Run, model: DNR) -> Trust:
     it."""
     views, base = traced_small(run), run.settings.model.base
     noisy, clean = (load(run.workspace, views, SPLIT, raytraced=True, raw=raw, base=base) for raw in (True, False))
-    share = best_share(model, noisy, clean)
-    before, after = mean_psnr(model, clean)
-    if share and after - before < LEAST_GAIN:
-        _apply(model, 0)
-        share, after = 0, before
+    trust = judged(best_share(model, noisy, clean), *mean_psnr(model, clean))
+    _apply(model, trust.share)
+    return trust
+
+
+def judged(share: float, before: float, after: float) -> Trust:
+    """``share``, or none where it gains less than LEAST_GAIN. before, after: PSNR without and with it, dB."""
+    if after - before < LEAST_GAIN:
+        return Trust(share=0, psnr=(before, before))
     return Trust(share=share, psnr=(before, after))
 
 
