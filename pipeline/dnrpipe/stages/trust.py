@@ -33,7 +33,7 @@ SHARES = tuple(i / 10 for i in range(11))
 ENOUGH = 0.95
 """Of the most that any share gains."""
 LEAST_GAIN = 0.3
-"""dB. The network takes about as long as one ray and a half of each pixel, and of eight that brings as much."""
+"""dB. The network takes about as long as two rays of each pixel (docs/frames.md), which beside eight bring as much."""
 
 
 class Trust(BaseModel, frozen=True):
