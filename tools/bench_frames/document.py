@@ -14,7 +14,7 @@ from typing import Any
 
 from dnrpipe.core.machine import processor
 from dnrpipe.studies.cells.results import number
-from dnrpipe.studies.frames.ours import BASE, NEURAL
+from dnrpipe.studies.frames.ours import BASE, NEURAL, is_own
 from dnrpipe.studies.frames.pareto_front import frontier
 from dnrtrain.atomic import write_json, write_text
 
@@ -120,7 +120,7 @@ def _scene(scene: dict[str, Any]) -> list[str]:
     for name in sorted(shown, key=lambda name: scene["rows"][name]["ms"]):
         row = scene["rows"][name]
         parts = ", ".join(f"{part} {ms:.1f}" for part, ms in row["parts"].items() if ms > 0)
-        label = f"**{name}**" if _own(name) else name
+        label = f"**{name}**" if is_own(name) else name
         lines.append(
             f"| {label} | {row['ms']:.1f} | {parts} | {row['psnr']:.2f} | {number(row.get('psnr_mask'), 2)} |"
             f" {row['ssim']:.4f} | {number(row.get('lpips_vgg'), 4)} |"
@@ -141,8 +141,8 @@ def _scene(scene: dict[str, Any]) -> list[str]:
 def _moving(move: str, found: dict[str, Any]) -> list[str]:
     """A move's renderers, by their milliseconds; of the rivals those alone that nothing beats at their time."""
     rows = found["rows"]
-    points = {name: (row["ms"], row["psnr"]) for name, row in rows.items() if not _own(name)}
-    shown = [*(name for name in rows if _own(name)), *frontier(points)]
+    points = {name: (row["ms"], row["psnr"]) for name, row in rows.items() if not is_own(name)}
+    shown = [*(name for name in rows if is_own(name)), *frontier(points)]
     lines = [
         f"{move.capitalize()} of {found['frames']} frames: means over six of them, against {found['reference_spp']}"
         f" samples ({found['reference']}). Flicker: mean absolute difference of the change from frame to frame, after"
@@ -153,16 +153,12 @@ def _moving(move: str, found: dict[str, Any]) -> list[str]:
     ]
     for name in sorted(shown, key=lambda name: rows[name]["ms"]):
         row = rows[name]
-        label = f"**{name}**" if _own(name) else name
+        label = f"**{name}**" if is_own(name) else name
         lines.append(
             f"| {label} | {row['ms']:.1f} | {row['psnr']:.2f} | {number(row.get('lpips_alex'), 4)} |"
             f" {1000 * row['flicker']:.2f} |"
         )
     return lines
-
-
-def _own(name: str) -> bool:
-    return name.startswith((NEURAL, BASE))
 
 
 def _best(per: dict[str, list[dict[str, Any]]], index: int, kind: str) -> float | None:

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from dnrpipe.core.ledger import CostRecord, UpfrontPart, break_even_frames, total, upfront_work
-from dnrpipe.studies.frames.ours import BASE, NEURAL
+from dnrpipe.studies.frames.ours import BASE, NEURAL, is_own
 from dnrpipe.studies.frames.pareto_front import Point, crossover, frontier, quality_at
 
 COUNTS = (200, 2000)
@@ -50,12 +50,11 @@ def at_equal_time(scene: Mapping[str, Any], frames: int) -> dict[str, Any]:
     line = _line(scene)
     found = []
     for name in scene["standing"]:
-        if name.startswith((NEURAL, BASE)):
-            row = scene["rows"][name]
-            ms = row["ms"] + 1000 * scene["upfront"]["total"] / frames
-            traced = quality_at(line, ms)
-            traced = line[0][1] if traced is None else traced
-            found.append({"name": name, "psnr": row["psnr"], "ms": ms, "rival": traced})
+        row = scene["rows"][name]
+        ms = row["ms"] + 1000 * scene["upfront"]["total"] / frames
+        traced = quality_at(line, ms)
+        traced = line[0][1] if traced is None else traced
+        found.append({"name": name, "psnr": row["psnr"], "ms": ms, "rival": traced})
     return max(found, key=lambda one: one["psnr"] - one["rival"])
 
 
@@ -67,9 +66,7 @@ def break_even(scene: Mapping[str, Any], figure: Figure = "psnr") -> tuple[str, 
     """
     rows, line = scene["rows"], _line(scene, figure)
     found = []
-    for name in scene["standing"]:
-        if not (line and name.startswith((NEURAL, BASE))):
-            continue
+    for name in scene["standing"] if line else ():
         level = crossover(line, BETTER[figure] * rows[name][figure])
         traced = line[-1][0] if level is None else level
         frames = break_even_frames(scene["upfront"]["total"], traced / 1000, rows[name]["ms"] / 1000)
@@ -116,12 +113,11 @@ def _line(scene: Mapping[str, Any], figure: Figure = "psnr") -> list[Point]:
     points = {
         name: (row["ms"], BETTER[figure] * row[figure])
         for name, row in scene["rows"].items()
-        if figure in row and not name.startswith((NEURAL, BASE))
+        if figure in row and not is_own(name)
     }
     return [points[name] for name in frontier(points)]
 
 
 def short(name: str) -> str:
     """What a cell of a table has room for: "3 rays" of our frames, "base, 3 rays" where nothing is neural."""
-    kind, _, rays = name.partition(", ")
-    return (f"base, {rays}" if kind == BASE else rays) or name
+    return name.replace(f"{BASE}, ", "base, ").removeprefix(f"{NEURAL}, ")

@@ -105,24 +105,25 @@ def moves(scene: BenchScene, frames: int) -> dict[str, list[View]]:
     width, height = scene.size
     cameras = scene.settings.cameras.model_copy(update={"width": width, "height": height})
     focal, distance = framing(scene.summary, cameras)
-    middle = np.asarray(scene.summary.bounds.center)
-    rise, turn = math.radians(18), math.radians(200)
-    away = np.array([math.cos(rise) * math.cos(turn), math.cos(rise) * math.sin(turn), math.sin(rise)])
-    orbit, eye = orbit_views(scene.summary, cameras, STEPS)[:frames], middle + away * distance * 0.85
     around = scene.summary.surroundings
-    for standpoint in () if around is None else around.standpoints:
-        if np.allclose(standpoint.place, scene.views[0].position):
-            eye, middle = np.array(standpoint.place), np.array(standpoint.target)
-            orbit = [
-                look_at_view(f"{i:04d}", middle + _turned(eye - middle, i - frames // 2), middle, focal, cameras)
-                for i in range(frames)
-            ]
-    walk = [
-        look_at_view(
-            f"{i:04d}", middle + _turned(eye - middle, SIDEWAYS * i) * (1 - CLOSER) ** i, middle, focal, cameras
-        )
-        for i in range(frames)
-    ]
+    standpoints = () if around is None else around.standpoints
+    inside = next((one for one in standpoints if np.allclose(one.place, scene.views[0].position)), None)
+    if inside is None:
+        rise, turn = math.radians(18), math.radians(200)
+        way = np.array([math.cos(rise) * math.cos(turn), math.cos(rise) * math.sin(turn), math.sin(rise)])
+        way, middle = way * distance * 0.85, np.asarray(scene.summary.bounds.center)
+    else:
+        way, middle = np.array(inside.place) - inside.target, np.array(inside.target)
+
+    def seen(number: int, degrees: float, share: float = 1) -> View:
+        """From so much of the way, turned by so much."""
+        eye = middle + _turned(way, degrees) * share
+        return look_at_view(f"{number:04d}", eye, middle, focal, cameras)
+
+    orbit = orbit_views(scene.summary, cameras, STEPS)[:frames]
+    if inside is not None:
+        orbit = [seen(number, number - frames // 2) for number in range(frames)]
+    walk = [seen(number, SIDEWAYS * number, (1 - CLOSER) ** number) for number in range(frames)]
     return {"orbit": orbit, "walk": walk}
 
 

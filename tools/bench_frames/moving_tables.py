@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dnrpipe.studies.cells.results import number
-from dnrpipe.studies.frames.ours import BASE, NEURAL, REMEMBERS
+from dnrpipe.studies.frames.ours import REMEMBERS, is_own
 
 from . import equal_time
 from .standing import CLASSES, class_limits
@@ -31,8 +31,8 @@ def over_moves(scene: Mapping[str, Any]) -> Rows:
 
 
 def best_within(rows: Rows, limit_ms: float, *, ours: bool) -> str | None:
-    """The renderer of the highest PSNR that takes at most so long, of ours (NEURAL or BASE) or of the rival's."""
-    fast = [name for name, row in rows.items() if row["ms"] <= limit_ms and name.startswith((NEURAL, BASE)) == ours]
+    """The renderer of the highest PSNR that takes at most so long, of ours or of the rival's."""
+    fast = [name for name, row in rows.items() if row["ms"] <= limit_ms and is_own(name) == ours]
     return max(fast, key=lambda name: rows[name]["psnr"]) if fast else None
 
 
@@ -56,9 +56,9 @@ def lines(scenes: Sequence[Mapping[str, Any]]) -> list[str]:
         for limit in class_limits(scene["size"])[: len(CLASSES) - 1]:
             pair = [best_within(rows, limit, ours=ours) for ours in (True, False)]
             cells = [scene["scene"], f"{limit:.0f} ms"]
-            for name, ours in zip(pair, (True, False), strict=True):
+            for name in pair:
                 row = rows[name] if name else {}
-                shown = "-" if name is None else f"{equal_time.short(name) if ours else name}, {row['ms']:.0f} ms"
+                shown = "-" if name is None else f"{equal_time.short(name)}, {row['ms']:.0f} ms"
                 cells += [shown, number(row.get("psnr"), 2), number(row.get("lpips_alex"), 4)]
                 cells += [number(1000 * row["flicker"] if row else None, 2)]
             mine, rival = pair
@@ -77,6 +77,6 @@ def lines(scenes: Sequence[Mapping[str, Any]]) -> list[str]:
 def _as_standing(scene: Mapping[str, Any]) -> dict[str, Any]:
     """What `equal_time` reads, with the moves' rows in place of those of single views; ours are those that remember."""
     rows = over_moves(scene)
-    ours = [name for name in rows if name.startswith((NEURAL, BASE)) and name.endswith(REMEMBERS)]
+    ours = [name for name in rows if is_own(name) and name.endswith(REMEMBERS)]
     kept = {key: scene[key] for key in ("scene", "upfront") if key in scene}
     return {**kept, "rows": rows, "standing": ours}

@@ -35,6 +35,11 @@ REMEMBERS = ", remembers"
 """Ends the names of frames that remember the ones before."""
 
 
+def is_own(name: str) -> bool:
+    """Whether the renderer of that name is ours, and not path tracing."""
+    return name.startswith((NEURAL, BASE))
+
+
 class Ours:
     """The workspace's fine-tuned model on the CPU, and its base image.
 
