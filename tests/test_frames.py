@@ -259,7 +259,7 @@ note(same=(whole == parts).all(), partial=((whole > 0) & (whole < 1)).sum())
 
 
 def test_cutouts_in_several_launches_cover_as_much(tmp_path: Path) -> None:
-    """A quarter of a veil, everywhere: 16 rays a pixel in one launch, and in four launches of four cells each."""
+    """A quarter of a veil, everywhere: 16 rays a pixel in one launch, in four launches of four cells each, by formula."""
     found = _run(
         tmp_path,
         HALF_THERE,
@@ -272,6 +272,9 @@ other = Frames(engine, folder / "scene.xml", "path", 5, frames.size)
 parts = other.coverage(views[0], mask)
 again = other.coverage(views[0], mask)
 steps = np.round(parts * 16) - parts * 16
+exact = frames.coverage(views[0], mask, alpha=whole)
+veil = (np.abs(exact - (1 - 0.75**2)) < 1e-4).sum() / ((whole > 0) & (whole < 0.9)).sum()
+note(exact=exact.mean(), veil=veil, outside=np.abs(exact[whole == 0]).max())
 note(whole=whole.mean(), parts=parts.mean(), off=np.abs(whole - parts).mean(), steps=np.abs(steps).max(),
      fine=(np.round(parts * 4) != parts * 4).mean(), same=(parts == again).all())
 """,
@@ -281,6 +284,10 @@ note(whole=whole.mean(), parts=parts.mean(), off=np.abs(whole - parts).mean(), s
     assert 0 < found["off"] < 0.1  # other random points
     assert found["steps"] < 1e-4 and found["fine"] > 0.1  # of 16 rays, not of 4
     assert found["same"] == 1
+    # Where a base image tells which pixels are partly covered, these are looked at alone, and without chance.
+    assert found["exact"] == pytest.approx(found["whole"], rel=0.02)
+    assert found["veil"] > 0.7  # the rest are rims
+    assert found["outside"] == 0
 
 
 def test_views_of_another_size_and_odd_ray_counts_are_refused(tmp_path: Path) -> None:

@@ -78,7 +78,7 @@ def bench(root: Path, options: Options, tell: Callable[[str], None]) -> dict[str
     if options.moving:
         best = [baselines[name] for name in result["frontier"]]
         limit = LONGEST * class_limits(scene.size)[1]
-        shown = [(ran.spp, ran.method) for ran in best if ran.method != "raw" and ran.ms() <= limit]
+        shown = [(ran.spp, ran.method) for ran in best if ran.ms() <= limit]
         result["moving"] = measure(
             scene,
             ours,

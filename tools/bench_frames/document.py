@@ -14,7 +14,7 @@ from typing import Any
 
 from dnrpipe.core.machine import processor
 from dnrpipe.studies.cells.results import number
-from dnrpipe.studies.frames.ours import BASE, NEURAL, is_own
+from dnrpipe.studies.frames.ours import BASE, GRAINY, NEURAL, is_own
 from dnrpipe.studies.frames.pareto_front import frontier
 from dnrtrain.atomic import write_json, write_text
 
@@ -125,13 +125,13 @@ def _scene(scene: dict[str, Any]) -> list[str]:
             f"| {label} | {row['ms']:.1f} | {parts} | {row['psnr']:.2f} | {number(row.get('psnr_mask'), 2)} |"
             f" {row['ssim']:.4f} | {number(row.get('lpips_vgg'), 4)} |"
         )
-    lines += ["", "| at most | best rival | dB | neural | base image alone |", "|---|---|---|---|---|"]
+    lines += ["", "| at most | best rival | dB | neural | base image alone | not denoised |", "|---|---|---|---|---|---|"]
     per = {name: standing["classes"] for name, standing in scene["standing"].items()}
     for index, row in enumerate(next(iter(per.values()))):
-        mine = [_best(per, index, kind) for kind in (NEURAL, BASE)]
+        mine = [_best(per, index, kind) for kind in (NEURAL, BASE, GRAINY)]
         lines.append(
             f"| {row['limit_ms']:.0f} ms | {row['rival'] or 'none'} | {number(row['rival_db'], 2)} |"
-            f" {number(mine[0], 2)} | {number(mine[1], 2)} |"
+            f" {' | '.join(number(best, 2) for best in mine)} |"
         )
     for move, found in scene.get("moving", {}).items():
         lines += ["", *_moving(move, found)]

@@ -186,7 +186,7 @@ def _look(
         else:
             channels = renderer.frame(way[-1], int(samples))
         channels = {**channels, "depth.Z": channels["depth.Z"] / engine.unit_scale}
-        channels["coverage"] = silhouettes.coverage(view, channels["mask"] > 0.5)
+        channels["coverage"] = silhouettes.coverage(view, channels["mask"] > 0.5, alpha=channels["base.A"])
         return without_grain(channels, renderer) if kind else channels
 
     bases = {chosen: [base(way, view, chosen) for way, view in zip(scaled, views, strict=True)] for chosen in inputs}

@@ -63,15 +63,15 @@ class Worker(BundleWorker):
         write_exr(task.output, {name: plane for name, plane in channels.items() if name not in CHAIN}, header)
         return answer
 
-    def channels(self, view: View, samples: int | None = None) -> dict[str, np.ndarray]:
+    def channels(self, view: View, samples: int | None = None, *, denoise: bool | None = None) -> dict[str, np.ndarray]:
         """Base image and G-buffer of a view in scene units: linear Rec.709, float32 [H, W] each.
 
-        samples: rays per pixel, if not the workspace's.
+        samples, denoise: rays per pixel, and whether baked light's base image is denoised, if not as in the workspace.
         """
         channels = self.grainy(view, samples)
         if isinstance(self.common, SampledCommon):
             return channels | self._traced(self.common, view, channels)
-        return without_grain(channels, self.renderer) if self.denoise else channels
+        return self._finished(channels, denoise)
 
     def grainy(self, view: View, samples: int | None = None, number: int = 0) -> dict[str, np.ndarray]:
         """`channels` by the kernel alone: not denoised, not path-traced. number: see `BaseRenderer.frame`."""
@@ -80,11 +80,17 @@ class Worker(BundleWorker):
         self.repaired, self.masked = self.repaired + renderer.repaired, self.masked + renderer.masked
         for name in ("depth.Z", *CHAIN):
             channels[name] = channels[name] / self.engine.unit_scale
-        channels["coverage"] = self._frames(view).coverage(view, channels["mask"] > 0.5)
+        channels["coverage"] = self._frames(view).coverage(view, channels["mask"] > 0.5, alpha=channels["base.A"])
         return channels
 
     def remembered(
-        self, view: View, earlier: Sequence[View], number: int = 0, samples: int | None = None
+        self,
+        view: View,
+        earlier: Sequence[View],
+        number: int = 0,
+        samples: int | None = None,
+        *,
+        denoise: bool | None = None,
     ) -> dict[str, np.ndarray]:
         """`channels` of a view, with what the frames ``earlier`` of a camera's way saw, the first of that number.
 
@@ -98,8 +104,11 @@ class Worker(BundleWorker):
         self.seen = way
         for frame, *_ in way[known:-1]:
             self._taken(frame, samples)
-        channels = self._taken(view, samples)
-        return without_grain(channels, self.renderer) if self.denoise else channels
+        return self._finished(self._taken(view, samples), denoise)
+
+    def _finished(self, channels: dict[str, np.ndarray], denoise: bool | None) -> dict[str, np.ndarray]:
+        denoise = self.denoise if denoise is None else denoise
+        return without_grain(channels, self.renderer) if denoise else channels
 
     def _taken(self, view: View, samples: int | None) -> dict[str, np.ndarray]:
         return self.history.take(view, self.grainy(view, samples, self.history.number))

@@ -28,10 +28,12 @@ from .lobes import lets_through, mean_of
 from .recorded import Recorded, prepare_emitters
 from .sensors import Camera, opaque_camera, scaled_view
 from .texels import ATTRIBUTE
-from .visibility import first_visible_of
+from .visibility import first_visible_of, straight_on
 
 MAX_RAYS = 1 << 24
 """Of a launch: bounds its memory (2 GiB). What needs more is the mean of several launches."""
+OPEN = 1e-3
+"""Alpha up to which nothing covers a pixel, and from 1 less which all of it is covered."""
 
 
 @dataclass(frozen=True)
@@ -97,18 +99,22 @@ class Frames:
         result["depth.Z"] = np.where(mask, depth, 0).astype(np.float32)
         return result | {"coverage": self.coverage(view, mask, rays)}
 
-    def coverage(self, view: View, mask: np.ndarray, rays: int = 16) -> np.ndarray:
+    def coverage(self, view: View, mask: np.ndarray, rays: int = 16, alpha: np.ndarray | None = None) -> np.ndarray:
         """Share of the pixel that surfaces cover, float32 [H, W]: of ``rays`` (a square number) in a regular grid.
 
         mask: bool [H, W], whether the ray through the pixel's centre meets a surface. Only pixels that differ from a
-        neighbour are looked at (a tenth, as a rule); where surfaces let light straight through, all are, at random.
+        neighbour are looked at (a tenth, as a rule). alpha: of a base image, float32 [H, W]; where surfaces let light
+        straight through, it takes the mask's place, and pixels that are partly covered by it are looked at, too; None:
+        there all pixels are, at random.
         """
-        if self.lets_through:
+        if self.lets_through and alpha is None:
             return self._mean(self._cover_kernel, view, rays, 0)[..., 0]
         if rays not in self._cover:
             self._cover[rays] = self._edge_kernel(rays)
-        kernel = self._cover[rays]
-        edges = np.flatnonzero(_differs(mask))
+        kernel, looked_at = self._cover[rays], np.zeros(mask.shape, bool)
+        if self.lets_through and alpha is not None:
+            mask, looked_at = alpha > 0.5, (alpha > OPEN) & (alpha < 1 - OPEN)
+        edges = np.flatnonzero(looked_at | _differs(mask))
         result = mask.astype(np.float32)
         if len(edges):
             import drjit as dr
@@ -128,16 +134,21 @@ class Frames:
     def _edge_kernel(self, count: int) -> Any:
         import drjit as dr
 
-        mi, scene, seen = self.mi, self.scene, seen_first(self.mi, self.scene)
-        cells = math.isqrt(count)
+        mi, scene, visible = self.mi, self.scene, first_visible_of(self.mi, self.scene)
+        passes, transmittance = straight_on(mi, visible)
+        holes, cells = self.lets_through, math.isqrt(count)
         if cells * cells != count:
             raise ValueError(f"rays: is {count}, expected a square number")
 
         @Recorded
         def kernel(camera: Any, pixel: Any, place: Any) -> list[Any]:
             offset = (mi.Point2f(place % cells, place // cells) + 0.5) / cells
-            hit = seen(scene, pinhole(mi, camera, pixel, offset), None)
-            return [dr.select(hit.is_valid(), mi.Float(1), mi.Float(0))]
+            ray, hit = visible(scene, pinhole(mi, camera, pixel, offset), mi.Bool(True))
+            covered = dr.select(hit.is_valid(), mi.Float(1), mi.Float(0))
+            if holes:
+                open_ = passes(hit, mi.Bool(True))
+                covered = dr.select(open_, 1 - mean_of(transmittance(scene, ray, hit, open_)), covered)
+            return [covered]
 
         return kernel
 

@@ -156,30 +156,11 @@ def with_tinted_alpha(mi: Any, inner: Any, first_visible: Any) -> Any:
 
     Mitsuba's integrators say whether a path met anything, and count a tinted null interaction as nothing met.
     first_visible: (scene, ray, active) -> (ray that starts behind what the camera does not see, its first hit).
-    T is the product along the straight ray, per colour, so two panes of different colours can hide everything; a
-    sample counts as covered with probability 1 - mean(T). Rays into a medium keep the integrator's own answer.
+    A sample counts as covered with probability 1 - mean(T). Rays into a medium keep the integrator's own answer.
     """
     import drjit as dr
 
-    def passes(hit: Any, active: Any) -> Any:
-        if not dr.is_jit_v(mi.Float) and not (active and hit.is_valid()):
-            return False
-        found = active & hit.is_valid()
-        null = mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.Null)
-        return found & null & dr.select(hit.is_medium_transition(), False, True)
-
-    def transmittance(scene: Any, ray: Any, hit: Any, passing: Any) -> Any:
-        """Per colour, from ``hit`` on, which passes light."""
-
-        def onwards(hit: Any, total: Any, passing: Any) -> tuple[Any, Any, Any]:
-            total = total * dr.select(passing, hit.bsdf().eval_null_transmission(hit, passing), 1)
-            _, hit = first_visible(scene, hit.spawn_ray(ray.d), passing)
-            opaque = passing & hit.is_valid() & dr.select(passes(hit, passing), False, True)
-            total = dr.select(opaque, 0, total)
-            return hit, total, passing & passes(hit, passing) & (dr.max(total) > 0)
-
-        state = (hit, mi.Spectrum(1.0), passing)
-        return dr.while_loop(state, lambda hit, total, passing: passing, onwards)[1]
+    passes, transmittance = straight_on(mi, first_visible)
 
     class TintedAlpha(mi.SamplingIntegrator):
         def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> Any:
@@ -192,3 +173,33 @@ def with_tinted_alpha(mi: Any, inner: Any, first_visible: Any) -> Any:
             return colour, dr.select(redrawn, chance >= mean_of(total), met), aovs
 
     return TintedAlpha(mi.Properties("tinted_alpha"))
+
+
+def straight_on(mi: Any, first_visible: Any) -> tuple[Any, Any]:
+    """Two functions: (hit, active) -> whether light passes straight through there, not into a medium; and (scene, ray,
+    hit, passing) -> what is left of it, T per colour, where nothing opaque stands behind.
+
+    T is the product along the straight ray, per colour, so two panes of different colours can hide everything.
+    first_visible: see `with_tinted_alpha`.
+    """
+    import drjit as dr
+
+    def passes(hit: Any, active: Any) -> Any:
+        if not dr.is_jit_v(mi.Float) and not (active and hit.is_valid()):
+            return False
+        found = active & hit.is_valid()
+        null = mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.Null)
+        return found & null & dr.select(hit.is_medium_transition(), False, True)
+
+    def transmittance(scene: Any, ray: Any, hit: Any, passing: Any) -> Any:
+        def onwards(hit: Any, total: Any, passing: Any) -> tuple[Any, Any, Any]:
+            total = total * dr.select(passing, hit.bsdf().eval_null_transmission(hit, passing), 1)
+            _, hit = first_visible(scene, hit.spawn_ray(ray.d), passing)
+            opaque = passing & hit.is_valid() & dr.select(passes(hit, passing), False, True)
+            total = dr.select(opaque, 0, total)
+            return hit, total, passing & passes(hit, passing) & (dr.max(total) > 0)
+
+        state = (hit, mi.Spectrum(1.0), passing)
+        return dr.while_loop(state, lambda hit, total, passing: passing, onwards)[1]
+
+    return passes, transmittance

@@ -1,4 +1,4 @@
-"""Our frames, from nothing but a camera: G-buffer and base image, then the network; each part timed.
+"""Our frames, from nothing but a camera: G-buffer and base image, the denoiser, then the network; each part timed.
 
 G-buffer and base image come from one kernel of Mitsuba in this process. What it gives goes through the EXR files that
 the trainer reads, which is not timed: a viewer would hand over memory.
@@ -30,18 +30,18 @@ from .scene import BenchScene, Clock
 
 TIMED = ("none", "baked")
 """Base images that this benchmark can render frame by frame."""
-NEURAL, BASE = "neural", "base image alone"
+NEURAL, BASE, GRAINY = "neural", "base image alone", "base image, not denoised"
 REMEMBERS = ", remembers"
 """Ends the names of frames that remember the ones before."""
 
 
 def is_own(name: str) -> bool:
     """Whether the renderer of that name is ours, and not path tracing."""
-    return name.startswith((NEURAL, BASE))
+    return name.startswith((NEURAL, BASE, GRAINY))
 
 
 class Ours:
-    """The workspace's fine-tuned model on the CPU, and its base image.
+    """The workspace's fine-tuned model on the CPU, its base image, and that before it is denoised.
 
     model is None, and frames have nothing neural, where the workspace has none: the base image alone is measured then.
     samples: rays per pixel of base images, each with the same model, whatever it was trained with; none: the
@@ -87,7 +87,7 @@ class Ours:
             self._inputs(samples, view, clock, history)
 
     def frame(self, view: View, clock: Clock, *, remember: bool = False) -> dict[str, dict[str, Any]]:
-        """By NEURAL and BASE, and the rays per pixel: {"picture": display RGB over white [1, 3, H, W], "parts":
+        """By NEURAL, BASE and GRAINY, and the rays per pixel: {"picture": display RGB over white [1, 3, H, W], "parts":
         {name: ms}}.
 
         remember: with what earlier such frames saw, since `begin`; only of baked light.
@@ -97,38 +97,42 @@ class Ours:
             channels, parts = self._inputs(samples, view, clock, history if remember else None)
             rays = "" if samples is None else f", {samples} rays"
             rays += REMEMBERS if remember else ""
+            if self.renderer is not None and self.scene.settings.base.denoise:
+                result[GRAINY + rays] = {"picture": self._picture(channels), "parts": dict(parts)}
+                # It changes the planes, which the history keeps no part of.
+                channels, parts["denoiser"] = clock.time(partial(without_grain, channels, self.renderer))
             if samples is not None:
-                alpha = channels["coverage"][..., None]
-                base = np.stack([channels[f"base.{c}"] for c in "RGB"], axis=-1)
-                straight = base / np.maximum(channels["base.A"], 1e-6)[..., None]
-                picture = self.scene.shown(np.concatenate([straight * alpha, alpha], axis=-1))
-                result[BASE + rays] = {"picture": picture, "parts": dict(parts)}
+                result[BASE + rays] = {"picture": self._picture(channels), "parts": dict(parts)}
             if self.model is not None:
                 data = self._data(view, channels)
                 picture, parts["network"] = clock.time(partial(render_views, self.model, data))
                 result[NEURAL + rays] = {"picture": picture.float(), "parts": parts}
         return result
 
+    def _picture(self, channels: dict[str, np.ndarray]) -> Any:
+        """A base image as it is displayed."""
+        alpha = channels["coverage"][..., None]
+        base = np.stack([channels[f"base.{c}"] for c in "RGB"], axis=-1)
+        straight = base / np.maximum(channels["base.A"], 1e-6)[..., None]
+        return self.scene.shown(np.concatenate([straight * alpha, alpha], axis=-1))
+
     def _inputs(
         self, samples: int | None, view: View, clock: Clock, history: History | None
     ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
-        """(channels that the network sees, ms by part). The base image's kernel gives the G-buffer, too."""
+        """(channels, not denoised; ms by part). The base image's kernel gives the G-buffer, too."""
         if self.renderer is None or samples is None:
             channels, ms = clock.time(partial(self.scene.frames.gbuffer, view))
             return channels, {"G-buffer": ms}
         scale = self.scene.engine.unit_scale
         number = 0 if history is None else history.number
         channels, ms = clock.time(partial(self.renderer.frame, scaled_view(view, scale), samples, number))
-        mask = channels["mask"] > 0.5
-        coverage, finer = clock.time(partial(self.scene.frames.coverage, view, mask))
+        mask, alpha = channels["mask"] > 0.5, channels["base.A"]
+        coverage, finer = clock.time(partial(self.scene.frames.coverage, view, mask, alpha=alpha))
         channels |= {name: channels[name] / scale for name in ("depth.Z", *CHAIN)}
         parts = {"base image and G-buffer": ms, "silhouettes": finer}
         if history is not None:
             channels, parts["history"] = clock.time(partial(history.take, view, channels))
-        channels = {**channels, "coverage": coverage}
-        if self.scene.settings.base.denoise:
-            channels, parts["denoiser"] = clock.time(partial(without_grain, channels, self.renderer))
-        return channels, parts
+        return {**channels, "coverage": coverage}, parts
 
     def _data(self, view: View, channels: dict[str, np.ndarray]) -> Any:
         with tempfile.TemporaryDirectory() as folder:

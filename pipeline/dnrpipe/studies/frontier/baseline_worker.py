@@ -69,7 +69,7 @@ class Worker(FileWorker):
         if task.settings.model.base == "baked":
             ours = Ours(scene, (), task.output.parent / "no-model")
             ours.frame(views[0], clock)
-            frames = [next(iter(ours.frame(view, clock).items())) for view in views]
+            frames = [(name, frame) for view in views for name, frame in ours.frame(view, clock).items()]
             parts = [frame["parts"].values() for name, frame in frames if name.startswith(BASE)]
             base_ms = float(np.median([sum(ms) for ms in parts]))
         return BaselineFile(key=task.fingerprint, threads=self.threads, baselines=points, base_ms=base_ms)

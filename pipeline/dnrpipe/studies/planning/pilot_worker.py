@@ -196,7 +196,7 @@ class Worker:
                 for name, frame in frames.items():
                     if name.startswith(NEURAL):
                         row.add(frame["picture"], truth[number], frame["parts"])
-                    elif row is neural[0]:
+                    elif name.startswith(BASE) and row is neural[0]:
                         base.add(frame["picture"], truth[number], frame["parts"])
         rival = []
         for baseline in baselines.values():
