@@ -259,7 +259,7 @@ note(same=(whole == parts).all(), partial=((whole > 0) & (whole < 1)).sum())
 
 
 def test_cutouts_in_several_launches_cover_as_much(tmp_path: Path) -> None:
-    """A quarter of a veil, everywhere: 16 rays a pixel in one launch, in four launches of four cells each, by formula."""
+    """A quarter of a veil, everywhere: 16 rays a pixel in one launch, in four of four cells each, by formula."""
     found = _run(
         tmp_path,
         HALF_THERE,
@@ -286,7 +286,7 @@ note(whole=whole.mean(), parts=parts.mean(), off=np.abs(whole - parts).mean(), s
     assert found["same"] == 1
     # Where a base image tells which pixels are partly covered, these are looked at alone, and without chance.
     assert found["exact"] == pytest.approx(found["whole"], rel=0.02)
-    assert found["veil"] > 0.7  # the rest are rims
+    assert found["veil"] > 0.6  # the rest are rims
     assert found["outside"] == 0
 
 

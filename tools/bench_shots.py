@@ -37,7 +37,7 @@ from dnrpipe.core.workspace import Workspace
 from dnrpipe.stages.session import resolve_settings
 from dnrpipe.stages.shot_scene import look_at_shot
 from dnrpipe.stages.shots.frame_tasks import FrameTask, Way
-from dnrpipe.stages.shots.make_shot import lpips_of, shot_light
+from dnrpipe.stages.shots.make_shot import lpips_of
 from dnrpipe.stages.shots.open_shot import parse_size
 from dnrpipe.stages.shots.references import compared, display_of, shown
 from dnrpipe.stages.shots.render_frames import FRAMES_FOLDER, frame_outcomes
@@ -112,7 +112,7 @@ def measured(scene: Path, root: Path, size: tuple[int, int], frames: int) -> dic
     cameras = root.with_suffix(".json")
     write_cameras(cameras, views, "arc")
     named = ("--cameras", str(cameras), "-w", str(root), "--name", "arc", "--preset", "standard")
-    words = ("shot", str(scene), *named, *light_of_reel(looked_at, size), "--json")
+    words = ("shot", str(scene), *named, "--plan-for", str(REEL), "--json")
     started = time.monotonic()
     answer = subprocess.run([sys.executable, "-m", "dnrpipe.cli", *words], check=True, stdout=subprocess.PIPE)
     seconds = time.monotonic() - started
@@ -135,12 +135,6 @@ def measured(scene: Path, root: Path, size: tuple[int, int], frames: int) -> dic
         "check": shot["check"],
         **found,
     }
-
-
-def light_of_reel(looked_at: Path, size: tuple[int, int]) -> list[str]:
-    """Flags for the light that a shot of REEL frames would take, not so few as are rendered. looked_at: see `arc`."""
-    base = shot_light(opened(looked_at), REEL * size[0] * size[1]).base
-    return ["--set", f"base.light_size={base.light_size}", "--set", f"base.light_spp={base.light_spp}"]
 
 
 def arc(scene: Path, looked_at: Path, size: tuple[int, int], frames: int) -> list[View]:

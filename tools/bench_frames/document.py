@@ -125,7 +125,11 @@ def _scene(scene: dict[str, Any]) -> list[str]:
             f"| {label} | {row['ms']:.1f} | {parts} | {row['psnr']:.2f} | {number(row.get('psnr_mask'), 2)} |"
             f" {row['ssim']:.4f} | {number(row.get('lpips_vgg'), 4)} |"
         )
-    lines += ["", "| at most | best rival | dB | neural | base image alone | not denoised |", "|---|---|---|---|---|---|"]
+    lines += [
+        "",
+        "| at most | best rival | dB | neural | base image alone | not denoised |",
+        "|---|---|---|---|---|---|",
+    ]
     per = {name: standing["classes"] for name, standing in scene["standing"].items()}
     for index, row in enumerate(next(iter(per.values()))):
         mine = [_best(per, index, kind) for kind in (NEURAL, BASE, GRAINY)]

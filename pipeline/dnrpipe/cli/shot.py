@@ -24,6 +24,12 @@ from .options import amount, common, open_session
 @click.option(
     "--way", type=click.Choice(["path", "base", "neural"]), help="Path tracing, base images, the neural renderer."
 )
+@click.option(
+    "--plan-for",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Frames that baked light has to pay for, where more will follow (default: those of the shot).",
+)
 @click.option("--name", metavar="NAME", help="Of the shot's folder (default: the camera's name).")
 @click.option("--transparent", is_flag=True, help="The world behind everything is left out, and alpha says so.")
 @click.option(
@@ -40,6 +46,7 @@ def shot(
     target_psnr: float | None,
     target_lpips: float | None,
     way: str | None,
+    plan_for: int | None,
     name: str | None,
     transparent: bool,
     dry_run: bool,
@@ -49,8 +56,8 @@ def shot(
 
     SCENE is a scene file or a workspace. Measures on windows of two frames what path tracing with a denoiser, base
     images and the neural renderer give and cost, says so, and takes the cheapest that is good enough: without --time
-    and --target-..., the best quality that baked light has; where four samples are as good as that usually is, they are
-    taken, and no light is baked. Frames in which things move are path-traced. Makes ./SCENE.shot.dnr (or -w DIR) with
+    and --target-..., the best quality that baked light has; where four samples are as good as that usually is, and
+    baking would take longer than it saves, they are taken. Frames in which things move are path-traced. Makes ./SCENE.shot.dnr (or -w DIR) with
     shots/NAME: frames/ (scene-linear EXR: colour, depth, normal, albedo, object number), pictures/, NAME.mp4, check/.
     Goes on after an interruption.
 
@@ -82,7 +89,13 @@ def shot(
         size=None if size is None else parse_size(size),
         camera=camera,
         camera_file=camera_file,
-        wanted=Wanted(seconds=amount("--time", duration, parse_seconds), psnr=target_psnr, lpips=target_lpips, way=way),
+        wanted=Wanted(
+            seconds=amount("--time", duration, parse_seconds),
+            psnr=target_psnr,
+            lpips=target_lpips,
+            way=way,
+            frames=plan_for,
+        ),
         name=name,
         transparent=transparent,
         only_plan=dry_run,

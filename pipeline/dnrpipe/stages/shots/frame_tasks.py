@@ -3,8 +3,8 @@
 Ways of rendering a frame (`Way`):
 
     path     path tracing and Open Image Denoise, with albedo and normals of clean primary rays
-    base     the base image, baked light and mirror-like paths, denoised
-    neural   the same, corrected by the network
+    base     the base image, baked light and mirror-like paths, denoised or not
+    neural   the same, denoised and corrected by the network
 
 Seconds are wall-clock, ``cpu_seconds`` of the process.
 """
@@ -35,13 +35,14 @@ WayName = Literal["path", "base", "neural"]
 
 class Way(BaseModel):
     """How a frame is rendered. spp: samples per pixel of ``path``, rays per pixel of a base image. quality: of the
-    denoiser, of ``path``."""
+    denoiser, of ``path``. denoise: of ``base``; the others always are."""
 
     model_config = ConfigDict(frozen=True)
 
     name: WayName
     spp: int
     quality: Literal["balanced", "high"] = "high"
+    denoise: bool = True
 
     @property
     def told(self) -> str:
@@ -49,7 +50,9 @@ class Way(BaseModel):
         if self.name == "path":
             quickly = " quickly" if self.quality == "balanced" else ""
             return f"path tracing, {self.spp} samples, denoised{quickly}"
-        return f"{'base images, denoised' if self.name == 'base' else 'neural renderer'}, {self.spp} rays"
+        if self.name == "neural":
+            return f"neural renderer, {self.spp} rays"
+        return f"base images, {'denoised, ' if self.denoise else ''}{self.spp} rays"
 
 
 class FrameCommon(Task):

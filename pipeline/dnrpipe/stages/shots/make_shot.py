@@ -46,7 +46,7 @@ from .renderers import Renderer, path_tracer, shipped_renderer, trained_renderer
 
 CHECKED = 2
 """Frames of a shot that are traced to check it."""
-PLAN_VERSION = 12
+PLAN_VERSION = 13
 LIGHT_SIDE, MORE = 1024, (1, 2, 4)
 """Texels of the light map's side, and times as many paths, or texels where charts are small, for more pixels."""
 BATCH = 8
@@ -76,7 +76,7 @@ def plan_shot(session: Session, shot: Shot, kept: KeptWorker) -> ShotPlan:
     kept: what renders them.
     """
     started = time.monotonic()
-    choose_light(session, shot.frames)
+    choose_light(session, shot.frames, shot.wanted.frames)
     run = _run(session, kept)
     tracer, path = path_tracer(run, shot.background), folder_of(run, shot) / PLAN
     lpips = lpips_of(run)
@@ -111,12 +111,13 @@ def plan_shot(session: Session, shot: Shot, kept: KeptWorker) -> ShotPlan:
     return plan
 
 
-def choose_light(session: Session, frames: Sequence[ShotFrame]) -> None:
-    """Choose what no setting says of the light map (`shot_light`).
+def choose_light(session: Session, frames: Sequence[ShotFrame], planned: int | None = None) -> None:
+    """Choose what no setting says of the light map (`shot_light`). planned: frames to plan for, if more than these.
 
     The choice is not remembered as flags are: the next shot has other frames.
     """
     pixels = sum(frame.view.width * frame.view.height for frame in frames if not frame.moving)
+    pixels = pixels * max(planned or 0, len(frames)) // len(frames)
     session.settings = shot_light(session.run.for_stage("render"), pixels)
 
 

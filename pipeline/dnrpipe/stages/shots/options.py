@@ -27,7 +27,8 @@ PATIENCE = 8
 
 
 class Wanted(BaseModel):
-    """What the user asked for. seconds: for all of the shot, from here on. psnr in dB, lpips (AlexNet)."""
+    """What the user asked for. seconds: for all of the shot, from here on. psnr in dB, lpips (AlexNet). frames: to plan
+    for, if more of the shot will follow."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -35,6 +36,7 @@ class Wanted(BaseModel):
     psnr: float | None = None
     lpips: float | None = None
     way: str | None = None
+    frames: int | None = None
 
     @property
     def aimless(self) -> bool:

@@ -1,14 +1,14 @@
 """Which way to make a shot: what the pilot measured, reckoned to all of its frames.
 
-Light is baked only where baked light can be worth it: where few samples and a quick denoiser, which take no longer than
-baked light, are worse, unless something else than that is wanted; and where path tracing all frames at the most samples
-takes longer than baking is expected to.
+Light is baked only where baked light can be worth it: where few samples and a quick denoiser are worse, or baking takes
+less than it saves, unless something else than that is wanted; and where path tracing all frames at the most samples takes
+longer than baking is expected to.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,11 @@ from .renderers import Renderer, shipped_renderer
 
 FEWER = (2, 4)
 """Rays per pixel of base images that are tried beside the settings'."""
+RAW = (4, 8, 16)
+"""The same of base images that are not denoised: that takes as long as three to eight rays do, and does less where most
+light comes straight from a sky or lies baked on matt surfaces."""
+SAVED = 0.5
+"""Of a frame of STEADY samples, what a base image as good takes less where it is not denoised, give or take."""
 DEEP, MOST_DEEP = 8, 0.02
 """Surfaces of a path beyond which light is no more that of matt surfaces, which reflect too little, but of glass behind
 glass; and the share of such light from which on baking does not pay. Base images follow glass as far as path tracing
@@ -64,8 +69,13 @@ def weigh(
     quick = pilot.measure(tracer, [steady])
     option, told = path_option(quick[0], shape), quick[0].lpips is not None and quick[0].shows
     if told and option.reaches(*USUAL) and wanted.aimless and not _light_is_ready(run):
-        run.console.say(f"baked light is not weighed: {steady.told}, are as good as it usually is, in its time")
-        return _running([option], tracing=True), None
+        baking, saved = _baking_seconds(run, quick[0]), SAVED * _planned(shape, wanted) * option.frame
+        if baking > saved:
+            run.console.say(
+                f"baked light is not weighed: {steady.told}, are as good as it usually is, and baking would take about"
+                f" {duration(baking)} to save {duration(saved)}"
+            )
+            return _running([option], tracing=True), None
     others = [steady.model_copy(update={"spp": spp}) for spp in LADDER if spp != STEADY]
     measured = pilot.measure(tracer, [*others, *(Way(name="path", spp=spp) for spp in LADDER)])
     quick += measured[: len(others)]
@@ -77,12 +87,13 @@ def weigh(
     rays = run.settings.base.samples
     counts = [*(n for n in FEWER if n < rays), rays]
     ways = [Way(name="base" if wanted.way == "base" else "neural", spp=n) for n in counts]
+    raw = [] if wanted.way == "neural" else [Way(name="base", spp=n, denoise=False) for n in RAW]
     if run.kept is not None:
         run.kept.close()  # baking wants the memory
     renderer, trust = shipped_renderer(run, tracer.common.background, trust=1.0), 0.0
 
-    measured = pilot.measure(renderer, ways)
-    ours = [found for found in measured if found.way.name == "base"]
+    measured = pilot.measure(renderer, [*ways, *raw])
+    ours = sorted((found for found in measured if found.way.name == "base"), key=lambda found: found.way.denoise)
     if wanted.way != "base":
         trust, corrected = pilot.trusted(ways)
         run.console.say(_trust_told(trust))
@@ -204,14 +215,25 @@ def _no_baked_light(
     if wanted.aimless and deep > MOST_DEEP:
         return f"{deep:.1%} of the light meets more than {DEEP} surfaces, glass behind glass, as in base images"
     most = ladder[-1]
-    tracing = path_option(most, shape).seconds
-    light = light_plan(run.settings, run.effect_plan).paths * LIGHT_PATH * most.pixel / most.way.spp
+    planned = replace(shape, still=_planned(shape, wanted))
+    tracing, light = path_option(most, planned).seconds, _baking_seconds(run, most)
     if tracing < light:
         return (
             f"path tracing all frames at {most.way.spp} samples takes {duration(tracing)}, baking the light about"
             f" {duration(light)}"
         )
     return ""
+
+
+def _baking_seconds(run: Run, traced: Measured) -> float:
+    """What baking light is expected to take. traced: what samples of camera paths take."""
+    return light_plan(run.settings, run.effect_plan).paths * LIGHT_PATH * traced.pixel / traced.way.spp
+
+
+def _planned(shape: Shape, wanted: Wanted) -> int:
+    """Frames that stand still, of all that are to be planned for."""
+    here = shape.still + shape.moving
+    return max(shape.still, round(shape.still * (wanted.frames or here) / here))
 
 
 def _trust_told(share: float) -> str:
