@@ -63,6 +63,14 @@ def write_exr(
         raise OSError(errno.EIO, str(error), str(path)) from None
 
 
+def compress_by(threads: int) -> None:
+    """From here on, let OpenEXR compress by so many threads of this process; the bytes are the same by any number."""
+    import OpenEXR
+
+    if hasattr(OpenEXR, "set_global_thread_count"):  # versions before have no way to say so
+        OpenEXR.set_global_thread_count(threads)
+
+
 def read_exr(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Read all channels (float32 [H, W]) and the JSON metadata ({} when there is none).
 

@@ -57,9 +57,9 @@ def shot(
     SCENE is a scene file or a workspace. Measures on windows of two frames what path tracing with a denoiser, base
     images and the neural renderer give and cost, says so, and takes the cheapest that is good enough: without --time
     and --target-..., the best quality that baked light has; where four samples are as good as that usually is, and
-    baking would take longer than it saves, they are taken. Frames in which things move are path-traced. Makes ./SCENE.shot.dnr (or -w DIR) with
-    shots/NAME: frames/ (scene-linear EXR: colour, depth, normal, albedo, object number), pictures/, NAME.mp4, check/.
-    Goes on after an interruption.
+    baking would take longer than it saves, they are taken. Frames in which things move are path-traced. Makes
+    ./SCENE.shot.dnr (or -w DIR) with shots/NAME: frames/ (scene-linear EXR: colour, depth, normal, albedo, object
+    number), pictures/, NAME.mp4, check/. Goes on after an interruption.
 
     \b
     Examples:

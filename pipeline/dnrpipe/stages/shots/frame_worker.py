@@ -7,6 +7,7 @@ scene's view transform.
 from __future__ import annotations
 
 import functools
+import os
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -26,7 +27,7 @@ from dnrpipe.raytrace.frames import Frames
 from dnrpipe.raytrace.recorded import Stopwatch, timed
 from dnrtrain.dataset import view_in_memory
 from dnrtrain.display import DisplayTransform
-from dnrtrain.exr import write_exr
+from dnrtrain.exr import compress_by, write_exr
 from dnrtrain.model import render
 
 from ..trainer import torch_device
@@ -46,6 +47,7 @@ class Worker:
 
     def __init__(self, common: dict[str, Any]) -> None:
         self.common = settings = FrameCommon.model_validate(common)
+        compress_by(os.cpu_count() or 1)  # a file of a real shot takes as long as a third of its frame
         self.display = DisplayTransform(settings.frame, settings.scene)
         self.base = None if settings.base is None else BaseWorker(settings.base)
         self.engine = self.base.engine if self.base is not None else Engine(settings.variant, 0, [settings.bundle])
@@ -86,7 +88,7 @@ class Worker:
         for path in (task.output, task.picture):
             path.parent.mkdir(parents=True, exist_ok=True)
         task.picture.unlink(missing_ok=True)  # an older one beside a new frame would pass for its picture
-        with ThreadPoolExecutor(1) as beside:  # both compress, each on one core
+        with ThreadPoolExecutor(1) as beside:  # a picture is compressed by one core
             picture = beside.submit(self._write_picture, task.picture, layers)
             write_exr(task.output, layers, header, half=HALF)
             picture.result()

@@ -1,8 +1,8 @@
 """Which way to make a shot: what the pilot measured, reckoned to all of its frames.
 
 Light is baked only where baked light can be worth it: where few samples and a quick denoiser are worse, or baking takes
-less than it saves, unless something else than that is wanted; and where path tracing all frames at the most samples takes
-longer than baking is expected to.
+less than it saves, unless something else than that is wanted; and where path tracing all frames at the most samples
+takes longer than baking is expected to.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .pilot import LADDER, MOST, Measured, Pilot, reckoned
 from .records import ShotFrame
 from .renderers import Renderer, shipped_renderer
 
-FEWER = (2, 4)
+FEWER = (4,)
 """Rays per pixel of base images that are tried beside the settings'."""
 RAW = (4, 8, 16)
 """The same of base images that are not denoised: that takes as long as three to eight rays do, and does less where most
