@@ -26,7 +26,7 @@ from .renderers import Renderer, shipped_renderer
 
 FEWER = (4,)
 """Rays per pixel of base images that are tried beside the settings'."""
-RAW = (4, 8, 16)
+RAW = (4, 8)
 """The same of base images that are not denoised: that takes as long as three to eight rays do, and does less where most
 light comes straight from a sky or lies baked on matt surfaces."""
 SAVED = 0.5
