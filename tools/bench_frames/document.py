@@ -14,7 +14,7 @@ from typing import Any
 
 from dnrpipe.core.machine import processor
 from dnrpipe.studies.cells.results import number
-from dnrpipe.studies.frames.ours import BASE, GRAINY, NEURAL, is_own
+from dnrpipe.studies.frames.ours import BASE, NEURAL, SMOOTH, is_own
 from dnrpipe.studies.frames.pareto_front import frontier
 from dnrtrain.atomic import write_json, write_text
 
@@ -127,12 +127,12 @@ def _scene(scene: dict[str, Any]) -> list[str]:
         )
     lines += [
         "",
-        "| at most | best rival | dB | neural | base image alone | not denoised |",
+        "| at most | best rival | dB | neural | base image alone | smoothed |",
         "|---|---|---|---|---|---|",
     ]
     per = {name: standing["classes"] for name, standing in scene["standing"].items()}
     for index, row in enumerate(next(iter(per.values()))):
-        mine = [_best(per, index, kind) for kind in (NEURAL, BASE, GRAINY)]
+        mine = [_best(per, index, kind) for kind in (NEURAL, BASE, SMOOTH)]
         lines.append(
             f"| {row['limit_ms']:.0f} ms | {row['rival'] or 'none'} | {number(row['rival_db'], 2)} |"
             f" {' | '.join(number(best, 2) for best in mine)} |"

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from dnrpipe.core.ledger import CostRecord, UpfrontPart, break_even_frames, total, upfront_work
-from dnrpipe.studies.frames.ours import BASE, GRAINY, NEURAL, is_own
+from dnrpipe.studies.frames.ours import BASE, NEURAL, SMOOTH, is_own
 from dnrpipe.studies.frames.pareto_front import Point, crossover, frontier, quality_at
 
 COUNTS = (200, 2000)
@@ -119,6 +119,6 @@ def _line(scene: Mapping[str, Any], figure: Figure = "psnr") -> list[Point]:
 
 
 def short(name: str) -> str:
-    """What a cell of a table has room for: "3 rays" of our frames, "base, 3 rays" where nothing is neural, "raw, 3
-    rays" where nothing is denoised either."""
-    return name.replace(f"{BASE}, ", "base, ").replace(f"{GRAINY}, ", "raw, ").removeprefix(f"{NEURAL}, ")
+    """What a cell of a table has room for: "3 rays" of our frames, "base, 3 rays" where nothing is neural, "smoothed,
+    3 rays" where that took the denoiser's place."""
+    return name.replace(f"{BASE}, ", "base, ").replace(f"{SMOOTH}, ", "smoothed, ").removeprefix(f"{NEURAL}, ")

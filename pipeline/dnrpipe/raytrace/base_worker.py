@@ -18,6 +18,7 @@ from .history import History
 from .light_worker import read_light
 from .recorded import Stopwatch
 from .sensors import scaled_view
+from .smoothing import Smoother
 from .tasks import BakedCommon, BaseAnswer, BaseTask, SampledCommon
 
 COLOUR = ("base.R", "base.G", "base.B", "base.A")
@@ -41,6 +42,7 @@ class Worker(BundleWorker):
         scene = self.engine.scenes[str(self.bundle)]
         self.denoise = isinstance(self.common, BakedCommon) and self.common.denoise
         self.renderer = BaseRenderer(self.engine.mi, scene, light, gloss=not self.denoise)
+        self.smoother = Smoother(self.engine.mi)
         self.silhouettes: dict[tuple[int, int], Frames] = {}
         self.history, self.seen = History(self.engine.mi), list[tuple[View, int | None, int]]()
         """Of the frames ``seen``, with their rays per pixel and the number of the first."""
@@ -63,15 +65,15 @@ class Worker(BundleWorker):
         write_exr(task.output, {name: plane for name, plane in channels.items() if name not in CHAIN}, header)
         return answer
 
-    def channels(self, view: View, samples: int | None = None, *, denoise: bool | None = None) -> dict[str, np.ndarray]:
+    def channels(self, view: View, samples: int | None = None, *, smooth: bool = False) -> dict[str, np.ndarray]:
         """Base image and G-buffer of a view in scene units: linear Rec.709, float32 [H, W] each.
 
-        samples, denoise: rays per pixel, and whether baked light's base image is denoised, if not as in the workspace.
+        samples: rays per pixel, if not the workspace's. smooth: by `smoothing`, not denoised as in the workspace.
         """
         channels = self.grainy(view, samples)
         if isinstance(self.common, SampledCommon):
             return channels | self._traced(self.common, view, channels)
-        return self._finished(channels, denoise)
+        return self._finished(channels, smooth)
 
     def grainy(self, view: View, samples: int | None = None, number: int = 0) -> dict[str, np.ndarray]:
         """`channels` by the kernel alone: not denoised, not path-traced. number: see `BaseRenderer.frame`."""
@@ -90,7 +92,7 @@ class Worker(BundleWorker):
         number: int = 0,
         samples: int | None = None,
         *,
-        denoise: bool | None = None,
+        smooth: bool = False,
     ) -> dict[str, np.ndarray]:
         """`channels` of a view, with what the frames ``earlier`` of a camera's way saw, the first of that number.
 
@@ -104,11 +106,12 @@ class Worker(BundleWorker):
         self.seen = way
         for frame, *_ in way[known:-1]:
             self._taken(frame, samples)
-        return self._finished(self._taken(view, samples), denoise)
+        return self._finished(self._taken(view, samples), smooth)
 
-    def _finished(self, channels: dict[str, np.ndarray], denoise: bool | None) -> dict[str, np.ndarray]:
-        denoise = self.denoise if denoise is None else denoise
-        return without_grain(channels, self.renderer) if denoise else channels
+    def _finished(self, channels: dict[str, np.ndarray], smooth: bool) -> dict[str, np.ndarray]:
+        if smooth:
+            return self.smoother(with_coverage(channels))
+        return without_grain(channels, self.renderer) if self.denoise else channels
 
     def _taken(self, view: View, samples: int | None) -> dict[str, np.ndarray]:
         return self.history.take(view, self.grainy(view, samples, self.history.number))
@@ -133,12 +136,20 @@ class Worker(BundleWorker):
 
 
 def without_grain(channels: dict[str, np.ndarray], renderer: BaseRenderer) -> dict[str, np.ndarray]:
-    """The channels with a denoised base image whose alpha is the coverage, which has no grain at silhouettes.
+    """`with_coverage`, denoised.
 
     Where no surface of the renderer's scene lets light straight through, the diffuse part has no grain but at edges,
-    and stays as it is: a denoiser would blur its textures. FRESH_CHANNELS hold the frame's own with its grain: the
-    network may take of it what a denoiser smooths away. The planes are changed in place: copies of them are half a
-    gigabyte of a 4K frame.
+    and stays as it is: a denoiser would blur its textures.
+    """
+    image = with_coverage(channels)
+    return image | denoised(image, diffuse=renderer.lets_through)
+
+
+def with_coverage(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The channels with a base image whose alpha is the coverage, which has no grain at silhouettes.
+
+    FRESH_CHANNELS hold the frame's own with its grain: the network may take of it what a denoiser smooths away. The
+    planes are changed in place: copies of them are half a gigabyte of a 4K frame.
     """
     alpha = channels["coverage"]
     share = alpha / np.maximum(channels["base.A"], LEAST_ALPHA)
@@ -146,8 +157,7 @@ def without_grain(channels: dict[str, np.ndarray], renderer: BaseRenderer) -> di
         if name in channels:
             channels[name] *= share
     own = dict(zip(FRESH_CHANNELS, (channels[name] for name in (*COLOUR[:3], "rays")), strict=True))
-    image = own | channels | {"base.A": alpha}
-    return image | denoised(image, diffuse=renderer.lets_through)
+    return own | channels | {"base.A": alpha}
 
 
 def denoised(channels: dict[str, np.ndarray], *, diffuse: bool = True) -> dict[str, np.ndarray]:

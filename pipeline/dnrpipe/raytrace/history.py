@@ -31,7 +31,7 @@ import numpy as np
 from dnrtrain.contract import FRESH_CHANNELS, View
 
 from .base_renderer import CHAIN
-from .recorded import Recorded
+from .recorded import Recorded, aligned
 from .sensors import opaque_camera
 
 MOST_DIFFUSE, MOST_MIRRORED, MOST_GLOSSY, MOST_UNEVEN = 3.0, 16.0, 3.0, 2.0
@@ -95,8 +95,8 @@ class History:
         mi, size, first = self.mi, (view.height, view.width), self.before is None
         if self.before is None or (self.before[0].height, self.before[0].width) != size:
             pixels = view.width * view.height
-            self.before = view, [mi.Float(_aligned([np.zeros(n * pixels)])) for n in (4, 4, 4, 4, 4, 4, 1)]
-        planes = mi.Float(_aligned([channels[name] for name in TAKEN]))
+            self.before = view, [mi.Float(aligned([np.zeros(n * pixels)])) for n in (4, 4, 4, 4, 4, 4, 1)]
+        planes = mi.Float(aligned([channels[name] for name in TAKEN]))
         earlier, memory = self.before
         resting = not first and view.c2w == earlier.c2w and view.intrinsics == earlier.intrinsics
         cameras = opaque_camera(mi, view), opaque_camera(mi, earlier)
@@ -236,19 +236,6 @@ PLACE, FACING, END, S, D, REST, SQUARES = range(7)
 """What a frame leaves behind: P and what the pixel's centre sees (SURFACE, RIM or 0); n, and 1 where the neighbours lie
 on the same surface; where the path ends, and R of S; S and the luminance of base; D and its R; albedo and alpha: four
 values a pixel, side by side, which are read at once. And the mean square of the luminance."""
-
-
-def _aligned(planes: list[np.ndarray]) -> np.ndarray:
-    """The planes one after the other, float32, at an address that is a multiple of 64.
-
-    Dr.Jit takes memory as it is, and records a kernel anew for memory that is aligned otherwise.
-    """
-    count = sum(plane.size for plane in planes)
-    buffer = np.empty(count + 16, np.float32)
-    start = -buffer.ctypes.data // 4 % 16
-    flat = buffer[start : start + count]
-    np.concatenate([plane.ravel() for plane in planes], out=flat)
-    return flat
 
 
 class _Picture:

@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
+import numpy as np
+
 from .lobes import media_of
 from .tasks import Costs, costs_since
 
@@ -108,3 +110,16 @@ def prepare_emitters(mi: Any, scene: Any) -> None:
     here = dr.zeros(mi.SurfaceInteraction3f)
     source, _ = scene.sample_emitter_direction(here, mi.Point2f(0.5), False)
     dr.eval(source, scene.pdf_emitter_direction(here, source))
+
+
+def aligned(planes: list[np.ndarray]) -> np.ndarray:
+    """The planes one after the other, float32, at an address that is a multiple of 64.
+
+    Dr.Jit takes memory as it is, and records a kernel anew for memory that is aligned otherwise.
+    """
+    count = sum(plane.size for plane in planes)
+    buffer = np.empty(count + 16, np.float32)
+    start = -buffer.ctypes.data // 4 % 16
+    flat = buffer[start : start + count]
+    np.concatenate([plane.ravel() for plane in planes], out=flat)
+    return flat

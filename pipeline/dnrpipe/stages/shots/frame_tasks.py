@@ -3,7 +3,7 @@
 Ways of rendering a frame (`Way`):
 
     path     path tracing and Open Image Denoise, with albedo and normals of clean primary rays
-    base     the base image, baked light and mirror-like paths, denoised or not
+    base     the base image, baked light and mirror-like paths, denoised or smoothed (`raytrace.smoothing`)
     neural   the same, denoised and corrected by the network
 
 Seconds are wall-clock, ``cpu_seconds`` of the process.
@@ -35,14 +35,14 @@ WayName = Literal["path", "base", "neural"]
 
 class Way(BaseModel):
     """How a frame is rendered. spp: samples per pixel of ``path``, rays per pixel of a base image. quality: of the
-    denoiser, of ``path``. denoise: of ``base``; the others always are."""
+    denoiser, of ``path``. smooth: ``base`` is smoothed, not denoised."""
 
     model_config = ConfigDict(frozen=True)
 
     name: WayName
     spp: int
     quality: Literal["balanced", "high"] = "high"
-    denoise: bool = True
+    smooth: bool = False
 
     @property
     def told(self) -> str:
@@ -52,7 +52,7 @@ class Way(BaseModel):
             return f"path tracing, {self.spp} samples, denoised{quickly}"
         if self.name == "neural":
             return f"neural renderer, {self.spp} rays"
-        return f"base images, {'denoised, ' if self.denoise else ''}{self.spp} rays"
+        return f"base images, {'smoothed' if self.smooth else 'denoised'}, {self.spp} rays"
 
 
 class FrameCommon(Task):

@@ -121,12 +121,11 @@ class Worker:
         if self.base is None:
             raise UserError(f"frame {task.view.name}: {task.way.told} need baked light")
         self.base.repaired = self.base.masked = 0
-        denoise = None if task.way.denoise else False
         if task.earlier is None:
-            channels = timed(ms, "base image", self.base.channels, task.view, task.way.spp, denoise=denoise)
+            channels = timed(ms, "base image", self.base.channels, task.view, task.way.spp, smooth=task.way.smooth)
         else:
             asked = (task.view, task.earlier, task.number, task.way.spp)
-            channels = timed(ms, "base image", self.base.remembered, *asked, denoise=denoise)
+            channels = timed(ms, "base image", self.base.remembered, *asked, smooth=task.way.smooth)
         lost = self.base.masked
         colours: list[np.ndarray] = []
         if task.way.name == "neural":

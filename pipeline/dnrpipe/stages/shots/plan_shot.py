@@ -26,11 +26,11 @@ from .renderers import Renderer, shipped_renderer
 
 FEWER = (4,)
 """Rays per pixel of base images that are tried beside the settings'."""
-RAW = (4, 8)
-"""The same of base images that are not denoised: that takes as long as three to eight rays do, and does less where most
-light comes straight from a sky or lies baked on matt surfaces."""
+SMOOTH = (4, 8)
+"""The same of base images that are smoothed instead of denoised: that takes as long as three to eight rays do, and does
+less where most light comes straight from a sky or lies baked on matt surfaces."""
 SAVED = 0.5
-"""Of a frame of STEADY samples, what a base image as good takes less where it is not denoised, give or take."""
+"""Of a frame of STEADY samples, what a base image as good takes less where it is smoothed, give or take."""
 DEEP, MOST_DEEP = 8, 0.02
 """Surfaces of a path beyond which light is no more that of matt surfaces, which reflect too little, but of glass behind
 glass; and the share of such light from which on baking does not pay. Base images follow glass as far as path tracing
@@ -87,13 +87,13 @@ def weigh(
     rays = run.settings.base.samples
     counts = [*(n for n in FEWER if n < rays), rays]
     ways = [Way(name="base" if wanted.way == "base" else "neural", spp=n) for n in counts]
-    raw = [] if wanted.way == "neural" else [Way(name="base", spp=n, denoise=False) for n in RAW]
+    smooth = [] if wanted.way == "neural" else [Way(name="base", spp=n, smooth=True) for n in SMOOTH]
     if run.kept is not None:
         run.kept.close()  # baking wants the memory
     renderer, trust = shipped_renderer(run, tracer.common.background, trust=1.0), 0.0
 
-    measured = pilot.measure(renderer, [*ways, *raw])
-    ours = sorted((found for found in measured if found.way.name == "base"), key=lambda found: found.way.denoise)
+    measured = pilot.measure(renderer, [*ways, *smooth])
+    ours = sorted((found for found in measured if found.way.name == "base"), key=lambda found: not found.way.smooth)
     if wanted.way != "base":
         trust, corrected = pilot.trusted(ways)
         run.console.say(_trust_told(trust))

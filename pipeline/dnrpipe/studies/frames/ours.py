@@ -21,27 +21,28 @@ from dnrtrain.model import render_views
 
 from ...core.errors import UserError
 from ...raytrace.base_renderer import CHAIN, BaseRenderer
-from ...raytrace.base_worker import without_grain
+from ...raytrace.base_worker import denoised, with_coverage
 from ...raytrace.history import History
 from ...raytrace.light_worker import read_light
 from ...raytrace.sensors import scaled_view
+from ...raytrace.smoothing import Smoother
 from ...stages.base_images import light_path
 from .scene import BenchScene, Clock
 
 TIMED = ("none", "baked")
 """Base images that this benchmark can render frame by frame."""
-NEURAL, BASE, GRAINY = "neural", "base image alone", "base image, not denoised"
+NEURAL, BASE, SMOOTH = "neural", "base image alone", "base image, smoothed"
 REMEMBERS = ", remembers"
 """Ends the names of frames that remember the ones before."""
 
 
 def is_own(name: str) -> bool:
     """Whether the renderer of that name is ours, and not path tracing."""
-    return name.startswith((NEURAL, BASE, GRAINY))
+    return name.startswith((NEURAL, BASE, SMOOTH))
 
 
 class Ours:
-    """The workspace's fine-tuned model on the CPU, its base image, and that before it is denoised.
+    """The workspace's fine-tuned model on the CPU, its base image, and that smoothed instead of denoised (`smoothing`).
 
     model is None, and frames have nothing neural, where the workspace has none: the base image alone is measured then.
     samples: rays per pixel of base images, each with the same model, whatever it was trained with; none: the
@@ -74,6 +75,7 @@ class Ours:
             gloss = not scene.settings.base.denoise
             self.renderer = BaseRenderer(scene.engine.mi, mitsuba_scene, read_light(light), gloss=gloss)
             counts = samples or (scene.settings.base.samples,)
+        self.smoother = Smoother(scene.engine.mi)
         self.histories = {count: History(scene.engine.mi) for count in counts}
 
     def begin(self) -> None:
@@ -87,7 +89,7 @@ class Ours:
             self._inputs(samples, view, clock, history)
 
     def frame(self, view: View, clock: Clock, *, remember: bool = False) -> dict[str, dict[str, Any]]:
-        """By NEURAL, BASE and GRAINY, and the rays per pixel: {"picture": display RGB over white [1, 3, H, W], "parts":
+        """By NEURAL, BASE and SMOOTH, and the rays per pixel: {"picture": display RGB over white [1, 3, H, W], "parts":
         {name: ms}}.
 
         remember: with what earlier such frames saw, since `begin`; only of baked light.
@@ -98,9 +100,11 @@ class Ours:
             rays = "" if samples is None else f", {samples} rays"
             rays += REMEMBERS if remember else ""
             if self.renderer is not None and self.scene.settings.base.denoise:
-                result[GRAINY + rays] = {"picture": self._picture(channels), "parts": dict(parts)}
-                # It changes the planes, which the history keeps no part of.
-                channels, parts["denoiser"] = clock.time(partial(without_grain, channels, self.renderer))
+                channels, parts["coverage"] = clock.time(partial(with_coverage, channels))
+                smooth, ms = clock.time(partial(self.smoother, channels))
+                result[SMOOTH + rays] = {"picture": self._picture(smooth), "parts": {**parts, "smoothing": ms}}
+                clean, parts["denoiser"] = clock.time(partial(denoised, channels, diffuse=self.renderer.lets_through))
+                channels |= clean
             if samples is not None:
                 result[BASE + rays] = {"picture": self._picture(channels), "parts": dict(parts)}
             if self.model is not None:
