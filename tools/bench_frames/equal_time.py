@@ -119,6 +119,6 @@ def _line(scene: Mapping[str, Any], figure: Figure = "psnr") -> list[Point]:
 
 
 def short(name: str) -> str:
-    """What a cell of a table has room for: "3 rays" of our frames, "base, 3 rays" where nothing is neural, "smoothed,
-    3 rays" where that took the denoiser's place."""
-    return name.replace(f"{BASE}, ", "base, ").replace(f"{SMOOTH}, ", "smoothed, ").removeprefix(f"{NEURAL}, ")
+    """What a cell of a table has room for: "3 rays" of our frames, "base, 3 rays" where nothing is neural, "smoothed, 3
+    rays" where that took the denoiser's place."""
+    return name.replace(f"{BASE}, ", "base, ").replace(f"{SMOOTH}, ", "base, smoothed, ").removeprefix(f"{NEURAL}, ")

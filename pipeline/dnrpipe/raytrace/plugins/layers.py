@@ -94,27 +94,31 @@ def register(mi: Any) -> None:
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
-            defaults = {"base_color": 0.8, "specular_tint": 1.0, "sheen_tint": 1.0, "coat_tint": 1.0}
-            scalars = {"roughness": 0.5, "metallic": 0.0, "coat": 0.0, "sheen": 0.0}
-            self.textures = {name: props.get_texture(name, value) for name, value in (defaults | scalars).items()}
-            self.has = {name: name in props for name in self.textures}
+            # What a material has none of, it does not hold: a replayed kernel looks through all of it at each call.
+            has_coat, has_sheen = "coat" in props, "sheen" in props
+            defaults = {"base_color": 0.8, "specular_tint": 1.0, "roughness": 0.5, "metallic": 0.0}
+            defaults |= {"coat": 0.0, "coat_tint": 1.0} if has_coat else {}
+            defaults |= {"sheen": 0.0, "sheen_tint": 1.0} if has_sheen else {}
+            self.textures = {name: props.get_texture(name, value) for name, value in defaults.items()}
             eta = max(float(props.get("eta", 1.5)), 1.0001)
             coat_eta = max(float(props.get("coat_eta", 1.5)), 1.0001)
             coat_roughness = float(props.get("coat_roughness", 0.03))
             sheen_roughness = float(props.get("sheen_roughness", 0.5))
             self.table = albedo_tables(eta)
-            self.coat_table = albedo_tables(coat_eta) if self.has["coat"] else None
+            self.coat_table = albedo_tables(coat_eta) if has_coat else None
             cosine = (np.arange(64) + 0.5) / 64
             albedo = sheen_albedo(sheen_roughness, cosine)[None]
-            self.sheen_table = table_of(mi, [albedo] * 3) if self.has["sheen"] else None
+            self.sheen_table = table_of(mi, [albedo] * 3) if has_sheen else None
             f0 = f0_of(eta)
             self.f0 = parameter(mi, f0)
             self.s_mean = parameter(mi, max((energy.average_fresnel(eta) - f0) / (1 - f0), 0.0))
-            self.coat_f0 = parameter(mi, f0_of(coat_eta))
-            self.coat_fss = parameter(mi, energy.average_fresnel(coat_eta))
-            self.eta, self.coat_eta = parameter(mi, eta), parameter(mi, coat_eta)
-            self.coat_roughness = parameter(mi, coat_roughness)
-            self.coat_alpha = parameter(mi, max(coat_roughness**2, MIN_ALPHA))
+            self.eta = parameter(mi, eta)
+            if has_coat:
+                self.coat_f0 = parameter(mi, f0_of(coat_eta))
+                self.coat_fss = parameter(mi, energy.average_fresnel(coat_eta))
+                self.coat_eta = parameter(mi, coat_eta)
+                self.coat_roughness = parameter(mi, coat_roughness)
+                self.coat_alpha = parameter(mi, max(coat_roughness**2, MIN_ALPHA))
             front = mi.BSDFFlags.FrontSide
             self.m_components = [
                 int(mi.BSDFFlags.DiffuseReflection | front),

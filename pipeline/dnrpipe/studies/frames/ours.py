@@ -32,13 +32,14 @@ from .scene import BenchScene, Clock
 TIMED = ("none", "baked")
 """Base images that this benchmark can render frame by frame."""
 NEURAL, BASE, SMOOTH = "neural", "base image alone", "base image, smoothed"
+NEURAL_SMOOTH = "smoothed, neural"
 REMEMBERS = ", remembers"
 """Ends the names of frames that remember the ones before."""
 
 
 def is_own(name: str) -> bool:
     """Whether the renderer of that name is ours, and not path tracing."""
-    return name.startswith((NEURAL, BASE, SMOOTH))
+    return name.startswith((NEURAL, BASE, SMOOTH, NEURAL_SMOOTH))
 
 
 class Ours:
@@ -89,8 +90,8 @@ class Ours:
             self._inputs(samples, view, clock, history)
 
     def frame(self, view: View, clock: Clock, *, remember: bool = False) -> dict[str, dict[str, Any]]:
-        """By NEURAL, BASE and SMOOTH, and the rays per pixel: {"picture": display RGB over white [1, 3, H, W], "parts":
-        {name: ms}}.
+        """By NEURAL, BASE, SMOOTH and NEURAL_SMOOTH, and the rays per pixel: {"picture": display RGB over white
+        [1, 3, H, W], "parts": {name: ms}}.
 
         remember: with what earlier such frames saw, since `begin`; only of baked light.
         """
@@ -103,15 +104,22 @@ class Ours:
                 channels, parts["coverage"] = clock.time(partial(with_coverage, channels))
                 smooth, ms = clock.time(partial(self.smoother, channels))
                 result[SMOOTH + rays] = {"picture": self._picture(smooth), "parts": {**parts, "smoothing": ms}}
+                if self.model is not None:
+                    result[NEURAL_SMOOTH + rays] = self._neural(view, smooth, {**parts, "smoothing": ms}, clock)
                 clean, parts["denoiser"] = clock.time(partial(denoised, channels, diffuse=self.renderer.lets_through))
                 channels |= clean
             if samples is not None:
                 result[BASE + rays] = {"picture": self._picture(channels), "parts": dict(parts)}
             if self.model is not None:
-                data = self._data(view, channels)
-                picture, parts["network"] = clock.time(partial(render_views, self.model, data))
-                result[NEURAL + rays] = {"picture": picture.float(), "parts": parts}
+                result[NEURAL + rays] = self._neural(view, channels, parts, clock)
         return result
+
+    def _neural(
+        self, view: View, channels: dict[str, np.ndarray], parts: dict[str, float], clock: Clock
+    ) -> dict[str, Any]:
+        data = self._data(view, channels)
+        picture, ms = clock.time(partial(render_views, self.model, data))
+        return {"picture": picture.float(), "parts": {**parts, "network": ms}}
 
     def _picture(self, channels: dict[str, np.ndarray]) -> Any:
         """A base image as it is displayed."""
