@@ -24,6 +24,7 @@ from dnrpipe.stages.shots.pilot import Measured, Pilot, _Process, _Window, best_
 from dnrpipe.stages.shots.plan_shot import (
     Shape,
     _no_baked_light,
+    _planned,
     baked_option,
     moving_way,
     path_option,
@@ -142,6 +143,19 @@ def test_without_baked_light_what_it_usually_has_is_enough() -> None:
     assert choose([flickers, some.model_copy(update={"lpips": 0.05}), more], Wanted(way="path"))[0] is more
     poor = path(8, 29.0, 0.05)
     assert choose([path(1, 22.0, 0.2), poor, path(64, 33.0, 0.04)], Wanted()) == (poor, "the best of up to 8 samples")
+
+
+def test_light_is_to_be_paid_by_all_frames_that_are_planned() -> None:
+    """Also by those that are rendered another day; never by fewer than those of today."""
+    shape = Shape(still=40, moving=8, pixels=1, convert=0.0)
+    assert [_planned(shape, Wanted(frames=frames)) for frames in (None, 240, 10)] == [40, 200, 40]
+    assert Wanted(frames=240).aimless
+
+
+def test_ways_are_told_apart() -> None:
+    ways = [Way(name="base", spp=8, smooth=smooth) for smooth in (False, True)]
+    assert [way.told for way in ways] == ["base images, denoised, 8 rays", "base images, smoothed, 8 rays"]
+    assert len({way.model_dump_json() for way in ways}) == 2
 
 
 def test_a_shot_without_aim_wants_no_time_no_quality_and_no_baked_light() -> None:
