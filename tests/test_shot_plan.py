@@ -120,6 +120,16 @@ def test_as_few_rays_as_cost_next_to_nothing() -> None:
     assert choose([few, smeared, most], Wanted())[0] is most, "PSNR alone is not enough"
 
 
+def test_baked_light_that_is_worse_than_good_path_tracing_is_not_taken() -> None:
+    """Where it was baked to save time."""
+    steady, baked = option("path", 100, 35.0, 0.02, spp=4), option("base", 30, 31.0, 0.06, spp=8)
+    assert choose([steady, baked], Wanted()) == (steady, "baked light is worse here")
+    as_good = baked.model_copy(update={"psnr": 34.6, "lpips": 0.021})
+    assert choose([steady, as_good], Wanted())[0] is as_good
+    poor = steady.model_copy(update={"psnr": 30.0, "lpips": 0.05})
+    assert choose([poor, baked.model_copy(update={"psnr": 29.0})], Wanted())[0].way.name == "base", "not good itself"
+
+
 def test_rungs_between_and_beyond_those_measured() -> None:
     low = Measured(Way(name="path", spp=4), pixel=1.0, start=2.0, psnr=30.0, lpips=0.1)
     high = Measured(Way(name="path", spp=16), pixel=4.0, start=1.0, psnr=34.0, lpips=0.025)

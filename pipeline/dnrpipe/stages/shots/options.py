@@ -116,8 +116,12 @@ def choose(options: Sequence[Option], wanted: Wanted) -> tuple[Option, str]:
     best = max(baked, key=quality)
     lpips = None if best.lpips is None else best.lpips * NEAR[1]
     aim = min((own for own in baked if own.reaches(quality(best) - NEAR[0], lpips)), key=lambda own: own.seconds)
+    steady = next((o for o in options if o.way.name == "path" and o.way.spp == STEADY and o.reaches(*USUAL)), None)
+    if steady is not None:  # good already: light was baked to save time, not to have less than that
+        lpips = None if steady.lpips is None else steady.lpips * NEAR[1]
+        aim = aim if aim.reaches(quality(steady) - NEAR[0], lpips) else steady
     enough = [option for option in options if option.reaches(aim.psnr, aim.lpips)]
     found = min(enough, key=lambda option: option.seconds)
     if found is aim:
-        return aim, "nothing cheaper has its quality"
+        return aim, "nothing cheaper has its quality" if aim in baked else "baked light is worse here"
     return found, f"it has the quality of the {aim.told}, and is cheaper here"
