@@ -389,7 +389,8 @@ def _table(machine: str, rows: Sequence[dict[str, Any]]) -> str:
     for row in rows:
         own, rung = row["ours"], equal_rung(row, ("psnr", "lpips"))
         ours = row["before"] + REEL * row["frame"]
-        way = f"{row['chosen']['way']['name']} {row['chosen']['way']['spp']}"
+        chosen = row["chosen"]["way"]
+        way = f"{chosen['name']}{', smoothed,' if chosen.get('smooth') else ''} {chosen['spp']}"
         cells = [row["scene"], row["size"], way, f"{row['before']:.0f}", f"{row['frame']:.2f}"]
         cells += [f"{own['psnr']:.2f}", f"{own['lpips']:.4f}", f"{own['flip']:.4f}", f"{own['flicker']:.4f}"]
         if rung is None:
