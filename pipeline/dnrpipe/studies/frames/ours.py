@@ -117,6 +117,7 @@ class Ours:
     def _neural(
         self, view: View, channels: dict[str, np.ndarray], parts: dict[str, float], clock: Clock
     ) -> dict[str, Any]:
+        assert self.model is not None
         data = self._data(view, channels)
         picture, ms = clock.time(partial(render_views, self.model, data))
         return {"picture": picture.float(), "parts": {**parts, "network": ms}}
