@@ -73,7 +73,7 @@ class Worker(BundleWorker):
         channels = self.grainy(view, samples)
         if isinstance(self.common, SampledCommon):
             return channels | self._traced(self.common, view, channels)
-        return self._finished(channels, smooth)
+        return self.finished(channels, smooth)
 
     def grainy(self, view: View, samples: int | None = None, number: int = 0) -> dict[str, np.ndarray]:
         """`channels` by the kernel alone: not denoised, not path-traced. number: see `BaseRenderer.frame`."""
@@ -106,9 +106,10 @@ class Worker(BundleWorker):
         self.seen = way
         for frame, *_ in way[known:-1]:
             self._taken(frame, samples)
-        return self._finished(self._taken(view, samples), smooth)
+        return self.finished(self._taken(view, samples), smooth)
 
-    def _finished(self, channels: dict[str, np.ndarray], smooth: bool) -> dict[str, np.ndarray]:
+    def finished(self, channels: dict[str, np.ndarray], smooth: bool) -> dict[str, np.ndarray]:
+        """Channels of `grainy`, smoothed, or denoised where the workspace's are; they are changed in place."""
         if smooth:
             return self.smoother(with_coverage(channels))
         return without_grain(channels, self.renderer) if self.denoise else channels

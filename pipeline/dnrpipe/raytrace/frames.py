@@ -306,8 +306,7 @@ def pinhole(mi: Any, camera: Camera, pixel: Any, offset: Any) -> Any:
 def seen_first(mi: Any, scene: Any) -> Any:
     """Function (scene, ray, sampler) -> what the pixel shows there first.
 
-    Lamps are passed, and what surfaces let straight through is passed with its probability; where there are no such
-    surfaces, the sampler may be None.
+    Lamps are passed, and what surfaces let straight through is passed with its probability.
     """
     import drjit as dr
 

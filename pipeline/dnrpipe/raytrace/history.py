@@ -31,6 +31,7 @@ import numpy as np
 from dnrtrain.contract import FRESH_CHANNELS, View
 
 from .base_renderer import CHAIN
+from .neighbours import Pixels
 from .recorded import Recorded, aligned
 from .sensors import opaque_camera
 
@@ -238,21 +239,8 @@ on the same surface; where the path ends, and R of S; S and the luminance of bas
 values a pixel, side by side, which are read at once. And the mean square of the luminance."""
 
 
-class _Picture:
-    """Pixels of a frame and their neighbours; beyond the border the last pixel continues."""
-
-    def __init__(self, mi: Any, width: int, height: int) -> None:
-        import drjit as dr
-
-        self.mi, self.width, self.height = mi, width, height
-        self.pixel = dr.arange(mi.UInt32, width * height)
-        self.x, self.y = mi.Int32(self.pixel % width), mi.Int32(self.pixel // width)
-
-    def index(self, right: int, below: int) -> Any:
-        """Of the neighbours so far away."""
-        import drjit as dr
-
-        return dr.clip(self.y + below, 0, self.height - 1) * self.width + dr.clip(self.x + right, 0, self.width - 1)
+class _Picture(Pixels):
+    """What a frame shows at its pixels and about them."""
 
     def seen(self, camera: Any, planes: list[Any]) -> _Seen:
         """What the frame sees. planes: of TAKEN."""

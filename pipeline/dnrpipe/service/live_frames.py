@@ -27,7 +27,6 @@ from dnrpipe.core.errors import UserError
 from dnrpipe.core.images import eight_bit, flip_error, over_white, picture_of, rgba
 from dnrpipe.core.settings import Settings
 from dnrpipe.raytrace.base_worker import Worker as BaseWorker
-from dnrpipe.raytrace.base_worker import with_coverage, without_grain
 from dnrpipe.raytrace.engine import Engine, masked, masked_channels
 from dnrpipe.raytrace.frames import Frames
 from dnrpipe.raytrace.history import History
@@ -94,10 +93,8 @@ class Worker:
                 channels = timed(ms, "history", self.history.take, view, channels)
                 rays = int(channels["rays"].max())
             if self.base is not None and self.base.denoise and mode in REMEMBERED:
-                if task["fine"]:
-                    channels = timed(ms, "denoiser", without_grain, channels, self.base.renderer)
-                else:  # most of what the denoiser does, in a tenth of its time, which goes into rays and pixels
-                    channels = timed(ms, "smoothing", self.base.smoother, with_coverage(channels))
+                smooth = not task["fine"]  # the denoiser's time goes into rays and pixels of what moves
+                channels = timed(ms, "smoothing" if smooth else "denoiser", self.base.finished, channels, smooth)
             if mode in ("neural", "error"):
                 picture = timed(ms, "network", self._neural, view, channels)
             else:

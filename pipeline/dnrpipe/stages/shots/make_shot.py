@@ -76,7 +76,7 @@ def plan_shot(session: Session, shot: Shot, kept: KeptWorker) -> ShotPlan:
     kept: what renders them.
     """
     started = time.monotonic()
-    choose_light(session, shot.frames, shot.wanted.frames)
+    choose_light(session, shot.frames, shot.wanted.planned(len(shot.frames)))
     run = _run(session, kept)
     tracer, path = path_tracer(run, shot.background), folder_of(run, shot) / PLAN
     lpips = lpips_of(run)
@@ -112,13 +112,13 @@ def plan_shot(session: Session, shot: Shot, kept: KeptWorker) -> ShotPlan:
 
 
 def choose_light(session: Session, frames: Sequence[ShotFrame], planned: int | None = None) -> None:
-    """Choose what no setting says of the light map (`shot_light`). planned: frames to plan for, if more than these.
+    """Choose what no setting says of the light map (`shot_light`). planned: frames, of which
+    these are some; None: these alone.
 
     The choice is not remembered as flags are: the next shot has other frames.
     """
     pixels = sum(frame.view.width * frame.view.height for frame in frames if not frame.moving)
-    pixels = pixels * max(planned or 0, len(frames)) // len(frames)
-    session.settings = shot_light(session.run.for_stage("render"), pixels)
+    session.settings = shot_light(session.run.for_stage("render"), pixels * (planned or len(frames)) // len(frames))
 
 
 def shot_light(run: Run, pixels: int) -> Settings:

@@ -39,6 +39,10 @@ class Wanted(BaseModel):
     way: str | None = None
     frames: int | None = None
 
+    def planned(self, here: int) -> int:
+        """Frames to plan for, of a shot of so many."""
+        return max(self.frames or 0, here)
+
     @property
     def aimless(self) -> bool:
         """Neither a time nor a quality is wanted, nor baked light."""
@@ -113,13 +117,15 @@ def choose(options: Sequence[Option], wanted: Wanted) -> tuple[Option, str]:
             few = [option for option in options if option.way.spp <= PATIENCE]
             return max(few or options, key=quality), f"the best of up to {PATIENCE} samples"
         return min(enough, key=lambda option: option.seconds), "as good as baked light usually is"
+
+    def is_near(option: Option, other: Option) -> bool:
+        return option.reaches(quality(other) - NEAR[0], None if other.lpips is None else other.lpips * NEAR[1])
+
     best = max(baked, key=quality)
-    lpips = None if best.lpips is None else best.lpips * NEAR[1]
-    aim = min((own for own in baked if own.reaches(quality(best) - NEAR[0], lpips)), key=lambda own: own.seconds)
+    aim = min((own for own in baked if is_near(own, best)), key=lambda own: own.seconds)
     steady = next((o for o in options if o.way.name == "path" and o.way.spp == STEADY and o.reaches(*USUAL)), None)
-    if steady is not None:  # good already: light was baked to save time, not to have less than that
-        lpips = None if steady.lpips is None else steady.lpips * NEAR[1]
-        aim = aim if aim.reaches(quality(steady) - NEAR[0], lpips) else steady
+    if steady is not None and not is_near(aim, steady):
+        aim = steady  # good already: light was baked to save time, not to have less than that
     enough = [option for option in options if option.reaches(aim.psnr, aim.lpips)]
     found = min(enough, key=lambda option: option.seconds)
     if found is aim:

@@ -238,7 +238,7 @@ def _baking_seconds(run: Run, traced: Measured) -> float:
 def _planned(shape: Shape, wanted: Wanted) -> int:
     """Frames that stand still, of all that are to be planned for."""
     here = shape.still + shape.moving
-    return max(shape.still, round(shape.still * (wanted.frames or here) / here))
+    return round(shape.still * wanted.planned(here) / here)
 
 
 def _trust_told(share: float) -> str:
