@@ -4,7 +4,8 @@ A part stands between ``<!-- rows -->`` or ``<!-- KIND FILE -->``, FILE in docs/
 Kinds: results (of `dnrpipe ablate`), frames (of tools.bench_frames), noise (of tools.bench_noise),
 frontier (of `dnrpipe frontier`), plan-check (of tools.plan_check), selection (of `dnrpipe bench-select`),
 selections (of several of its runs together: FILE,FILE), plan-equal (of tools.plan_equal),
-untrained (of tools.bench_untrained), device (of tools.bench_device), scaling (of tools.bench_ray).
+untrained (of tools.bench_untrained), device (of tools.bench_device), scaling (of tools.bench_ray),
+evaluations (of tools.evaluations).
 
 python -m tools.result_tables [--check] docs/ablation.md docs/*.md
 """
@@ -24,6 +25,7 @@ from tools.bench_noise.document import markdown as noise_markdown
 from tools.bench_ray import markdown as scaling_markdown
 from tools.bench_shots import markdown as shots_markdown
 from tools.bench_untrained import markdown as untrained_markdown
+from tools.evaluations import markdown as evaluations_markdown
 from tools.plan_check import markdown as check_markdown
 from tools.plan_equal import markdown as equal_markdown
 
@@ -36,7 +38,9 @@ from dnrpipe.studies.selectbench.bench_tables import markdown as selection_markd
 from dnrpipe.studies.selectbench.bench_tables import read_results as selection_results
 from dnrpipe.studies.selectbench.bench_tables import together as selections_markdown
 
-KINDS = "rows|device|results|frames|noise|frontier|plan-check|plan-equal|selections?|untrained|scaling|shots"
+KINDS = (
+    "rows|device|results|frames|noise|frontier|plan-check|plan-equal|selections?|untrained|scaling|shots|evaluations"
+)
 PART = re.compile(rf"(<!-- ({KINDS})(?: (\S+))? -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -80,6 +84,7 @@ OF_JSON: dict[str, Callable[[Any], str]] = {
     "shots": shots_markdown,
     "untrained": untrained_markdown,
     "scaling": scaling_markdown,
+    "evaluations": evaluations_markdown,
     "plan-equal": equal_markdown,
     "plan-check": check_markdown,
 }

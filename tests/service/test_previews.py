@@ -105,6 +105,22 @@ def test_first_of_all(server: Server, trained: str) -> None:
     assert not (workspace / "base" / "test").exists()
 
 
+def test_of_a_renderer_without_base_images(server: Server, trained: str) -> None:
+    """As the preset ``paper`` has: the picture is made of the pass files."""
+    from dnrpipe.core.console import Console
+    from dnrpipe.core.settings import resolve
+    from dnrpipe.core.workspace import Workspace
+    from dnrpipe.stages.finetune import LivePicture
+    from dnrpipe.stages.stage import Run
+
+    workspace = Workspace.open(copy_of(server, trained, "painted"))
+    settings = resolve("draft", {"model": {"base": "none", "output": "display", "filter": 0}}, environment={})
+    training: Any = SimpleNamespace(size=(64, 64))  # a training view would be asked for by `subset`
+    picture = LivePicture(Run(workspace, settings, Console()), training)
+    assert picture.preview is not None and picture.split == "test"
+    assert not (workspace.preview / "base").exists()
+
+
 def test_a_damaged_reference_costs_the_view_not_the_training(server: Server, trained: str) -> None:
     """It is evaluation's to repair; meanwhile a training view is shown, which is said."""
     workspace = copy_of(server, trained, "dented")

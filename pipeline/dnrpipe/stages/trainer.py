@@ -38,12 +38,12 @@ def load(
 
     Args:
         raw: ray-traced targets before the denoiser.
-        base_files: where rendered ones lie, instead of ``base/<split>``.
+        base_files: where those that are rendered lie, instead of ``base/<split>``.
     """
     from dnrtrain.dataset import load_views
 
-    if base in RENDERED:
-        base_files = base_files or [base_path(workspace, split, view.name) for view in views]
+    rendered = base_files or [base_path(workspace, split, view.name) for view in views]
+    base_files = rendered if base in RENDERED else None
     return load_views(
         base_files or [workspace.passes(split, view.name) for view in views],
         [workspace.raytraced(split, view.name) for view in views] if raytraced else None,
