@@ -26,7 +26,7 @@ import numpy as np
 
 from .engine import masked_channels
 from .lightmap import light_texture
-from .recorded import Recorded, prepare_emitters
+from .recorded import Recorded, planes_of, prepare_emitters
 from .sensors import Camera, opaque_camera
 from .sequence import GOLDEN, ORDER, TILE, fraction
 
@@ -96,7 +96,7 @@ class BaseRenderer:
         shape = (view.height, view.width)
         bands = -(-view.height // max(1, MAX_RAYS // (view.width * samples)))
         rows = -(-view.height // bands)
-        channels = {name: np.empty(shape, np.float32) for name in names}
+        channels: dict[str, np.ndarray] = {}
         for first in range(0, view.height, rows):
             # All bands have the same height, for which the kernel is recorded: the last one ends with the picture.
             first = min(first, view.height - rows)
@@ -104,12 +104,16 @@ class BaseRenderer:
             size = view.width, rows, samples
             values = self.kernel(self.scene, self.light, self.tables, camera, rays, turn, start, *size)
             dr.eval(values)
-            for plane, value in zip(channels.values(), values, strict=True):
-                plane[first : first + rows] = np.array(value).reshape(rows, view.width)
+            band = dict(zip(names, planes_of(values, (rows, view.width)), strict=True))
+            if bands == 1:
+                channels = band
+                continue
+            for name, plane in band.items():
+                channels.setdefault(name, np.empty(shape, np.float32))[first : first + rows] = plane
         self.repaired = int(np.count_nonzero(channels.pop(LOST)))
         channels, self.masked = masked_channels(channels)
         for name in (*GBUFFER, *CHAIN):
-            channels[name] = channels[name] * channels["mask"]
+            channels[name] *= channels["mask"]
         rays = np.full(shape, samples, np.float32)
         return channels | {"coverage": np.minimum(channels["base.A"], 1), "rays": rays}
 

@@ -81,7 +81,7 @@ class Worker(BundleWorker):
         channels = renderer.frame(scaled, samples or self.common.samples, number)
         self.repaired, self.masked = self.repaired + renderer.repaired, self.masked + renderer.masked
         for name in ("depth.Z", *CHAIN):
-            channels[name] = channels[name] / self.engine.unit_scale
+            channels[name] /= self.engine.unit_scale
         channels["coverage"] = self._frames(view).coverage(view, channels["mask"] > 0.5, alpha=channels["base.A"])
         return channels
 

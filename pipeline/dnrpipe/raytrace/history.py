@@ -32,7 +32,7 @@ from dnrtrain.contract import FRESH_CHANNELS, View
 
 from .base_renderer import CHAIN
 from .neighbours import Pixels
-from .recorded import Recorded, aligned
+from .recorded import Recorded, aligned, planes_of
 from .sensors import opaque_camera
 
 MOST_DIFFUSE, MOST_MIRRORED, MOST_GLOSSY, MOST_UNEVEN = 3.0, 16.0, 3.0, 2.0
@@ -103,7 +103,7 @@ class History:
         cameras = opaque_camera(mi, view), opaque_camera(mi, earlier)
         given, memory = self.kernel(planes, memory, *cameras, view.width, view.height, resting)
         self.before, self.number = (view, memory), self.number + 1
-        found = {name: np.array(values).reshape(size) for name, values in zip(GIVEN, given, strict=True)}
+        found = dict(zip(GIVEN, planes_of(given, size), strict=True))
         share = found["base.A"] / np.maximum(channels["base.A"], LEAST_ALPHA)
         own = [*(channels[f"base.{c}"] * share for c in "RGB"), channels["rays"]]
         return {**channels, **found, **dict(zip(FRESH_CHANNELS, own, strict=True))}

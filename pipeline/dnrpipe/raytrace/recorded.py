@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
@@ -110,6 +110,21 @@ def prepare_emitters(mi: Any, scene: Any) -> None:
     here = dr.zeros(mi.SurfaceInteraction3f)
     source, _ = scene.sample_emitter_direction(here, mi.Point2f(0.5), False)
     dr.eval(source, scene.pdf_emitter_direction(here, source))
+
+
+def planes_of(values: Sequence[Any], shape: tuple[int, int]) -> list[np.ndarray]:
+    """Evaluated Dr.Jit arrays that nothing else reads as planes [H, W] that may be written to.
+
+    On a CPU they are Dr.Jit's memory: fresh planes would cost more, for the pages that they begin, than what is done to
+    them afterwards. Of arrays that share theirs all but one are copies.
+    """
+    found, known = [], set()
+    for value in values:
+        plane = value.numpy().reshape(shape)
+        shared = plane.ctypes.data in known or not plane.flags.writeable
+        known.add(plane.ctypes.data)
+        found.append(plane.copy() if shared else plane)
+    return found
 
 
 def aligned(planes: list[np.ndarray]) -> np.ndarray:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from .neighbours import Pixels
-from .recorded import Recorded, aligned
+from .recorded import Recorded, aligned, planes_of
 
 LOOSE = 1.5
 """Standard deviations of a pixel's mean within which a neighbour shows the same. Measured with four and eight rays,
@@ -49,8 +49,7 @@ class Smoother:
         height, width = channels["mask"].shape
         planes = self.mi.Float(aligned([channels[name] for name in TAKEN]))
         found = self.kernel(planes, width, height)
-        smooth = zip(TAKEN[:3], found, strict=True)
-        return {**channels, **{name: np.array(values).reshape(height, width) for name, values in smooth}}
+        return {**channels, **dict(zip(TAKEN[:3], planes_of(found, (height, width)), strict=True))}
 
     def _kernel(self, taken: Any, width: int, height: int) -> list[Any]:
         """Base image [3][height * width]. Recorded once for a size. taken: planes of TAKEN one after the other."""

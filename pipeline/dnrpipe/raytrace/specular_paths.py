@@ -41,7 +41,9 @@ LEAST_THROUGHPUT, LEAST_BY_CHANCE = 1e-2, 1e-3
 1.4 times as long for 0.03 dB behind the corrector (`drums`: 0.2 dB). The second is of paths from surfaces, which chance
 ends anyway."""
 LEAST_RHO = 0.05
-"""Diffuse reflectance from which a surface ends a chain."""
+"""Diffuse reflectance from which a surface ends a chain, and a path behind a wide lobe."""
+COAT = 0.09
+"""Mean reflectance of a dielectric's surface for diffuse light (Fresnel, index 1.5)."""
 NARROW = 1000.0
 """Density of a direction from which a lobe shows a sharp picture of what it reflects: GGX of roughness 0.1."""
 FAR = 1e6
@@ -117,6 +119,7 @@ class SpecularPaths:
         vertex = mi.UInt32(0)
         straight = mi.Bool(every)  # nothing has turned the ray yet
         unforked = mi.Bool(every)  # no glass yet
+        wide = mi.Bool(False)  # a lobe on the way blurs what is seen
         prev_rough = mi.Bool(False)  # S said what the lobe before sees of surfaces: only emitters count
 
         # ------------------- Multiple importance sampling ---------------------
@@ -151,18 +154,26 @@ class SpecularPaths:
             emission, mis = self._emission(scene, si, prev_si, prev_pdf, prev_sampled, shows)
             here = dr.select(shows, throughput * mis * emission, 0)
 
+            # ---------------------- The surface by itself ---------------------
+            # What a wide lobe shows of a coat is about what it would show of as much diffuse reflectance: measured,
+            # the same picture within 0.1 dB, for 4 to 11 % less time.
+            met = going & ~prev_rough & si.is_valid()
+            rho, opaque, coat = dr.dispatch(bsdf, self._looks, si, met)
+            ended = met & wide & (coat >= 0) & (opaque == 1) & (mean_of(rho) > LEAST_RHO)
+            rho = dr.select(ended, rho + coat, rho)
+            further = met & ~ended
+
             # ----------------------- Towards an emitter -----------------------
             # Once a path: measured, further vertices cost more than they bring.
-            met = going & ~prev_rough & si.is_valid()
-            splits = met & ~is_among(mi, bsdf, self.unsplit)
+            splits = further & ~is_among(mi, bsdf, self.unsplit)
             rough = self._is_rough(bsdf, si, splits)
             glossy = splits & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) & (~emitters_sampled | rough)
             source, emitted = self._towards_emitter(scene, si, u, glossy)
+            value, bsdf_pdf = dr.dispatch(bsdf, self._lit, si, si.to_local(source.d), glossy)
 
             # ---------------------- What the surface does ---------------------
-            towards = si.to_local(source.d)
-            found = dr.dispatch(bsdf, self._scattered, si, towards, u, order, unforked, met)
-            rho, opaque, (value, bsdf_pdf), (bsdf_sample, bsdf_weight), onwards, forked = found
+            found = dr.dispatch(bsdf, self._scattered, si, u, order, unforked, further)
+            (bsdf_sample, bsdf_weight), onwards, forked = found
 
             # --------------------------- Baked light --------------------------
             baked, around, place = self._baked(light, si, met)
@@ -222,7 +233,10 @@ class SpecularPaths:
             prev_rough = rough
             straight &= passed | (null & onwards)
             unforked &= ~forked
-            mirrored &= ~onwards | null | delta | (bsdf_sample.pdf > NARROW)
+            sharp = ~onwards | null | delta | (bsdf_sample.pdf > NARROW)
+            mirrored &= sharp
+            if dr.hint(self.camera, mode="scalar"):
+                wide |= ~sharp
             active = passed | (alive & (vertex < MAX_VERTICES))
             vertex += 1
 
@@ -294,29 +308,37 @@ class SpecularPaths:
             return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0.0)
         return scene.sample_emitter_direction(si, mi.Point2f(u[3], u[4]), True, active)
 
-    def _scattered(
-        self, bsdf: Any, si: Any, towards: Any, u: list[Any], place: Any, unforked: Any, active: Any
-    ) -> tuple[Any, ...]:
-        """What one BSDF does: all at once, so that what its lobes have in common is computed once.
+    def _looks(self, bsdf: Any, si: Any, active: Any) -> tuple[Any, Any, Any]:
+        """(rho, the share of light that does not pass straight on, what a coat adds to rho for a wide lobe that sees
+        the surface; negative: it lets light through, and a path goes on)."""
+        flags, kinds = bsdf.flags(), mi.BSDFFlags
+        rho = reflectance(mi, bsdf, self.diffuse, si, active, self.translucent)
+        passes = mi.has_flag(flags, kinds.Null)
+        opaque = 1 - mean_of(bsdf.eval_null_transmission(si, active)) if passes else mi.Float(1)
+        if mi.has_flag(flags, kinds.DeltaTransmission) or mi.has_flag(flags, kinds.GlossyTransmission):
+            return rho, opaque, mi.Float(-1)
+        coated = mi.has_flag(flags, kinds.GlossyReflection) or mi.has_flag(flags, kinds.DeltaReflection)
+        return rho, opaque, mi.Float(COAT if coated else 0)
+
+    def _lit(self, bsdf: Any, si: Any, towards: Any, active: Any) -> tuple[Any, Any]:
+        """(value, density) of the glossy lobes for the direction ``towards`` an emitter, local."""
+        if not self.has_emitters or not mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy):
+            return mi.Spectrum(0.0), mi.Float(0)
+        return bsdf.eval_pdf(self.glossy, si, towards, active)
+
+    def _scattered(self, bsdf: Any, si: Any, u: list[Any], place: Any, unforked: Any, active: Any) -> tuple[Any, ...]:
+        """Where paths go on at one BSDF.
 
         Args:
-            towards: the emitter, local.
             place: the samples' places in the sequence, in [0, 1).
             unforked: paths that have met no glass yet.
 
         Returns:
-            rho, the share of light that does not pass straight on, (value, density) of the glossy lobes for
-            ``towards``, (where paths go on, its weight), which go on, which were split by glass.
+            (where paths go on, its weight), which go on, which were split by glass.
         """
         flags, number, direction = bsdf.flags(), u[2], mi.Point2f(u[0], u[1])
-        passes = mi.has_flag(flags, mi.BSDFFlags.Null)
-        rho = reflectance(mi, bsdf, self.diffuse, si, active, self.translucent)
-        opaque = 1 - mean_of(bsdf.eval_null_transmission(si, active)) if passes else mi.Float(1)
-        lit = mi.Spectrum(0.0), mi.Float(0)
         on, weight, onwards, forked = dr.zeros(mi.BSDFSample3f), mi.Spectrum(0.0), mi.Bool(False), mi.Bool(False)
         if not any(bsdf is other for other in self.unsplit):
-            if self.has_emitters and mi.has_flag(flags, mi.BSDFFlags.Glossy):
-                lit = bsdf.eval_pdf(self.glossy, si, towards, active)
             on, weight = bsdf.sample(self.not_diffuse, si, number, direction, active)
             onwards = mi.Bool(active)
             if self.has_glass and mirrors_and_refracts(mi, flags):
@@ -327,10 +349,10 @@ class SpecularPaths:
                 side = dr.select(mirrors, mirrored, refracted)
                 split = dr.select(mirrors, mirrored_weight / MIRRORED, refracted_weight / (1 - MIRRORED))
                 on, weight = dr.select(forked, side, on), dr.select(forked, split, weight)
-        elif passes:
+        elif mi.has_flag(flags, mi.BSDFFlags.Null):
             on, share = bsdf.sample(self.null, si, number, direction, active)
             onwards, weight = active & (u[3] < dr.max(share)), mi.Spectrum(1.0)
-        return rho, opaque, lit, (on, weight), onwards, forked
+        return (on, weight), onwards, forked
 
 
 def _atlas_place(shape: Any, si: Any, active: Any) -> Any:

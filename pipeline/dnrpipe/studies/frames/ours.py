@@ -141,7 +141,8 @@ class Ours:
         channels, ms = clock.time(partial(self.renderer.frame, scaled_view(view, scale), samples, number))
         mask, alpha = channels["mask"] > 0.5, channels["base.A"]
         coverage, finer = clock.time(partial(self.scene.frames.coverage, view, mask, alpha=alpha))
-        channels |= {name: channels[name] / scale for name in ("depth.Z", *CHAIN)}
+        for name in ("depth.Z", *CHAIN):
+            channels[name] /= scale
         parts = {"base image and G-buffer": ms, "silhouettes": finer}
         if history is not None:
             channels, parts["history"] = clock.time(partial(history.take, view, channels))
