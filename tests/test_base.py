@@ -21,6 +21,7 @@ from dnrpipe.raytrace.engine import Engine
 from dnrpipe.raytrace.history import History
 from dnrpipe.raytrace.lightmap import LightBaker
 from dnrpipe.raytrace.lobes import diffuse_context
+from dnrpipe.raytrace.recorded import planes_of
 from dnrpipe.raytrace.second_targets import second_targets
 from dnrpipe.raytrace.sensors import sensor_dict
 from dnrpipe.raytrace.surface_maps import SurfaceMapper
@@ -401,6 +402,36 @@ def test_rough_metal_shows_what_its_lobe_sees_of_the_wall_without_grain(tmp_path
     assert baked[1, 0, 4:12, 4:12, 1].mean() > 3 * baked[1, 0, 4:12, 4:12, 0].mean()  # it is green
     rough = np.abs(np.diff(ours[..., 1], axis=1))[near[:, 1:] & near[:, :-1]].mean()
     assert rough < 0.06 * ours[near, 1].mean()
+
+
+@pytest.mark.parametrize(("opacity", "within"), [(1.0, 0.03), (0.4, 0.05)])
+def test_brushed_metal_shows_coated_walls_as_bright_as_they_are(tmp_path: Path, opacity: float, within: float) -> None:
+    """Behind its wide lobe the wall's coat counts as diffuse; where the wall lets light through, paths go on."""
+    metal = {"type": "dnr_principled", "base_color": rgb(0.9, 0.9, 0.9), "metallic": 1.0, "roughness": 0.35}
+    wall = {"type": "twosided", "b": {"type": "dnr_principled", "base_color": rgb(0.4, 0.1, 0.1), "roughness": 0.3}}
+    if opacity < 1:
+        wall = {"type": "mask", "opacity": opacity, "b": wall}
+    sky = {"type": "constant", "radiance": rgb(1, 1, 1)}
+    scene = corner_room(tmp_path, {"type": "twosided", "b": metal}, wall, sky)
+    baked = LightBaker(mi, scene, onwards()).bake(64, 256, 0)
+    renderer = BaseRenderer(mi, scene, baked, gloss=False)
+    channels, truth = renderer.frame(camera(0.0), 32), traced(scene, camera(0.0))
+    near = (channels["uv.V"] > 0.3) & (channels["uv.U"] < 0.5) & (truth[..., 3] > 0.99)
+    assert near.sum() > 50
+    ours, theirs = colour(channels)[near, :3].mean(axis=0), truth[near, :3].mean(axis=0)
+    np.testing.assert_allclose(ours, theirs, rtol=within)
+    assert theirs[0] > 1.1 * theirs[1]  # the red wall is what is seen
+
+
+def test_planes_are_memory_that_may_be_written_to() -> None:
+    """Two names of one array get a plane each."""
+    first, second = mi.Float(np.arange(6, dtype=np.float32)), mi.Float(np.ones(6, np.float32))
+    planes = planes_of([first, second, first], (2, 3))
+    planes[0] += 1
+    planes[1] *= 3
+    np.testing.assert_array_equal(planes[2], [[0, 1, 2], [3, 4, 5]])
+    np.testing.assert_array_equal(planes[0] - planes[2], np.ones((2, 3)))
+    np.testing.assert_array_equal(planes[1], np.full((2, 3), 3))
 
 
 def test_mirror_shows_the_baked_wall_and_says_where_its_path_ends(tmp_path: Path) -> None:

@@ -65,6 +65,8 @@ def test_how_light_is_baked() -> None:
     assert of(128, indoors, light="traced", light_size=300, light_spp=7) == LightPlan(gathered=False, size=300, spp=7)
     assert of(128, plan_effects(scene_census(), {}, max_depth=9)) == of(128)  # nobody measured it
     assert of(640, indoors).paths < 0.4 * of(640).paths
+    settings = resolve("draft", {"cameras": {"width": 128, "height": 128}}, environment={})
+    assert light_plan(settings, sunny, fine=True) == LightPlan(gathered=False, size=2048, spp=16)
 
 
 def on(plan: EffectPlan) -> set[str]:

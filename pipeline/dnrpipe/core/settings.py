@@ -115,7 +115,9 @@ class BaseSettings(Strict):
         " auto: the latter where much of the light has bounced",
     )
     light_size: Annotated[int, Field(ge=16, le=16384)] | Literal["auto"] = Field(
-        default="auto", description="texels of the baked light's side; auto: 1024 at 128 to 256 pixels"
+        default="auto",
+        description="texels of the baked light's side; auto: 1024 at 128 to 256 pixels,"
+        " twice that where most triangles hold no texel",
     )
     light_spp: Annotated[int, Field(ge=1, le=1_000_000)] | Literal["auto"] = Field(
         default="auto",

@@ -42,8 +42,8 @@ LEAST_THROUGHPUT, LEAST_BY_CHANCE = 1e-2, 1e-3
 ends anyway."""
 LEAST_RHO = 0.05
 """Diffuse reflectance from which a surface ends a chain, and a path behind a wide lobe."""
-COAT = 0.09
-"""Mean reflectance of a dielectric's surface for diffuse light (Fresnel, index 1.5)."""
+COAT = 0.04
+"""Reflectance of a dielectric's surface seen straight on (index 1.5)."""
 NARROW = 1000.0
 """Density of a direction from which a lobe shows a sharp picture of what it reflects: GGX of roughness 0.1."""
 FAR = 1e6
@@ -318,7 +318,9 @@ class SpecularPaths:
         if mi.has_flag(flags, kinds.DeltaTransmission) or mi.has_flag(flags, kinds.GlossyTransmission):
             return rho, opaque, mi.Float(-1)
         coated = mi.has_flag(flags, kinds.GlossyReflection) or mi.has_flag(flags, kinds.DeltaReflection)
-        return rho, opaque, mi.Float(COAT if coated else 0)
+        grazing = 1 - dr.abs(si.wi.z)
+        schlick = COAT + (1 - COAT) * dr.square(dr.square(grazing)) * grazing
+        return rho, opaque, schlick if coated else mi.Float(0)
 
     def _lit(self, bsdf: Any, si: Any, towards: Any, active: Any) -> tuple[Any, Any]:
         """(value, density) of the glossy lobes for the direction ``towards`` an emitter, local."""

@@ -18,7 +18,7 @@ from dnrtrain.contract import NPZ_ERRORS, View
 from ..core.cameras import spread
 from ..core.errors import UserError
 from ..core.ledger import Purpose
-from ..core.scene_files import scene_fingerprint, split_views
+from ..core.scene_files import read_summary, scene_fingerprint, split_views
 from ..core.settings import Settings
 from ..core.workspace import Workspace, digest
 from ..effects.plan import DIRECT_DEPTH, EffectPlan
@@ -107,14 +107,17 @@ class LightPlan:
         return COARSE_PATHS + RAY * rays if self.gathered else rays
 
 
-def light_plan(settings: Settings, plan: EffectPlan) -> LightPlan:
-    """As the settings say; where they say auto, what suits the images and how much of the light has bounced."""
+def light_plan(settings: Settings, plan: EffectPlan, *, fine: bool = False) -> LightPlan:
+    """As the settings say; where they say auto, what suits the images and how much of the light has bounced.
+
+    fine: twice the texels a side of what suits the images (`AtlasFacts.loses_most`).
+    """
     chosen, way = settings.base, settings.base.light
     if way == "auto":
         bounced = plan.pilot.beyond(DIRECT_DEPTH) if plan.pilot else 0.0
         way = "gathered" if bounced >= GATHER_FROM else "traced"
     side = max(settings.cameras.width, settings.cameras.height)
-    wanted = max(min(TEXELS * side, MANY), TEXELS_BEYOND[way] * side)
+    wanted = max(min(TEXELS * side, MANY), TEXELS_BEYOND[way] * side) * (2 if fine else 1)
     return LightPlan(
         gathered=way == "gathered",
         size=min(2 ** round(np.log2(wanted)), MOST) if chosen.light_size == "auto" else chosen.light_size,
@@ -206,7 +209,7 @@ def base_renderer(workspace: Workspace, settings: Settings, plan: EffectPlan) ->
         "samples": chosen.samples,
     }
     if kind == "baked":
-        baked = light_plan(settings, plan)
+        baked = light_plan(settings, plan, fine=read_summary(workspace.scene).atlas.loses_most)
         common |= {"light": str(light_path(workspace)), "denoise": chosen.denoise}
         light = {
             "output": common["light"],
