@@ -106,19 +106,16 @@ def test_first_of_all(server: Server, trained: str) -> None:
 
 
 def test_of_a_renderer_without_base_images(server: Server, trained: str) -> None:
-    """As the preset ``paper`` has: the picture is made of the pass files."""
-    from dnrpipe.core.console import Console
-    from dnrpipe.core.settings import resolve
+    """As the preset ``paper`` has: views are made of the pass files, wherever base images would lie."""
+    from dnrpipe.core.scene_files import split_views
     from dnrpipe.core.workspace import Workspace
-    from dnrpipe.stages.finetune import LivePicture
-    from dnrpipe.stages.stage import Run
+    from dnrpipe.stages.trainer import load
 
-    workspace = Workspace.open(copy_of(server, trained, "painted"))
-    settings = resolve("draft", {"model": {"base": "none", "output": "display", "filter": 0}}, environment={})
-    training: Any = SimpleNamespace(size=(64, 64))  # a training view would be asked for by `subset`
-    picture = LivePicture(Run(workspace, settings, Console()), training)
-    assert picture.preview is not None and picture.split == "test"
-    assert not (workspace.preview / "base").exists()
+    workspace = Workspace.open(server.root / f"{trained}.dnr")
+    view = next(view for view in split_views(workspace)["train"] if workspace.raytraced("train", view.name).exists())
+    nowhere = [workspace.preview / "base" / "nowhere.exr"]
+    views = load(workspace, [view], "train", raytraced=True, base="none", base_files=nowhere)
+    assert views.names == (view.name,) and views.tensors.base is None
 
 
 def test_a_damaged_reference_costs_the_view_not_the_training(server: Server, trained: str) -> None:
