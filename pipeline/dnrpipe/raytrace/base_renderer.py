@@ -96,7 +96,7 @@ class BaseRenderer:
         shape = (view.height, view.width)
         bands = -(-view.height // max(1, MAX_RAYS // (view.width * samples)))
         rows = -(-view.height // bands)
-        channels: dict[str, np.ndarray] = {}
+        channels = {name: np.empty(shape, np.float32) for name in names} if bands > 1 else {}
         for first in range(0, view.height, rows):
             # All bands have the same height, for which the kernel is recorded: the last one ends with the picture.
             first = min(first, view.height - rows)
@@ -105,11 +105,9 @@ class BaseRenderer:
             values = self.kernel(self.scene, self.light, self.tables, camera, rays, turn, start, *size)
             dr.eval(values)
             band = dict(zip(names, planes_of(values, (rows, view.width)), strict=True))
-            if bands == 1:
-                channels = band
-                continue
-            for name, plane in band.items():
-                channels.setdefault(name, np.empty(shape, np.float32))[first : first + rows] = plane
+            for name, plane in channels.items():
+                plane[first : first + rows] = band[name]
+            channels = channels or band
         self.repaired = int(np.count_nonzero(channels.pop(LOST)))
         channels, self.masked = masked_channels(channels)
         for name in (*GBUFFER, *CHAIN):
