@@ -18,7 +18,7 @@ from typing import Any
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.workspace import Workspace
 from dnrpipe.stages.records import METRICS, Metrics, equal_rung
-from dnrpipe.studies.cells.intervals import summarise
+from dnrpipe.studies.cells.intervals import difference, summarise
 from dnrpipe.studies.cells.results import made_by, table
 from dnrtrain.atomic import write_json
 from dnrtrain.records import read
@@ -31,7 +31,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("workspaces", nargs="+", metavar="NAME=WORKSPACE.dnr")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--device", help="that they were trained on, by its name")
+    parser.add_argument("--device", help="that they were trained on, by its name (default: as the first one says)")
     given = parser.parse_args()
     try:
         found = {name: evaluated(Path(root)) for name, root in (pair.split("=", 1) for pair in given.workspaces)}
@@ -74,21 +74,17 @@ def markdown(results: dict[str, Any]) -> str:
         rows.append([name, *values, f"{metrics.neural_ms:.1f}", rival])
     first = found[names[0]]
     for name in names[1:]:
-        rows.append([f"{name} − {names[0]}", *(difference(found, names[0], name, key) for key in FIGURES), "", ""])
+        rows.append([f"{name} − {names[0]}", *(differences(found, names[0], name, key) for key in FIGURES), "", ""])
     views = f"{len(first['metrics']['views'])} test views"
-    about = f"{first['scene']}, {first['size']}, {views}, trained on {results['device']}"
+    about = f"{first['scene']}, {first['size']}, {views}, trained on {results['device'] or first['metrics']['device']}"
     return f"`{results['command']}`: {about}.\n\n{table(head, rows)}"
 
 
-def difference(found: dict[str, Any], first: str, other: str, key: str) -> str:
-    """Mean of other - first over the views, with its interval."""
+def differences(found: dict[str, Any], first: str, other: str, key: str) -> str:
+    """Mean of other - first over the views, with its interval, bold where that leaves out 0."""
     views = [{view["name"]: view[key] for view in found[name]["metrics"]["views"]} for name in (other, first)]
     pairs = {(name, 0): views[0][name] - views[1][name] for name in views[1]}
-    mean = summarise(pairs, pairs=True)
-    assert mean is not None and mean.half is not None
-    digits = FIGURES[key][1]
-    low, high = mean.mean - mean.half, mean.mean + mean.half
-    return f"{mean.mean:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]"
+    return difference(summarise(pairs, pairs=True), FIGURES[key][1])
 
 
 if __name__ == "__main__":

@@ -112,8 +112,9 @@ def plan_shot(session: Session, shot: Shot, kept: KeptWorker) -> ShotPlan:
 
 
 def choose_light(session: Session, frames: Sequence[ShotFrame], planned: int | None = None) -> None:
-    """Choose what no setting says of the light map (`shot_light`). planned: frames, of which
-    these are some; None: these alone.
+    """Choose what no setting says of the light map (`shot_light`).
+
+    planned: frames, of which these are some; None: these alone.
 
     The choice is not remembered as flags are: the next shot has other frames.
     """
