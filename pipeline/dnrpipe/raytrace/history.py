@@ -16,8 +16,12 @@ closer to P than to V (measured). That and other S follow P, for a few frames an
 neighbourhood shows, so that light which moved does not stay behind (variance clipping; Salvi 2016). Where nothing is
 found, a pixel begins anew.
 
-Places are looked up by Catmull-Rom splines, which keep what is sharp; at rims of surfaces by those corners that lie on
-the same one.
+At edges a pixel shows several surfaces, and its rays say little of how much of each: most of what flickers is there.
+Edges move with the surface in front, and all that they show is followed by it, whatever the corners lie on, within
+what the neighbourhood shows (as temporal antialiasing does; Karis 2014).
+
+Places are looked up by Catmull-Rom splines, which keep what is sharp; where something has come from behind another, by
+those corners that lie on the same surface.
 """
 
 from __future__ import annotations
@@ -35,9 +39,9 @@ from .neighbours import Pixels
 from .recorded import Recorded, aligned, planes_of
 from .sensors import opaque_camera
 
-MOST_DIFFUSE, MOST_MIRRORED, MOST_GLOSSY, MOST_UNEVEN = 3.0, 16.0, 3.0, 2.0
-"""Rays of earlier frames that count: for D, for S that follows V, for S that follows P, and at most where the corners
-lie on several surfaces. Each lookup blurs a little, and light moves on what is not a mirror."""
+MOST_DIFFUSE, MOST_MIRRORED, MOST_OTHER = 3.0, 16.0, 6.0
+"""Rays of earlier frames that count: for D, for S that follows V, for S that follows P and for all at edges. Each
+lookup blurs a little, light moves on what is not a mirror, and D has no grain but at edges."""
 MOST_RESTING = 512.0
 """Where the camera has not moved."""
 PLANE = 0.01
@@ -53,6 +57,8 @@ SPREAD, REACH = 2.5, 2
 LEAST_WEIGHT = 0.2
 """Share of the corners, by their distance, that must lie on the same surface."""
 CORNERS = ((0, 0), (1, 0), (0, 1), (1, 1))
+AROUND = tuple((right, below) for below in (-1, 0, 1) for right in (-1, 0, 1))
+"""A pixel and its eight neighbours."""
 
 COLOURS = tuple(f"{kind}.{c}" for kind in ("diffuse", "base", "albedo") for c in "RGB")
 TAKEN = (
@@ -96,7 +102,7 @@ class History:
         mi, size, first = self.mi, (view.height, view.width), self.before is None
         if self.before is None or (self.before[0].height, self.before[0].width) != size:
             pixels = view.width * view.height
-            self.before = view, [mi.Float(aligned([np.zeros(n * pixels)])) for n in (4, 4, 4, 4, 4, 4, 1)]
+            self.before = view, [mi.Float(aligned([np.zeros(4 * pixels)])) for _ in PACKETS]
         planes = mi.Float(aligned([channels[name] for name in TAKEN]))
         earlier, memory = self.before
         resting = not first and view.c2w == earlier.c2w and view.intrinsics == earlier.intrinsics
@@ -128,7 +134,7 @@ class History:
         alpha, noise, rays = planes[9:12]
         specular, bright = base - diffuse, mi.luminance(base)
         seen = picture.seen(camera, planes)
-        past = _rested(mi, memory) if resting else _moved(mi, picture, earlier, memory, seen, specular)
+        past = _rested(mi, memory) if resting else _moved(mi, picture, earlier, memory, seen, diffuse, specular)
 
         share, share_d = rays / (rays + past.rays_s), rays / (rays + past.rays_d)
         s, d = dr.lerp(past.s, specular, share), dr.lerp(past.d, diffuse, share_d)
@@ -137,21 +143,22 @@ class History:
         squares = dr.lerp(past.squares, bright * bright + noise * noise, share)
         error = dr.sqrt(dr.maximum(squares - light * light, 0) * share)  # of all frames by the variance of one's mean
         given = [*d, *(s + d), *albedo, alpha, error, rays + past.rays_s]
-        packets = [(*seen.point, seen.kind), (*seen.normal, dr.select(seen.flat, 1.0, 0.0))]
-        packets += [(*seen.end, rays + past.rays_s), (*s, light), (*d, rays + past.rays_d), (*albedo, alpha)]
-        return given, [*(dr.ravel(mi.Vector4f(*packet)) for packet in packets), squares]
+        packets = [(*seen.point, seen.kind), (*seen.normal, squares), (*seen.end, rays + past.rays_s)]
+        packets += [(*s, light), (*d, rays + past.rays_d), (*albedo, alpha)]
+        return given, [dr.ravel(mi.Vector4f(*packet)) for packet in packets]
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """What a frame sees, an array element per pixel: n, P, what is at the centre, whether the neighbours lie on P's
-    surface, whether they face as it does; V, the end of the path and its length behind P; distance of P from
-    the camera."""
+    """What a frame sees, an array element per pixel: n, P, what is at the centre, whether neighbours lie on other
+    surfaces and where the one in front is, whether all face as P does; V, the end of the path and its length behind P;
+    distance of P from the camera."""
 
     normal: Any
     point: Any
     kind: Any
-    flat: Any
+    edge: Any
+    front: Any
     even: Any
     virtual: Any
     end: Any
@@ -180,63 +187,66 @@ def _rested(mi: Any, memory: list[Any]) -> _Past:
     """Each pixel is where it was."""
     import drjit as dr
 
-    pixel = dr.arange(mi.UInt32, dr.width(memory[SQUARES]))
-    s, d, rest, end = (dr.gather(mi.Vector4f, memory[i], pixel) for i in (S, D, REST, END))
+    pixel = dr.arange(mi.UInt32, dr.width(memory[S]) // 4)
+    facing, end, s, d, rest = (dr.gather(mi.Vector4f, memory[i], pixel) for i in (FACING, END, S, D, REST))
     counts = [dr.minimum(rays, MOST_RESTING) for rays in (end.w, d.w)]
-    return _Past(_rgb(mi, s), _rgb(mi, d), _rgb(mi, rest), rest.w, s.w, memory[SQUARES], *counts)
+    return _Past(_rgb(mi, s), _rgb(mi, d), _rgb(mi, rest), rest.w, s.w, facing.w, *counts)
 
 
-def _moved(mi: Any, picture: _Picture, earlier: Any, memory: list[Any], seen: _Seen, specular: Any) -> _Past:
-    """Looked up where P and V were. specular: S of the frame."""
+def _moved(
+    mi: Any, picture: _Picture, earlier: Any, memory: list[Any], seen: _Seen, diffuse: Any, specular: Any
+) -> _Past:
+    """Looked up where P and V were. diffuse, specular: D and S of the frame."""
     import drjit as dr
 
-    mask, narrow = seen.kind == SURFACE, (seen.length > 0) & seen.even
+    edge, mask = seen.edge, (seen.kind == SURFACE) & ~seen.edge
+    narrow = (seen.length > 0) & seen.even & ~edge
     near = DISPLACED * (seen.distance + seen.length) / earlier[1][0]
 
     # ------------------------- Where P was ----------------------------
-    at = _Places(mi, picture, earlier, seen.point)
+    at = _Places(mi, picture, earlier, dr.select(edge, seen.front, seen.point))
     same, sharp = [], at.inside & mask
     for index in at.corners:
         place, facing = (dr.gather(mi.Vector4f, memory[i], index) for i in (PLACE, FACING))
         on = (place.w == SURFACE) & (dr.dot(facing.xyz, seen.normal) > TURNED)
         on &= dr.abs(dr.dot(place.xyz - seen.point, seen.normal)) < PLANE * seen.distance
-        same.append(at.inside & dr.select(mask, on, (seen.kind == RIM) & (place.w >= RIM)))
-        sharp &= same[-1] & (facing.w > 0.5)
+        same.append(at.inside & (edge | (mask & on)))
+        sharp &= same[-1]
     weights, known = at.weights(same)
-    d, rest, s, end = (at.bilinear(memory[i], weights) for i in (D, REST, S, END))
-    most_d, most_s = (dr.select(sharp, most, MOST_UNEVEN) for most in (MOST_DIFFUSE, MOST_GLOSSY))
+    facing, end, s, d, rest = (at.bilinear(memory[i], weights) for i in (FACING, END, S, D, REST))
+    most_d = dr.select(edge, MOST_OTHER, MOST_DIFFUSE)
     rays_d = dr.select(known, dr.minimum(d.w, most_d), 0)
-    rays_s = dr.select(known & ~narrow, dr.minimum(end.w, most_s), 0)
-    squares = at.bilinear(memory[SQUARES], weights)
-    low, high = picture.bounds(specular)
-    colour, light = dr.clip(_rgb(mi, s), low, high), s.w
-    d = at.spline(memory[D], sharp, d)
+    rays_s = dr.select(known & ~narrow, dr.minimum(end.w, MOST_OTHER), 0)
+    edge &= at.inside
+    s, d = at.spline(memory[S], edge, s), _rgb(mi, at.spline(memory[D], sharp | edge, d))
+    colour, light, squares = picture.clipped(_rgb(mi, s), specular), s.w, facing.w
+    d = dr.select(edge, picture.clipped(d, diffuse), d)
 
     # ------------------------- Where V was ----------------------------
     at = _Places(mi, picture, earlier, seen.virtual)
-    same, sharp = [], at.inside & mask & narrow
+    same, sharp = [], at.inside & narrow
     for index in at.corners:
         place, facing, end = (dr.gather(mi.Vector4f, memory[i], index) for i in (PLACE, FACING, END))
         on = at.inside & narrow & (place.w == SURFACE) & (dr.dot(facing.xyz, seen.normal) > TURNED)
         same.append(on & (dr.norm(end.xyz - seen.end) < near))
-        sharp &= same[-1] & (facing.w > 0.5)
+        sharp &= same[-1]
     weights, mirrored = at.weights(same)
-    s, end = (at.bilinear(memory[i], weights) for i in (S, END))
+    s, end, facing = (at.bilinear(memory[i], weights) for i in (S, END, FACING))
     colour = dr.select(mirrored, _rgb(mi, at.spline(memory[S], sharp, s)), colour)
     light = dr.select(mirrored, s.w, light)
-    squares = dr.select(mirrored, at.bilinear(memory[SQUARES], weights), squares)
-    rays_s = dr.select(mirrored, dr.minimum(end.w, dr.select(sharp, MOST_MIRRORED, MOST_UNEVEN)), rays_s)
-    return _Past(colour, _rgb(mi, d), _rgb(mi, rest), rest.w, light, squares, rays_s, rays_d)
+    squares = dr.select(mirrored, facing.w, squares)
+    rays_s = dr.select(mirrored, dr.minimum(end.w, dr.select(sharp, MOST_MIRRORED, MOST_OTHER)), rays_s)
+    return _Past(colour, d, _rgb(mi, rest), rest.w, light, squares, rays_s, rays_d)
 
 
 def _rgb(mi: Any, packet: Any) -> Any:
     return mi.Color3f(packet.x, packet.y, packet.z)
 
 
-PLACE, FACING, END, S, D, REST, SQUARES = range(7)
-"""What a frame leaves behind: P and what the pixel's centre sees (SURFACE, RIM or 0); n, and 1 where the neighbours lie
-on the same surface; where the path ends, and R of S; S and the luminance of base; D and its R; albedo and alpha: four
-values a pixel, side by side, which are read at once. And the mean square of the luminance."""
+PACKETS = PLACE, FACING, END, S, D, REST = range(6)
+"""What a frame leaves behind: P and what the pixel's centre sees (SURFACE, RIM or 0); n and the mean square of the
+luminance of base; where the path ends, and R of S; S and the luminance; D and its R; albedo and alpha. Four values a
+pixel, side by side, which are read at once."""
 
 
 class _Picture(Pixels):
@@ -249,34 +259,34 @@ class _Picture(Pixels):
         mi = self.mi
         (right, up, back, origin), (fl_x, fl_y, cx, cy), _ = camera
         normal, mask, depth = mi.Normal3f(*planes[12:15]), planes[15] > 0.5, planes[16]
-        nearest = mi.Float(dr.inf)  # at rims: of the neighbours that see a surface
-        for below in (-1, 0, 1):
-            for right_ in (-1, 0, 1):
-                index = self.index(right_, below)
-                beside = dr.select(dr.gather(mi.Bool, mask, index), dr.gather(mi.Float, depth, index), dr.inf)
-                nearest = dr.minimum(nearest, beside)
-        rim = ~mask & dr.isfinite(nearest)
-        depth = dr.select(mask, depth, dr.select(rim, nearest, 0))
+        nearest = mi.Float(dr.inf)  # of the neighbours that see a surface
+        for right_, below in AROUND:
+            index = self.index(right_, below)
+            beside = dr.select(dr.gather(mi.Bool, mask, index), dr.gather(mi.Float, depth, index), dr.inf)
+            nearest = dr.minimum(nearest, beside)
+        nearest = dr.select(dr.isfinite(nearest), nearest, 0)
+        rim = ~mask & (nearest > 0)
         kind = dr.select(mask, SURFACE, dr.select(rim, RIM, 0.0))
         x, y = (mi.Float(self.x) + 0.5 - cx) / fl_x, (mi.Float(self.y) + 0.5 - cy) / fl_y
         sight = mi.Vector3f(right * x - up * y - back)
-        distance, sight = depth * dr.norm(sight), dr.normalize(sight)
+        stretch, sight = dr.norm(sight), dr.normalize(sight)
+        distance, ahead = dr.select(mask, depth, nearest) * stretch, nearest * stretch
         length, end = planes[17], mi.Point3f(*planes[18:21])
-        point, virtual = (mi.Point3f(origin + sight * far) for far in (distance, distance + length))
-        flat, even = self.is_flat(point, normal, distance, mask), self.is_even(normal)
-        return _Seen(normal, point, kind, flat, even, virtual, end, length, distance)
+        point, front, virtual = (mi.Point3f(origin + sight * far) for far in (distance, ahead, distance + length))
+        edge = rim | (mask & self.is_edge(point, normal, distance, mask))
+        return _Seen(normal, point, kind, edge, front, self.is_even(normal), virtual, end, length, distance)
 
-    def is_flat(self, point: Any, normal: Any, distance: Any, mask: Any) -> Any:
-        """Whether the four neighbours lie on the pixel's surface."""
+    def is_edge(self, point: Any, normal: Any, distance: Any, mask: Any) -> Any:
+        """Whether some of the eight neighbours lie on another surface."""
         import drjit as dr
 
-        mi = self.mi
-        flat = mi.Bool(mask)
-        for right, below in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        mi, edge = self.mi, self.mi.Bool(False)
+        for right, below in AROUND:
             index = self.index(right, below)
-            beside = dr.gather(mi.Point3f, point, index)
-            flat &= dr.gather(mi.Bool, mask, index) & (dr.abs(dr.dot(beside - point, normal)) < PLANE * distance)
-        return flat
+            beside, facing = dr.gather(mi.Point3f, point, index), dr.gather(mi.Normal3f, normal, index)
+            edge |= ~dr.gather(mi.Bool, mask, index) | (dr.dot(facing, normal) <= TURNED)
+            edge |= dr.abs(dr.dot(beside - point, normal)) >= PLANE * distance
+        return edge
 
     def is_even(self, normal: Any) -> Any:
         """Whether the normals of the four neighbours agree with the pixel's."""
@@ -287,19 +297,19 @@ class _Picture(Pixels):
             even &= dr.dot(dr.gather(self.mi.Normal3f, normal, self.index(right, below)), normal) > FLAT
         return even
 
-    def bounds(self, colour: Any) -> tuple[Any, Any]:
-        """(lower, upper) bound of what the neighbourhood shows: mean and standard deviation of nine pixels."""
+    def clipped(self, earlier: Any, colour: Any) -> Any:
+        """``earlier`` brought to what the neighbourhood of each pixel shows of ``colour``: mean and standard deviation
+        of nine pixels."""
         import drjit as dr
 
         mi = self.mi
         total, squares = mi.Color3f(0), mi.Color3f(0)
-        for below in (-REACH, 0, REACH):
-            for right in (-REACH, 0, REACH):
-                beside = dr.gather(mi.Color3f, colour, self.index(right, below))
-                total, squares = total + beside, squares + beside * beside
+        for right, below in AROUND:
+            beside = dr.gather(mi.Color3f, colour, self.index(REACH * right, REACH * below))
+            total, squares = total + beside, squares + beside * beside
         mean = total / 9
         spread = SPREAD * dr.sqrt(dr.maximum(squares / 9 - mean * mean, 0))
-        return mean - spread, mean + spread
+        return dr.clip(earlier, mean - spread, mean + spread)
 
 
 class _Places:
@@ -344,10 +354,10 @@ class _Places:
         return [dr.select(enough, share / total, 0) for share in shares], enough
 
     def bilinear(self, values: Any, weights: list[Any]) -> Any:
-        """Values at the places, 0 where nothing counts. values: four a pixel, side by side, or one."""
+        """Values at the places, 0 where nothing counts. values: four a pixel."""
         import drjit as dr
 
-        kind = self.mi.Float if dr.width(values) == self.width * self.height else self.mi.Vector4f
+        kind = self.mi.Vector4f
         pairs = zip(self.corners, weights, strict=True)
         return sum((weight * dr.gather(kind, values, index) for index, weight in pairs), kind(0))
 
