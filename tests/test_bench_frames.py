@@ -136,8 +136,10 @@ def test_a_texture_in_space_stays_put_and_noise_does_not() -> None:
     still = [_pattern(surface.position) for surface in surfaces]
     rng = np.random.default_rng(2)
     noisy = [image + rng.normal(0, 0.05, image.shape) for image in still]
-    calm, shaky = flicker(still, still, surfaces), flicker(noisy, still, surfaces)
-    assert calm["flicker"] == 0
+    halves = tuple([image + rng.normal(0, 0.1, image.shape) for image in still] for _ in range(2))
+    calm, shaky = flicker(still, still, surfaces, halves), flicker(noisy, still, surfaces, halves)
+    assert calm["flicker"] == 0 and calm["flicker_rms"] < 0.01, "the halves' noise is in neither"
+    assert 0.05 < shaky["flicker_rms"] < 0.05 * math.sqrt(2)
     assert calm["change"] < 2e-3
     # Difference of two independent draws, one of them bilinearly averaged: between one and sqrt 2 times the noise.
     single = 0.05 * math.sqrt(2 / math.pi)
@@ -228,7 +230,7 @@ def test_moving_cameras_are_judged_by_both_moves_and_against_the_better_rival() 
             "16 spp clean16": (200.0, 34.0, 0.004),
         }
         return {
-            name: {"ms": ms, "psnr": psnr - worse, "lpips_alex": 0.1, "flicker": flicker}
+            name: {"ms": ms, "psnr": psnr - worse, "lpips_alex": 0.1, "flicker": flicker, "flicker_rms": flicker / 4}
             for name, (ms, psnr, flicker) in found.items()
         }
 
@@ -237,7 +239,7 @@ def test_moving_cameras_are_judged_by_both_moves_and_against_the_better_rival() 
     table = moving_tables.lines([scene, {"scene": "not measured"}])
     fast, slow = (line for line in table if line.startswith("| box | ") and " rays, remembers, " in line)
     assert "1 rays, remembers, 100 ms | 32.50" in fast and "gathered x1, 118 ms | 30.50" in fast
-    assert fast.endswith("| +2.00 | 40% |") and slow.endswith("| +1.00 | 100% |")
+    assert fast.endswith("| +2.00 | 40% | 40% |") and slow.endswith("| +1.00 | 100% | 100% |")
     assert "base, 2 rays, remembers, 150 ms | 34.50" in slow  # the base image alone is a renderer of ours, too
     assert any("cheaper at equal PSNR" in line for line in table)
     assert moving_tables.lines([{"scene": "not measured"}]) == []

@@ -76,11 +76,19 @@ def changes(images: list[np.ndarray], surfaces: list[Surface]) -> list[tuple[np.
     return found
 
 
-def flicker(images: list[np.ndarray], reference: list[np.ndarray], surfaces: list[Surface]) -> dict[str, float]:
+def flicker(
+    images: list[np.ndarray],
+    reference: list[np.ndarray],
+    surfaces: list[Surface],
+    halves: tuple[list[np.ndarray], list[np.ndarray]] | None = None,
+) -> dict[str, float]:
     """How much a moving picture changes, display space [0, 1], means over the valid pixels of all pairs.
 
+    halves: of the reference, whose noise is independent: in the product of the differences from either it cancels.
+
     {"change": mean absolute change, "reference": the reference's, "flicker": mean absolute difference of the two
-    changes (what moves though light does not, or does not move though it does), "valid": share of surface pixels}
+    changes (what moves though light does not, or does not move though it does), "valid": share of surface pixels}, and
+    with halves "flicker_rms": the root mean square of that difference, without the reference's noise.
     """
     ours, true = changes(images, surfaces), changes(reference, surfaces)
     valid = np.stack([mask for _, mask in ours])
@@ -88,7 +96,11 @@ def flicker(images: list[np.ndarray], reference: list[np.ndarray], surfaces: lis
         raise ValueError("no pixel is seen in two frames one after the other: the frames are too far apart")
     change, truth = (np.stack([pair[0] for pair in rows])[valid] for rows in (ours, true))
     seen = np.stack([surface.mask for surface in surfaces[1:]])
-    return {
+    found = {}
+    if halves is not None:
+        off, again = (change - np.stack([pair[0] for pair in changes(half, surfaces)])[valid] for half in halves)
+        found["flicker_rms"] = float(np.sqrt(max(0.0, (off * again).mean())))
+    return found | {
         "change": float(np.abs(change).mean()),
         "reference": float(np.abs(truth).mean()),
         "flicker": float(np.abs(change - truth).mean()),

@@ -73,6 +73,9 @@ def measure(
         chosen = sorted({*last, *(number - 1 for number in last)})
         reference = make_references(scene, [views[i] for i in chosen], move, spp, kind, folder, tell)
         truth = dict(zip(chosen, (scene.shown(picture) for picture in reference.pictures), strict=True))
+        halves = {
+            i: [_plane(scene.shown(half)) for half in pair] for i, pair in zip(chosen, reference.halves, strict=True)
+        }
         surfaces = {i: surface_of(views[i], scene.frames.gbuffer(views[i])) for i in chosen}
         rivals = Rivals(scene, ours, baselines)
         ours.begin()
@@ -86,7 +89,7 @@ def measure(
                 took.setdefault(name, []).append(ms)
                 pictures.setdefault(name, {})[number] = picture.half()
             tell(f"{scene.name}: {move}, frame {number + 1} of {frames}")
-        rows = {name: _figures(shown, truth, surfaces, last, lpips) for name, shown in pictures.items()}
+        rows = {name: _figures(shown, truth, halves, surfaces, last, lpips) for name, shown in pictures.items()}
         found[move] = {
             "frames": frames,
             "reference": reference.kind,
@@ -151,6 +154,7 @@ def _own(ours: Ours, view: View, clock: Clock, judged: bool) -> dict[str, tuple[
 def _figures(
     shown: dict[int, torch.Tensor],
     truth: dict[int, torch.Tensor],
+    halves: dict[int, list[np.ndarray]],
     surfaces: dict[int, Surface],
     last: list[int],
     lpips: Any,
@@ -163,7 +167,8 @@ def _figures(
     for i in last:
         pair = (i - 1, i)
         ours, true = ([_plane(images[j]) for j in pair] for images in (shown, truth))
-        pairs.append(flicker(ours, true, [surfaces[j] for j in pair]))
+        parts = ([halves[j][0] for j in pair], [halves[j][1] for j in pair])
+        pairs.append(flicker(ours, true, [surfaces[j] for j in pair], parts))
     return {**quality, **{key: float(np.mean([pair[key] for pair in pairs])) for key in pairs[0]}}
 
 

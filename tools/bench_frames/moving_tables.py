@@ -17,7 +17,8 @@ from dnrpipe.studies.frames.ours import REMEMBERS, is_own
 from . import equal_time
 from .standing import CLASSES, class_limits
 
-FIGURES = ("ms", "psnr", "lpips_alex", "flicker")
+FLICKER = ("flicker", "flicker_rms")
+FIGURES = ("ms", "psnr", "lpips_alex", *FLICKER)
 Rows = dict[str, dict[str, float]]
 
 
@@ -46,10 +47,12 @@ def lines(scenes: Sequence[Mapping[str, Any]]) -> list[str]:
         f"Moving cameras, {' and '.join(known[0]['moving'])} of {first['frames']} frames: means over both, of six"
         f" frames each, against {first['reference_spp']} samples. The rival's samples are gathered over the frames"
         " where that is better. Flicker: mean absolute difference of the change from frame to frame, after"
-        " reprojection, from the reference's, x 1000.",
+        " reprojection, from the reference's, x 1000, which counts that one's noise; beside it, and in the last column,"
+        " its root mean square without that noise (by two halves of the reference).",
         "",
-        "| scene | within | ours | dB | LPIPS | flicker | its best | dB | LPIPS | flicker | lead | of its flicker |",
-        "|---|---|---|---|---|---|---|---|---|---|---|---|",
+        "| scene | within | ours | dB | LPIPS | flicker | its best | dB | LPIPS | flicker"
+        " | lead | of its flicker | without noise |",
+        "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for scene in known:
         rows = over_moves(scene)
@@ -60,13 +63,14 @@ def lines(scenes: Sequence[Mapping[str, Any]]) -> list[str]:
                 row = rows[name] if name else {}
                 shown = "-" if name is None else f"{equal_time.short(name)}, {row['ms']:.0f} ms"
                 cells += [shown, number(row.get("psnr"), 2), number(row.get("lpips_alex"), 4)]
-                cells += [number(1000 * row["flicker"] if row else None, 2)]
+                cells += [" / ".join(number(1000 * row[key] if key in row else None, 1) for key in FLICKER)]
             mine, rival = pair
             if mine and rival:
                 lead = rows[mine]["psnr"] - rows[rival]["psnr"]
-                cells += [f"{lead:+.2f}", f"{rows[mine]['flicker'] / rows[rival]['flicker']:.0%}"]
+                shares = (f"{rows[mine][key] / rows[rival][key]:.0%}" if key in rows[rival] else "-" for key in FLICKER)
+                cells += [f"{lead:+.2f}", *shares]
             else:
-                cells += ["-", "-"]
+                cells += ["-", "-", "-"]
             table.append(f"| {' | '.join(cells)} |")
     counted = equal_time.lines([_as_standing(scene) for scene in known])
     if counted:

@@ -31,12 +31,16 @@ HALVES = ("a", "b")
 
 @dataclass(frozen=True)
 class Reference:
-    """pictures: RGBA linear, premultiplied [H, W, 4]; noise: RMSE in display space; both per view."""
+    """Per view. halves: RGBA linear, premultiplied [H, W, 4]; pictures: their means; noise: RMSE in display space."""
 
     kind: str
     spp: int
-    pictures: list[np.ndarray]
+    halves: list[list[np.ndarray]]
     noise: list[float]
+
+    @property
+    def pictures(self) -> list[np.ndarray]:
+        return [np.mean(pair, axis=0) for pair in self.halves]
 
     @property
     def ceiling(self) -> float:
@@ -52,16 +56,14 @@ def make_references(
     for view in views:
         halves.append(_halves(scene, view, split, spp, folder / f"{split}-{view.name}.exr"))
         tell(f"{scene.name}: reference of {split} view {view.name}")
-    raw = Reference("raw", spp, [np.mean(pair, axis=0) for pair in halves], [_noise(scene, pair) for pair in halves])
+    raw = Reference("raw", spp, halves, [_noise(scene, pair) for pair in halves])
     if kind == "raw" or (kind == "auto" and raw.ceiling >= LEAST_CEILING):
         return raw
     smooth = []
     for view, pair in zip(views, halves, strict=True):
         guide = scene.frames.auxiliary(view, AUXILIARY_RAYS, view_seed(1, split, view.name))
         smooth.append([denoise(half, guide.albedo, guide.normal) for half in pair])
-    return Reference(
-        "denoised", spp, [np.mean(pair, axis=0) for pair in smooth], [_noise(scene, pair) for pair in smooth]
-    )
+    return Reference("denoised", spp, smooth, [_noise(scene, pair) for pair in smooth])
 
 
 def _halves(scene: BenchScene, view: View, split: str, spp: int, path: Path) -> list[np.ndarray]:
