@@ -97,7 +97,7 @@ def frames(root: Path, sizes: list[tuple[int, ...]]) -> list[dict[str, Any]]:
         torch_device(resolve("draft", {}, environment={})),
     )
     rays = scene.settings.base.samples
-    ours = Ours(scene, (rays,))
+    ours = Ours(scene, (rays,), smoothed=False)
     ours.model = corrector().to(device)
     ours.model.use_bfloat16 = decide_bfloat16("auto", device)
     rows = []

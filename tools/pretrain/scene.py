@@ -181,10 +181,10 @@ def _look(
         if kind == "remembered":
             history.begin()
             for frame in way[:-1]:
-                history.take(frame, renderer.frame(frame, int(samples), history.number))
-            channels = history.take(way[-1], renderer.frame(way[-1], int(samples), history.number))
+                history.take(frame, renderer.frame(frame, int(samples), history.number, tiles=False))
+            channels = history.take(way[-1], renderer.frame(way[-1], int(samples), history.number, tiles=False))
         else:
-            channels = renderer.frame(way[-1], int(samples))
+            channels = renderer.frame(way[-1], int(samples), tiles=not kind)
         channels = {**channels, "depth.Z": channels["depth.Z"] / engine.unit_scale}
         channels["coverage"] = silhouettes.coverage(view, channels["mask"] > 0.5, alpha=channels["base.A"])
         return without_grain(channels, renderer) if kind else channels

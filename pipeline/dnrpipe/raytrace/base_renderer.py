@@ -12,9 +12,8 @@ Notation
     diffuse  = the first vertex's share of it
     noise    = standard error of base's luminance by the spread of the pixel's samples; 0 with one sample
 
-The numbers that choose directions come from Kronecker sequences over the samples of a tile of TILE² pixels: sample s of
-a pixel at place t of its tile has the number s TILE² + t. They are the same in every picture but in frames that follow
-one another and remember (`history`): there frame f goes on where f - 1 ended.
+The numbers that choose directions come from Kronecker sequences (`sequence`). They are the same in every picture but in
+frames that follow one another and remember (`history`): there frame f goes on where f - 1 ended.
 Emitter sampling serves a path's first glossy vertex; multiple importance sampling joins it with hits of emitters.
 """
 
@@ -28,7 +27,7 @@ from .engine import masked_channels
 from .lightmap import light_texture
 from .recorded import Recorded, planes_of, prepare_emitters
 from .sensors import Camera, opaque_camera
-from .sequence import GOLDEN, ORDER, TILE, fraction
+from .sequence import GOLDEN, ORDER, TILE, beginnings, fraction
 
 MAX_RAYS = 1 << 22
 """Of a launch: bounds its memory (about 1 GiB). Larger pictures are rendered in bands of rows."""
@@ -78,11 +77,13 @@ class BaseRenderer:
         # Recorded at the first call: tracing the plugins anew would take longer than the frame itself.
         self.kernel = Recorded(self._kernel, scene)
 
-    def frame(self, view: Any, samples: int, number: int = 0) -> dict[str, np.ndarray]:
+    def frame(self, view: Any, samples: int, number: int = 0, *, tiles: bool = True) -> dict[str, np.ndarray]:
         """Channels of BASE_CHANNELS and of the G-buffer: float32 [H, W] each, linear Rec.709, premultiplied.
 
         view: in the bundle's units, as are ``depth.Z`` and those of CHAIN. samples: K, rays per pixel. number: of the
         frame among those that remember; frames of other numbers cast other rays but for the first of each pixel.
+        tiles: samples of neighbouring pixels complement one another, as those want who smooth them; not: as denoisers
+        want (`sequence`).
         ``coverage`` is base.A, at most 1. Where cut-outs stand one behind the other, base.A can be above 1 as the
         colours are: each surface adds its opaque share.
         """
@@ -91,7 +92,7 @@ class BaseRenderer:
         mi = self.mi
         camera = opaque_camera(mi, view)
         rays = dr.opaque(mi.UInt32, samples)  # as data: the kernel is the same for all numbers of them
-        turn = dr.opaque(mi.UInt32, number % FRAMES)
+        turn, tiled = dr.opaque(mi.UInt32, number % FRAMES), dr.opaque(mi.UInt32, int(tiles))
         names = (LOST, *MEANS, *CENTRES, NOISE)
         shape = (view.height, view.width)
         bands = -(-view.height // max(1, MAX_RAYS // (view.width * samples)))
@@ -102,7 +103,7 @@ class BaseRenderer:
             first = min(first, view.height - rows)
             start = dr.opaque(mi.UInt32, first)
             size = view.width, rows, samples
-            values = self.kernel(self.scene, self.light, self.tables, camera, rays, turn, start, *size)
+            values = self.kernel(self.scene, self.light, self.tables, camera, rays, turn, tiled, start, *size)
             dr.eval(values)
             band = dict(zip(names, planes_of(values, (rows, view.width)), strict=True))
             for name, plane in channels.items():
@@ -123,6 +124,7 @@ class BaseRenderer:
         camera: Camera,
         rays: Any,
         turn: Any,
+        tiled: Any,
         start: Any,
         width: int,
         height: int,
@@ -139,6 +141,7 @@ class BaseRenderer:
             camera: see `opaque_camera`.
             rays: ``samples``, as data.
             turn: number of the frame.
+            tiled: 1: in tiles, 0: scattered.
             start: the first row.
         """
         import drjit as dr
@@ -148,8 +151,7 @@ class BaseRenderer:
         pixel, sample = index // rays, index % rays
         axes, film, across = camera
         x, y = pixel % across, start + pixel // across
-        tile = dr.gather(mi.UInt32, tables[0], (y % TILE) * TILE + x % TILE)
-        order = mi.Float(sample * (TILE * TILE) + tile)
+        order = mi.Float(sample * (TILE * TILE)) + beginnings(mi, x, y, tables[0], tiled == 1)
         number = order + mi.Float(turn * rays * (TILE * TILE))
         order = fraction((order + 0.5) / mi.Float(rays * (TILE * TILE)) + mi.Float(turn) * GOLDEN[0])
         place = dr.select(sample == 0, 0, mi.Float(sample + turn * (rays - 1)))

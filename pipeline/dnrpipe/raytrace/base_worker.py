@@ -70,15 +70,19 @@ class Worker(BundleWorker):
 
         samples: rays per pixel, if not the workspace's. smooth: by `smoothing`, not denoised as in the workspace.
         """
-        channels = self.grainy(view, samples)
+        channels = self.grainy(view, samples, smooth=smooth)
         if isinstance(self.common, SampledCommon):
             return channels | self._traced(self.common, view, channels)
         return self.finished(channels, smooth)
 
-    def grainy(self, view: View, samples: int | None = None, number: int = 0) -> dict[str, np.ndarray]:
-        """`channels` by the kernel alone: not denoised, not path-traced. number: see `BaseRenderer.frame`."""
+    def grainy(
+        self, view: View, samples: int | None = None, number: int = 0, *, smooth: bool = False
+    ) -> dict[str, np.ndarray]:
+        """`channels` by the kernel alone: not denoised, not path-traced. number: see `BaseRenderer.frame`. smooth:
+        they will be smoothed, not denoised."""
         renderer, scaled = self.renderer, scaled_view(view, self.engine.unit_scale)
-        channels = renderer.frame(scaled, samples or self.common.samples, number)
+        tiles = smooth or not self.denoise
+        channels = renderer.frame(scaled, samples or self.common.samples, number, tiles=tiles)
         self.repaired, self.masked = self.repaired + renderer.repaired, self.masked + renderer.masked
         for name in ("depth.Z", *CHAIN):
             channels[name] /= self.engine.unit_scale
@@ -105,8 +109,8 @@ class Worker(BundleWorker):
             self.history.begin(number)
         self.seen = way
         for frame, *_ in way[known:-1]:
-            self._taken(frame, samples)
-        return self.finished(self._taken(view, samples), smooth)
+            self._taken(frame, samples, smooth)
+        return self.finished(self._taken(view, samples, smooth), smooth)
 
     def finished(self, channels: dict[str, np.ndarray], smooth: bool) -> dict[str, np.ndarray]:
         """Channels of `grainy`, smoothed, or denoised where the workspace's are; they are changed in place."""
@@ -114,8 +118,8 @@ class Worker(BundleWorker):
             return self.smoother(with_coverage(channels))
         return without_grain(channels, self.renderer) if self.denoise else channels
 
-    def _taken(self, view: View, samples: int | None) -> dict[str, np.ndarray]:
-        return self.history.take(view, self.grainy(view, samples, self.history.number))
+    def _taken(self, view: View, samples: int | None, smooth: bool) -> dict[str, np.ndarray]:
+        return self.history.take(view, self.grainy(view, samples, self.history.number, smooth=smooth))
 
     def _frames(self, view: View) -> Frames:
         """Finer silhouettes than the base image's few rays give, for views of one size."""

@@ -88,12 +88,13 @@ class Worker:
             picture, spp = timed(ms, "path tracing", self._reference, view, int(task["spp"]))
         else:
             self._begin(view, bool(task["fine"]))
-            channels = timed(ms, "base image" if self.base else "G-buffer", self._channels, view, task["samples"])
+            smooth = not task["fine"]  # the denoiser's time goes into rays and pixels of what moves
+            part = "base image" if self.base else "G-buffer"
+            channels = timed(ms, part, self._channels, view, task["samples"], smooth)
             if self.history is not None and mode in REMEMBERED:
                 channels = timed(ms, "history", self.history.take, view, channels)
                 rays = int(channels["rays"].max())
             if self.base is not None and self.base.denoise and mode in REMEMBERED:
-                smooth = not task["fine"]  # the denoiser's time goes into rays and pixels of what moves
                 channels = timed(ms, "smoothing" if smooth else "denoiser", self.base.finished, channels, smooth)
             if mode in ("neural", "error"):
                 picture = timed(ms, "network", self._neural, view, channels)
@@ -120,8 +121,8 @@ class Worker:
             self.history.begin()
         self.resting = view if fine else None
 
-    def _channels(self, view: View, samples: int | None) -> dict[str, np.ndarray]:
-        """Base image and G-buffer, or the G-buffer alone."""
+    def _channels(self, view: View, samples: int | None, smooth: bool) -> dict[str, np.ndarray]:
+        """Base image, which will be smoothed or denoised, and G-buffer, or the G-buffer alone."""
         if self.base is None:
             channels, lost = masked_channels(self.frames((view.width, view.height)).gbuffer(view))
             self.repaired += lost
@@ -130,7 +131,8 @@ class Worker:
         if self.history is None:
             channels = self.base.channels(view)
         else:
-            channels = self.base.grainy(view, samples and min(samples, self.base.common.samples), self.history.number)
+            rays = samples and min(samples, self.base.common.samples)
+            channels = self.base.grainy(view, rays, self.history.number, smooth=smooth)
         self.repaired += self.base.repaired + self.base.masked
         return channels
 

@@ -47,7 +47,7 @@ class Ours:
 
     model is None, and frames have nothing neural, where the workspace has none: the base image alone is measured then.
     samples: rays per pixel of base images, each with the same model, whatever it was trained with; none: the
-    workspace's. folder, light: another model and baked light than the workspace's.
+    workspace's. folder, light: another model and baked light than the workspace's. smoothed: False: none are.
     Raises UserError: the model has a base image that is not timed here, or its light is not baked.
     """
 
@@ -57,6 +57,8 @@ class Ours:
         samples: tuple[int, ...] = (),
         folder: Path | None = None,
         light: Path | None = None,
+        *,
+        smoothed: bool = True,
     ) -> None:
         folder = folder or scene.workspace.checkpoints("step2")
         self.scene = scene
@@ -77,7 +79,10 @@ class Ours:
             self.renderer = BaseRenderer(scene.engine.mi, mitsuba_scene, read_light(light), gloss=gloss)
             counts = samples or (scene.settings.base.samples,)
         self.smoother = Smoother(scene.engine.mi)
-        self.histories = {count: History(scene.engine.mi) for count in counts}
+        denoises = self.renderer is not None and scene.settings.base.denoise
+        # Smoothed, denoised, or left as they are, base images have samples of their own (`sequence`).
+        kinds = (None,) if not denoises else (True, False) if smoothed else (False,)
+        self.histories = {(count, smooth): History(scene.engine.mi) for count in counts for smooth in kinds}
 
     def begin(self) -> None:
         """Forget the frames so far."""
@@ -86,8 +91,8 @@ class Ours:
 
     def remember(self, view: View, clock: Clock) -> None:
         """Take in what a frame of a moving camera sees."""
-        for samples, history in self.histories.items():
-            self._inputs(samples, view, clock, history)
+        for (samples, smooth), history in self.histories.items():
+            self._inputs(samples, view, clock, history, tiles=smooth is not False)
 
     def frame(self, view: View, clock: Clock, *, remember: bool = False) -> dict[str, dict[str, Any]]:
         """By NEURAL, BASE, SMOOTH and NEURAL_SMOOTH, and the rays per pixel: {"picture": display RGB over white
@@ -96,22 +101,21 @@ class Ours:
         remember: with what earlier such frames saw, since `begin`; only of baked light.
         """
         result: dict[str, dict[str, Any]] = {}
-        for samples, history in self.histories.items():
-            channels, parts = self._inputs(samples, view, clock, history if remember else None)
+        for (samples, smooth), history in self.histories.items():
+            memory = history if remember else None
+            channels, parts = self._inputs(samples, view, clock, memory, tiles=smooth is not False)
             rays = "" if samples is None else f", {samples} rays"
             rays += REMEMBERS if remember else ""
-            if self.renderer is not None and self.scene.settings.base.denoise:
+            base, neural = (SMOOTH, NEURAL_SMOOTH) if smooth else (BASE, NEURAL)
+            if self.renderer is not None and smooth is not None:
                 channels, parts["coverage"] = clock.time(partial(with_coverage, channels))
-                smooth, ms = clock.time(partial(self.smoother, channels))
-                result[SMOOTH + rays] = {"picture": self._picture(smooth), "parts": {**parts, "smoothing": ms}}
-                if self.model is not None:
-                    result[NEURAL_SMOOTH + rays] = self._neural(view, smooth, {**parts, "smoothing": ms}, clock)
-                clean, parts["denoiser"] = clock.time(partial(denoised, channels, diffuse=self.renderer.lets_through))
-                channels |= clean
+                clean = partial(denoised, channels, diffuse=self.renderer.lets_through)
+                found, ms = clock.time(partial(self.smoother, channels) if smooth else clean)
+                channels, parts["smoothing" if smooth else "denoiser"] = channels | found, ms
             if samples is not None:
-                result[BASE + rays] = {"picture": self._picture(channels), "parts": dict(parts)}
+                result[base + rays] = {"picture": self._picture(channels), "parts": dict(parts)}
             if self.model is not None:
-                result[NEURAL + rays] = self._neural(view, channels, parts, clock)
+                result[neural + rays] = self._neural(view, channels, parts, clock)
         return result
 
     def _neural(
@@ -130,15 +134,17 @@ class Ours:
         return self.scene.shown(np.concatenate([straight * alpha, alpha], axis=-1))
 
     def _inputs(
-        self, samples: int | None, view: View, clock: Clock, history: History | None
+        self, samples: int | None, view: View, clock: Clock, history: History | None, *, tiles: bool = True
     ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
-        """(channels, not denoised; ms by part). The base image's kernel gives the G-buffer, too."""
+        """(channels, not denoised; ms by part). The base image's kernel gives the G-buffer, too. tiles: see
+        `BaseRenderer.frame`."""
         if self.renderer is None or samples is None:
             channels, ms = clock.time(partial(self.scene.frames.gbuffer, view))
             return channels, {"G-buffer": ms}
         scale = self.scene.engine.unit_scale
         number = 0 if history is None else history.number
-        channels, ms = clock.time(partial(self.renderer.frame, scaled_view(view, scale), samples, number))
+        asked = (scaled_view(view, scale), samples, number)
+        channels, ms = clock.time(partial(self.renderer.frame, *asked, tiles=tiles))
         mask, alpha = channels["mask"] > 0.5, channels["base.A"]
         coverage, finer = clock.time(partial(self.scene.frames.coverage, view, mask, alpha=alpha))
         for name in ("depth.Z", *CHAIN):

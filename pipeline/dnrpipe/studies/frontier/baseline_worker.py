@@ -67,7 +67,7 @@ class Worker(FileWorker):
         ]
         base_ms = None
         if task.settings.model.base == "baked":
-            ours = Ours(scene, (), task.output.parent / "no-model")
+            ours = Ours(scene, (), task.output.parent / "no-model", smoothed=False)
             ours.frame(views[0], clock)
             frames = [(name, frame) for view in views for name, frame in ours.frame(view, clock).items()]
             parts = [frame["parts"].values() for name, frame in frames if name.startswith(BASE)]

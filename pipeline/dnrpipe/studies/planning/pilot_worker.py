@@ -178,7 +178,7 @@ class Worker:
 
         views = task.views
         scene = open_scene(self.workspace.root, views, self.threads, self.settings)
-        ours = Ours(scene, (), task.folders[-1], task.light)
+        ours = Ours(scene, (), task.folders[-1], task.light, smoothed=False)
         models = [load_model(folder) for folder in task.folders]
         shipped = self._shipped(task.train)
         models += [] if shipped is None else [shipped]
