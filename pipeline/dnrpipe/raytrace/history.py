@@ -53,7 +53,7 @@ FLAT = 0.9998
 DISPLACED = 4.0
 """Pixels, as large as they are at the end of a path, up to which two ends show the same."""
 SPREAD, REACH = 2.5, 2
-"""Standard deviations of the neighbourhood within which S stays; pixels that it reaches to each side."""
+"""Standard deviations of the neighbourhood within which S, and D at edges, stay; pixels it reaches to each side."""
 LEAST_WEIGHT = 0.2
 """Share of the corners, by their distance, that must lie on the same surface."""
 CORNERS = ((0, 0), (1, 0), (0, 1), (1, 1))
@@ -72,8 +72,6 @@ LEAST_ALPHA = 1e-3
 """Of the frame's own base image, where it is brought to the alpha of what is remembered."""
 HALF, TINY = 0.5, 1e-4
 """Pixels: how far a picture goes beyond the centres of its outer ones; what keeps a place off the last."""
-SURFACE, RIM = 1.0, 0.5
-"""What a pixel's centre sees: a surface; none, but a neighbour's does."""
 
 
 class History:
@@ -143,20 +141,20 @@ class History:
         squares = dr.lerp(past.squares, bright * bright + noise * noise, share)
         error = dr.sqrt(dr.maximum(squares - light * light, 0) * share)  # of all frames by the variance of one's mean
         given = [*d, *(s + d), *albedo, alpha, error, rays + past.rays_s]
-        packets = [(*seen.point, seen.kind), (*seen.normal, squares), (*seen.end, rays + past.rays_s)]
-        packets += [(*s, light), (*d, rays + past.rays_d), (*albedo, alpha)]
+        packets = [(*seen.point, dr.select(seen.mask, 1.0, 0.0)), (*seen.normal, squares)]
+        packets += [(*seen.end, rays + past.rays_s), (*s, light), (*d, rays + past.rays_d), (*albedo, alpha)]
         return given, [dr.ravel(mi.Vector4f(*packet)) for packet in packets]
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """What a frame sees, an array element per pixel: n, P, what is at the centre, whether neighbours lie on other
+    """What a frame sees, an array element per pixel: n, P, whether there is one, whether neighbours lie on other
     surfaces and where the one in front is, whether all face as P does; V, the end of the path and its length behind P;
     distance of P from the camera."""
 
     normal: Any
     point: Any
-    kind: Any
+    mask: Any
     edge: Any
     front: Any
     even: Any
@@ -199,26 +197,26 @@ def _moved(
     """Looked up where P and V were. diffuse, specular: D and S of the frame."""
     import drjit as dr
 
-    edge, mask = seen.edge, (seen.kind == SURFACE) & ~seen.edge
+    edge, inner = seen.edge, seen.mask & ~seen.edge
     narrow = (seen.length > 0) & seen.even & ~edge
     near = DISPLACED * (seen.distance + seen.length) / earlier[1][0]
 
     # ------------------------- Where P was ----------------------------
     at = _Places(mi, picture, earlier, dr.select(edge, seen.front, seen.point))
-    same, sharp = [], at.inside & mask
+    same, sharp = [], at.inside & inner
     for index in at.corners:
         place, facing = (dr.gather(mi.Vector4f, memory[i], index) for i in (PLACE, FACING))
-        on = (place.w == SURFACE) & (dr.dot(facing.xyz, seen.normal) > TURNED)
+        on = (place.w > 0) & (dr.dot(facing.xyz, seen.normal) > TURNED)
         on &= dr.abs(dr.dot(place.xyz - seen.point, seen.normal)) < PLANE * seen.distance
-        same.append(at.inside & (edge | (mask & on)))
+        same.append(at.inside & (edge | (inner & on)))
         sharp &= same[-1]
     weights, known = at.weights(same)
     facing, end, s, d, rest = (at.bilinear(memory[i], weights) for i in (FACING, END, S, D, REST))
     most_d = dr.select(edge, MOST_OTHER, MOST_DIFFUSE)
     rays_d = dr.select(known, dr.minimum(d.w, most_d), 0)
     rays_s = dr.select(known & ~narrow, dr.minimum(end.w, MOST_OTHER), 0)
-    edge &= at.inside
-    s, d = at.spline(memory[S], edge, s), _rgb(mi, at.spline(memory[D], sharp | edge, d))
+    followed = edge & at.inside
+    s, d = at.spline(memory[S], followed, s), _rgb(mi, at.spline(memory[D], sharp | followed, d))
     colour, light, squares = picture.clipped(_rgb(mi, s), specular), s.w, facing.w
     d = dr.select(edge, picture.clipped(d, diffuse), d)
 
@@ -227,7 +225,7 @@ def _moved(
     same, sharp = [], at.inside & narrow
     for index in at.corners:
         place, facing, end = (dr.gather(mi.Vector4f, memory[i], index) for i in (PLACE, FACING, END))
-        on = at.inside & narrow & (place.w == SURFACE) & (dr.dot(facing.xyz, seen.normal) > TURNED)
+        on = at.inside & narrow & (place.w > 0) & (dr.dot(facing.xyz, seen.normal) > TURNED)
         same.append(on & (dr.norm(end.xyz - seen.end) < near))
         sharp &= same[-1]
     weights, mirrored = at.weights(same)
@@ -244,7 +242,7 @@ def _rgb(mi: Any, packet: Any) -> Any:
 
 
 PACKETS = PLACE, FACING, END, S, D, REST = range(6)
-"""What a frame leaves behind: P and what the pixel's centre sees (SURFACE, RIM or 0); n and the mean square of the
+"""What a frame leaves behind: P, and 1 where there is one; n and the mean square of the
 luminance of base; where the path ends, and R of S; S and the luminance; D and its R; albedo and alpha. Four values a
 pixel, side by side, which are read at once."""
 
@@ -265,16 +263,14 @@ class _Picture(Pixels):
             beside = dr.select(dr.gather(mi.Bool, mask, index), dr.gather(mi.Float, depth, index), dr.inf)
             nearest = dr.minimum(nearest, beside)
         nearest = dr.select(dr.isfinite(nearest), nearest, 0)
-        rim = ~mask & (nearest > 0)
-        kind = dr.select(mask, SURFACE, dr.select(rim, RIM, 0.0))
         x, y = (mi.Float(self.x) + 0.5 - cx) / fl_x, (mi.Float(self.y) + 0.5 - cy) / fl_y
         sight = mi.Vector3f(right * x - up * y - back)
         stretch, sight = dr.norm(sight), dr.normalize(sight)
         distance, ahead = dr.select(mask, depth, nearest) * stretch, nearest * stretch
         length, end = planes[17], mi.Point3f(*planes[18:21])
         point, front, virtual = (mi.Point3f(origin + sight * far) for far in (distance, ahead, distance + length))
-        edge = rim | (mask & self.is_edge(point, normal, distance, mask))
-        return _Seen(normal, point, kind, edge, front, self.is_even(normal), virtual, end, length, distance)
+        edge = dr.select(mask, self.is_edge(point, normal, distance, mask), nearest > 0)
+        return _Seen(normal, point, mask, edge, front, self.is_even(normal), virtual, end, length, distance)
 
     def is_edge(self, point: Any, normal: Any, distance: Any, mask: Any) -> Any:
         """Whether some of the eight neighbours lie on another surface."""
