@@ -120,6 +120,16 @@ def test_as_few_rays_as_cost_next_to_nothing() -> None:
     assert choose([few, smeared, most], Wanted())[0] is most, "PSNR alone is not enough"
 
 
+def test_smoothed_frames_are_as_clean_as_denoised_ones() -> None:
+    """Or not taken, where nothing is wanted: windows tell grain poorly."""
+    clean = option("base", 40, 33.0, 0.107, spp=4)
+    smooth = clean.model_copy(update={"way": Way(name="base", spp=4, smooth=True), "seconds": 30.0})
+    assert choose([clean, smooth], Wanted())[0] is smooth
+    grainy = smooth.model_copy(update={"lpips": 0.112})
+    assert choose([clean, grainy], Wanted())[0] is clean
+    assert choose([clean, grainy], Wanted(lpips=0.12))[0] is grainy, "asked for"
+
+
 def test_baked_light_that_is_worse_than_good_path_tracing_is_not_taken() -> None:
     """Where it was baked to save time."""
     steady, baked = option("path", 100, 35.0, 0.02, spp=4), option("base", 30, 31.0, 0.06, spp=8)

@@ -14,7 +14,9 @@ from .frame_tasks import Way
 NEAR = 0.5, 1.1
 """Decibels below, and times the LPIPS of, the best of baked light that cheaper frames of it may have: half as many rays
 are half a decibel where a frame is good."""
-
+SMOOTH_ENOUGH = 1.02
+"""Times the LPIPS of denoised frames that smoothed ones of as many rays may have: windows tell grain poorly, since the
+references' own noise is in their LPIPS (`interior`: .112 and .107, in whole frames of 1280x720 .110 and .051)."""
 
 USUAL = 31.0, 0.03
 """PSNR and LPIPS that base images of eight rays have on the pilot's windows, give or take (`food` 31.6 dB, .024; `ship`
@@ -121,8 +123,14 @@ def choose(options: Sequence[Option], wanted: Wanted) -> tuple[Option, str]:
     def is_near(option: Option, other: Option) -> bool:
         return option.reaches(quality(other) - NEAR[0], None if other.lpips is None else other.lpips * NEAR[1])
 
-    best = max(baked, key=quality)
-    aim = min((own for own in baked if is_near(own, best)), key=lambda own: own.seconds)
+    denoised = {own.way.spp: own.lpips for own in baked if own.way.name == "base" and not own.way.smooth}
+
+    def is_clean(own: Option) -> bool:
+        least = denoised.get(own.way.spp) if own.way.smooth else None
+        return least is None or own.lpips is None or own.lpips <= least * SMOOTH_ENOUGH
+
+    best = max(filter(is_clean, baked), key=quality)
+    aim = min((own for own in baked if is_clean(own) and is_near(own, best)), key=lambda own: own.seconds)
     steady = next((o for o in options if o.way.name == "path" and o.way.spp == STEADY and o.reaches(*USUAL)), None)
     if steady is not None and not is_near(aim, steady):
         aim = steady  # good already: light was baked to save time, not to have less than that
