@@ -19,7 +19,7 @@ from dnrpipe.core.cameras import framing, look_at_view, orbit_views
 from dnrpipe.core.images import mean_known, rgba
 from dnrpipe.raytrace.base_renderer import CHAIN, BaseRenderer
 from dnrpipe.raytrace.engine import masked
-from dnrpipe.raytrace.history import History
+from dnrpipe.raytrace.history import MOST_DIFFUSE, History
 from dnrpipe.raytrace.sensors import scaled_view
 from dnrpipe.studies.frames.baselines import METHODS, denoised
 from dnrpipe.studies.frames.ours import Ours
@@ -36,8 +36,13 @@ CLOSER, SIDEWAYS = 0.01, 0.4
 """Of a walk, per frame: share of the distance, degrees about the scene's middle."""
 PAIRS = 3
 """Pairs of frames one after the other that are traced as references, the last of them at the end."""
-PATIENCE = (4, 16)
-"""How many times as many samples of earlier frames the rival keeps as we keep rays."""
+GATHERINGS = {
+    (4, True): "gathered x4, edges",
+    (4, False): "gathered x4",
+    (16, False): "gathered x16",
+}
+"""How many times as many samples of earlier frames the rival keeps as we keep rays; whether edges follow the surface in
+front; names."""
 
 
 def measure(
@@ -185,7 +190,12 @@ class Rivals:
         dark = np.zeros((2, 2, 2, 2, 3), np.float32)
         self.guide = BaseRenderer(mi, scene.engine.scenes[str(scene.bundle)], dark)
         samples = {spp for spp, _ in baselines}
-        self.histories = {(spp, patience): History(mi) for spp in samples for patience in PATIENCE}
+        # Its pictures have grain everywhere: fewer samples count where base images have some at edges alone.
+        self.histories = {
+            (spp, gathering): History(mi, most_other=MOST_DIFFUSE, edges=gathering[1])
+            for spp in samples
+            for gathering in GATHERINGS
+        }
 
     def frame(self, view: View, number: int, clock: Clock, judged: bool) -> dict[str, tuple[Any, float]]:
         """By name: (display picture, ms); of a frame that is not judged nothing but what is gathered."""
@@ -196,10 +206,10 @@ class Rivals:
         paths, gathered, guides = {}, {}, {0: (None, 0.0)}
         for spp in {spp for spp, _ in self.baselines}:
             paths[spp] = clock.time(lambda spp=spp: masked(scene.frames.path(view, spp, seed + spp))[0])
-            for patience in PATIENCE:
-                history = self.histories[spp, patience]
+            for patience, edges in GATHERINGS:
+                history = self.histories[spp, (patience, edges)]
                 taken = _as_base(channels, paths[spp][0], spp / patience)
-                gathered[spp, patience] = clock.time(partial(history.take, view, taken))
+                gathered[spp, (patience, edges)] = clock.time(partial(history.take, view, taken))
         found = {}
         for spp, method in self.baselines if judged else ():
             chosen = METHODS[method]
@@ -209,10 +219,9 @@ class Rivals:
             guide, rays_ms = guides[rays]
             image, ms = paths[spp]
             pictures = {f"{spp} spp {method}": (image, ms)}
-            for patience in PATIENCE:
-                channels_, more = gathered[spp, patience]
-                one = rgba(channels_, "base.")
-                pictures[f"{spp} spp {method}, gathered x{patience}"] = (one, ms + more)
+            for gathering, told in GATHERINGS.items():
+                channels_, more = gathered[spp, gathering]
+                pictures[f"{spp} spp {method}, {told}"] = (rgba(channels_, "base."), ms + more)
             for name, (noisy, spent) in pictures.items():
                 smooth, denoiser_ms = clock.time(partial(denoised, noisy, guide, chosen, rays))
                 if guide is not None:

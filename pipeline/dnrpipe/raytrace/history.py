@@ -78,10 +78,13 @@ class History:
     """Accumulates base images of frames that follow one another, of one size. Needs a jit variant.
 
     ``number`` of the next frame, which `BaseRenderer.frame` wants: how many came before it.
+
+    most_other, edges: MOST_OTHER, and whether edges follow the surface in front: others for pictures that have grain
+    everywhere, which base images have not.
     """
 
-    def __init__(self, mi: Any) -> None:
-        self.mi = mi
+    def __init__(self, mi: Any, *, most_other: float = MOST_OTHER, edges: bool = True) -> None:
+        self.mi, self.most_other, self.edges = mi, most_other, edges
         self.kernel = Recorded(self._kernel)
         self.begin()
 
@@ -131,8 +134,9 @@ class History:
         diffuse, base, albedo = (mi.Color3f(*planes[i : i + 3]) for i in (0, 3, 6))
         alpha, noise, rays = planes[9:12]
         specular, bright = base - diffuse, mi.luminance(base)
-        seen = picture.seen(camera, planes)
-        past = _rested(mi, memory) if resting else _moved(mi, picture, earlier, memory, seen, diffuse, specular)
+        seen = picture.seen(camera, planes, self.edges)
+        parts = diffuse, specular
+        past = _rested(mi, memory) if resting else _moved(mi, picture, earlier, memory, seen, parts, self.most_other)
 
         share, share_d = rays / (rays + past.rays_s), rays / (rays + past.rays_d)
         s, d = dr.lerp(past.s, specular, share), dr.lerp(past.d, diffuse, share_d)
@@ -192,11 +196,12 @@ def _rested(mi: Any, memory: list[Any]) -> _Past:
 
 
 def _moved(
-    mi: Any, picture: _Picture, earlier: Any, memory: list[Any], seen: _Seen, diffuse: Any, specular: Any
+    mi: Any, picture: _Picture, earlier: Any, memory: list[Any], seen: _Seen, parts: tuple[Any, Any], most_other: float
 ) -> _Past:
-    """Looked up where P and V were. diffuse, specular: D and S of the frame."""
+    """Looked up where P and V were. parts: D and S of the frame."""
     import drjit as dr
 
+    diffuse, specular = parts
     edge, inner = seen.edge, seen.mask & ~seen.edge
     narrow = (seen.length > 0) & seen.even & ~edge
     near = DISPLACED * (seen.distance + seen.length) / earlier[1][0]
@@ -212,9 +217,9 @@ def _moved(
         sharp &= same[-1]
     weights, known = at.weights(same)
     facing, end, s, d, rest = (at.bilinear(memory[i], weights) for i in (FACING, END, S, D, REST))
-    most_d = dr.select(edge, MOST_OTHER, MOST_DIFFUSE)
+    most_d = dr.select(edge, most_other, MOST_DIFFUSE)
     rays_d = dr.select(known, dr.minimum(d.w, most_d), 0)
-    rays_s = dr.select(known & ~narrow, dr.minimum(end.w, MOST_OTHER), 0)
+    rays_s = dr.select(known & ~narrow, dr.minimum(end.w, most_other), 0)
     followed = edge & at.inside
     s, d = at.spline(memory[S], followed, s), _rgb(mi, at.spline(memory[D], sharp | followed, d))
     colour, light, squares = picture.clipped(_rgb(mi, s), specular), s.w, facing.w
@@ -233,7 +238,7 @@ def _moved(
     colour = dr.select(mirrored, _rgb(mi, at.spline(memory[S], sharp, s)), colour)
     light = dr.select(mirrored, s.w, light)
     squares = dr.select(mirrored, facing.w, squares)
-    rays_s = dr.select(mirrored, dr.minimum(end.w, dr.select(sharp, MOST_MIRRORED, MOST_OTHER)), rays_s)
+    rays_s = dr.select(mirrored, dr.minimum(end.w, dr.select(sharp, MOST_MIRRORED, most_other)), rays_s)
     return _Past(colour, d, _rgb(mi, rest), rest.w, light, squares, rays_s, rays_d)
 
 
@@ -250,8 +255,8 @@ pixel, side by side, which are read at once."""
 class _Picture(Pixels):
     """What a frame shows at its pixels and about them."""
 
-    def seen(self, camera: Any, planes: list[Any]) -> _Seen:
-        """What the frame sees. planes: of TAKEN."""
+    def seen(self, camera: Any, planes: list[Any], edges: bool) -> _Seen:
+        """What the frame sees. planes: of TAKEN. edges: False: none but about surfaces."""
         import drjit as dr
 
         mi = self.mi
@@ -269,7 +274,9 @@ class _Picture(Pixels):
         distance, ahead = dr.select(mask, depth, nearest) * stretch, nearest * stretch
         length, end = planes[17], mi.Point3f(*planes[18:21])
         point, front, virtual = (mi.Point3f(origin + sight * far) for far in (distance, ahead, distance + length))
-        edge = dr.select(mask, self.is_edge(point, normal, distance, mask), nearest > 0)
+        edge = ~mask & (nearest > 0)
+        if edges:
+            edge |= mask & self.is_edge(point, normal, distance, mask)
         return _Seen(normal, point, mask, edge, front, self.is_even(normal), virtual, end, length, distance)
 
     def is_edge(self, point: Any, normal: Any, distance: Any, mask: Any) -> Any:
