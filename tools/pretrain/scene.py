@@ -177,14 +177,14 @@ def _look(
     def base(way: list[View], view: View, chosen: str) -> dict[str, np.ndarray]:
         """The base image called so, with its G-buffer."""
         samples, _, kind = chosen.partition(" ")
-        renderer = smooth if kind else grainy
+        renderer, tiles = smooth if kind else grainy, not kind
         if kind == "remembered":
             history.begin()
             for frame in way[:-1]:
-                history.take(frame, renderer.frame(frame, int(samples), history.number, tiles=False))
-            channels = history.take(way[-1], renderer.frame(way[-1], int(samples), history.number, tiles=False))
+                history.take(frame, renderer.frame(frame, int(samples), history.number, tiles=tiles))
+            channels = history.take(way[-1], renderer.frame(way[-1], int(samples), history.number, tiles=tiles))
         else:
-            channels = renderer.frame(way[-1], int(samples), tiles=not kind)
+            channels = renderer.frame(way[-1], int(samples), tiles=tiles)
         channels = {**channels, "depth.Z": channels["depth.Z"] / engine.unit_scale}
         channels["coverage"] = silhouettes.coverage(view, channels["mask"] > 0.5, alpha=channels["base.A"])
         return without_grain(channels, renderer) if kind else channels

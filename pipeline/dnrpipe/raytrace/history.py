@@ -35,7 +35,7 @@ import numpy as np
 from dnrtrain.contract import FRESH_CHANNELS, View
 
 from .base_renderer import CHAIN
-from .neighbours import Pixels
+from .neighbours import AROUND, Pixels
 from .recorded import Recorded, aligned, planes_of
 from .sensors import opaque_camera
 
@@ -57,8 +57,6 @@ SPREAD, REACH = 2.5, 2
 LEAST_WEIGHT = 0.2
 """Share of the corners, by their distance, that must lie on the same surface."""
 CORNERS = ((0, 0), (1, 0), (0, 1), (1, 1))
-AROUND = tuple((right, below) for below in (-1, 0, 1) for right in (-1, 0, 1))
-"""A pixel and its eight neighbours."""
 
 COLOURS = tuple(f"{kind}.{c}" for kind in ("diffuse", "base", "albedo") for c in "RGB")
 TAKEN = (

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+AROUND = tuple((right, below) for below in (-1, 0, 1) for right in (-1, 0, 1))
+"""A pixel and its eight neighbours."""
+
 
 class Pixels:
     """Of a frame; beyond the border the last pixel continues. x, y: columns and rows."""

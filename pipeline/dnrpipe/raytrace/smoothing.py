@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from .neighbours import Pixels
+from .neighbours import AROUND, Pixels
 from .recorded import Recorded, aligned, planes_of
 
 LOOSE = 1.5
@@ -58,7 +58,7 @@ class Smoother:
         mi = self.mi
         pixels = Pixels(mi, width, height)
         planes = [dr.gather(mi.Float, taken, pixels.pixel + i * width * height) for i in range(len(TAKEN))]
-        around = [pixels.index(right, below) for below in (-1, 0, 1) for right in (-1, 0, 1)]
+        around = [pixels.index(*place) for place in AROUND]
         diffuse = mi.Color3f(*planes[3:6])
         specular, normal, noise = mi.Color3f(*planes[:3]) - diffuse, mi.Normal3f(*planes[6:9]), planes[11]
         light, place = mi.luminance(specular), dr.select(planes[10] > 0.5, planes[9], -1)  # of no object

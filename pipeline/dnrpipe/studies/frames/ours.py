@@ -92,7 +92,7 @@ class Ours:
     def remember(self, view: View, clock: Clock) -> None:
         """Take in what a frame of a moving camera sees."""
         for (samples, smooth), history in self.histories.items():
-            self._inputs(samples, view, clock, history, tiles=smooth is not False)
+            self._inputs(samples, smooth, view, clock, history)
 
     def frame(self, view: View, clock: Clock, *, remember: bool = False) -> dict[str, dict[str, Any]]:
         """By NEURAL, BASE, SMOOTH and NEURAL_SMOOTH, and the rays per pixel: {"picture": display RGB over white
@@ -103,7 +103,7 @@ class Ours:
         result: dict[str, dict[str, Any]] = {}
         for (samples, smooth), history in self.histories.items():
             memory = history if remember else None
-            channels, parts = self._inputs(samples, view, clock, memory, tiles=smooth is not False)
+            channels, parts = self._inputs(samples, smooth, view, clock, memory)
             rays = "" if samples is None else f", {samples} rays"
             rays += REMEMBERS if remember else ""
             base, neural = (SMOOTH, NEURAL_SMOOTH) if smooth else (BASE, NEURAL)
@@ -134,17 +134,17 @@ class Ours:
         return self.scene.shown(np.concatenate([straight * alpha, alpha], axis=-1))
 
     def _inputs(
-        self, samples: int | None, view: View, clock: Clock, history: History | None, *, tiles: bool = True
+        self, samples: int | None, smooth: bool | None, view: View, clock: Clock, history: History | None
     ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
-        """(channels, not denoised; ms by part). The base image's kernel gives the G-buffer, too. tiles: see
-        `BaseRenderer.frame`."""
+        """(channels, not denoised; ms by part). The base image's kernel gives the G-buffer, too. smooth: of
+        ``histories``."""
         if self.renderer is None or samples is None:
             channels, ms = clock.time(partial(self.scene.frames.gbuffer, view))
             return channels, {"G-buffer": ms}
         scale = self.scene.engine.unit_scale
         number = 0 if history is None else history.number
         asked = (scaled_view(view, scale), samples, number)
-        channels, ms = clock.time(partial(self.renderer.frame, *asked, tiles=tiles))
+        channels, ms = clock.time(partial(self.renderer.frame, *asked, tiles=smooth is not False))
         mask, alpha = channels["mask"] > 0.5, channels["base.A"]
         coverage, finer = clock.time(partial(self.scene.frames.coverage, view, mask, alpha=alpha))
         for name in ("depth.Z", *CHAIN):
