@@ -195,7 +195,7 @@ def test_a_restart_of_the_server_is_no_end_of_a_job(server: Server, start: Calla
 
 def test_a_worker_stopped_in_order_gives_its_job_back(server: Server, start: Callable[..., Elsewhere]) -> None:
     with server.client() as client:
-        longer = TINY | {"cameras.train": 24}  # it must not be done before it is stopped
+        longer = TINY | {"cameras.train": 400}  # it must not be done before it is stopped
         job = _prepare(client, "passed-on", settings=longer)
         first = start("first")
         _working(client, job.id)
