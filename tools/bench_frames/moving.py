@@ -36,13 +36,13 @@ CLOSER, SIDEWAYS = 0.01, 0.4
 """Of a walk, per frame: share of the distance, degrees about the scene's middle."""
 PAIRS = 3
 """Pairs of frames one after the other that are traced as references, the last of them at the end."""
-GATHERINGS = {
-    (4, True): "gathered x4, edges",
-    (4, False): "gathered x4",
-    (16, False): "gathered x16",
+GATHERINGS: dict[str, tuple[float, dict[str, Any]]] = {
+    "gathered x1, edges": (1, {"most_other": MOST_DIFFUSE}),
+    "gathered x1": (1, {"most_other": MOST_DIFFUSE, "edges": False}),
+    "gathered x0.5": (0.5, {"most_other": MOST_DIFFUSE, "edges": False}),
 }
-"""How many times as many samples of earlier frames the rival keeps as we keep rays; whether edges follow the surface in
-front; names."""
+"""By name: how many times as many samples of earlier frames the rival keeps as we keep rays, and options of its history:
+the best found. More is worse: the denoiser takes what was looked up often for a pattern."""
 
 
 def measure(
@@ -190,11 +190,8 @@ class Rivals:
         dark = np.zeros((2, 2, 2, 2, 3), np.float32)
         self.guide = BaseRenderer(mi, scene.engine.scenes[str(scene.bundle)], dark)
         samples = {spp for spp, _ in baselines}
-        # Its pictures have grain everywhere: fewer samples count where base images have some at edges alone.
         self.histories = {
-            (spp, gathering): History(mi, most_other=MOST_DIFFUSE, edges=gathering[1])
-            for spp in samples
-            for gathering in GATHERINGS
+            (spp, name): History(mi, **options) for spp in samples for name, (_, options) in GATHERINGS.items()
         }
 
     def frame(self, view: View, number: int, clock: Clock, judged: bool) -> dict[str, tuple[Any, float]]:
@@ -206,10 +203,9 @@ class Rivals:
         paths, gathered, guides = {}, {}, {0: (None, 0.0)}
         for spp in {spp for spp, _ in self.baselines}:
             paths[spp] = clock.time(lambda spp=spp: masked(scene.frames.path(view, spp, seed + spp))[0])
-            for patience, edges in GATHERINGS:
-                history = self.histories[spp, (patience, edges)]
+            for name, (patience, _) in GATHERINGS.items():
                 taken = _as_base(channels, paths[spp][0], spp / patience)
-                gathered[spp, (patience, edges)] = clock.time(partial(history.take, view, taken))
+                gathered[spp, name] = clock.time(partial(self.histories[spp, name].take, view, taken))
         found = {}
         for spp, method in self.baselines if judged else ():
             chosen = METHODS[method]
@@ -219,9 +215,9 @@ class Rivals:
             guide, rays_ms = guides[rays]
             image, ms = paths[spp]
             pictures = {f"{spp} spp {method}": (image, ms)}
-            for gathering, told in GATHERINGS.items():
-                channels_, more = gathered[spp, gathering]
-                pictures[f"{spp} spp {method}, {told}"] = (rgba(channels_, "base."), ms + more)
+            for name in GATHERINGS:
+                channels_, more = gathered[spp, name]
+                pictures[f"{spp} spp {method}, {name}"] = (rgba(channels_, "base."), ms + more)
             for name, (noisy, spent) in pictures.items():
                 smooth, denoiser_ms = clock.time(partial(denoised, noisy, guide, chosen, rays))
                 if guide is not None:
