@@ -15,7 +15,8 @@ from tests.corner_room import corner_room, onwards, quad, rgb
 
 from dnrpipe.blender.bundle.ply import weld, write_ply
 from dnrpipe.core.images import rgba
-from dnrpipe.raytrace.base_renderer import CENTRES, MEANS, NOISE, BaseRenderer
+from dnrpipe.raytrace.auxiliary import auxiliary_integrator
+from dnrpipe.raytrace.base_renderer import CENTRES, FACING, MEANS, NOISE, SHOWN, BaseRenderer
 from dnrpipe.raytrace.base_worker import Worker, denoised, without_grain
 from dnrpipe.raytrace.engine import Engine
 from dnrpipe.raytrace.history import History
@@ -450,6 +451,31 @@ def test_mirror_shows_the_baked_wall_and_says_where_its_path_ends(tmp_path: Path
     assert (channels["chain.U"][on_floor] > 0.5).all() and (channels["chain.V"][on_floor] < 0.5).all()
     assert channels["chain.weight"][on_floor] == pytest.approx(1, abs=1e-3)
     assert np.abs(channels["diffuse.G"][on_floor]).max() < 0.05 * channels["base.G"][on_floor].max()
+
+
+def test_what_guides_the_denoiser_lies_behind_mirrors_glass_and_holes(tmp_path: Path) -> None:
+    mirror = {"type": "twosided", "b": {"type": "conductor", "specular_reflectance": rgb(0.9, 0.7, 0.5)}}
+    checks = {"type": "checkerboard", "color0": rgb(0.1, 0.6, 0.2), "color1": rgb(0.8, 0.2, 0.7)}
+    wall = {"type": "twosided", "b": {"type": "diffuse", "reflectance": checks}}
+    metal = {"type": "twosided", "b": {"type": "roughconductor", "alpha": 0.4}}
+    things = {
+        "pane": quad(
+            tmp_path / "p.ply",
+            [[-0.9, -0.6, 0.4], [0.1, -0.6, 0.4], [0.1, -0.6, 1.2], [-0.9, -0.6, 1.2]],
+            (0.8, 0.8),
+            {"type": "thindielectric"},
+        ),
+        "block": {"type": "sphere", "center": [0.5, 0.4, 0.4], "radius": 0.3, "bsdf": metal},
+        "hole": {"type": "sphere", "radius": 0.2, "bsdf": {"type": "mask", "opacity": 0.5, "bsdf": wall["b"]}},
+    }
+    scene = corner_room(tmp_path, mirror, wall, {"type": "constant"}, **things)
+    found = rendered(scene, np.ones((2, 2, 8, 8, 3), np.float32), camera(0.2), 256)
+    sensor = mi.load_dict(sensor_dict(mi, camera(0.2)))
+    image = np.array(mi.render(scene, sensor=sensor, integrator=auxiliary_integrator(mi, scene), spp=512, seed=1))
+    for i, name in enumerate((*SHOWN, *FACING)):
+        truth = image[..., i - 6]
+        assert truth.std() > 0.1
+        assert np.abs(found[name] - truth).mean() < 0.02, name
 
 
 def test_frames_repeat_bit_for_bit_and_views_share_one_kernel(tmp_path: Path) -> None:

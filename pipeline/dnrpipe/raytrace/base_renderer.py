@@ -31,9 +31,14 @@ from .sequence import GOLDEN, ORDER, TILE, beginnings, fraction
 
 MAX_RAYS = 1 << 22
 """Of a launch: bounds its memory (about 1 GiB). Larger pictures are rendered in bands of rows."""
+SHOWN = ("shown.R", "shown.G", "shown.B")
+"""Reflectance of what a pixel shows that is neither mirror, smooth glass nor hole, as the module `auxiliary` defines it;
+premultiplied, for denoisers."""
+FACING = ("facing.X", "facing.Y", "facing.Z")
+"""Mean of the shading normals there."""
 MEANS = (
     *("base.R", "base.G", "base.B", "base.A", "diffuse.R", "diffuse.G", "diffuse.B"),
-    *("albedo.R", "albedo.G", "albedo.B"),
+    *("albedo.R", "albedo.G", "albedo.B", *SHOWN, *FACING),
 )
 CHAIN = ("chain.length", "chain.X", "chain.Y", "chain.Z")
 """How far the first ray's path goes behind the first surface by mirrors and clear glass, and where that ends."""

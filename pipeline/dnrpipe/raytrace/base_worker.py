@@ -10,7 +10,7 @@ import numpy as np
 from dnrtrain.contract import FRESH_CHANNELS, View
 from dnrtrain.exr import write_exr
 
-from .base_renderer import CHAIN, BaseRenderer
+from .base_renderer import CHAIN, FACING, SHOWN, BaseRenderer
 from .denoise import denoise, exposure
 from .engine import BundleWorker, masked
 from .frames import Frames
@@ -22,10 +22,10 @@ from .smoothing import Smoother
 from .tasks import BakedCommon, BaseAnswer, BaseTask, SampledCommon
 
 COLOUR = ("base.R", "base.G", "base.B", "base.A")
-PREMULTIPLIED = tuple(f"{kind}.{c}" for kind in ("base", "diffuse", "albedo", "fresh") for c in "RGB")
+PREMULTIPLIED = tuple(f"{kind}.{c}" for kind in ("base", "diffuse", "albedo", "shown", "fresh") for c in "RGB")
 LEAST_ALPHA = 1e-6
-MIRROR = 0.02
-"""Diffuse reflectance below which a surface counts as mirror or glass."""
+WITHIN = (*CHAIN, *SHOWN, *FACING)
+"""Channels that no file holds."""
 
 
 class Worker(BundleWorker):
@@ -62,7 +62,7 @@ class Worker(BundleWorker):
             "masked": self.masked,
         }
         header = {**answer, "fingerprint": task.fingerprint, "view": view.model_dump(mode="json")}
-        write_exr(task.output, {name: plane for name, plane in channels.items() if name not in CHAIN}, header)
+        write_exr(task.output, {name: plane for name, plane in channels.items() if name not in WITHIN}, header)
         return answer
 
     def channels(self, view: View, samples: int | None = None, *, smooth: bool = False) -> dict[str, np.ndarray]:
@@ -171,11 +171,7 @@ def denoised(channels: dict[str, np.ndarray], *, diffuse: bool = True) -> dict[s
     The auxiliary images are not called clean: measured, that is better by half a decibel and more.
     """
     image = np.stack([channels[name] for name in COLOUR[:3]], axis=-1)
-    albedo = np.stack([channels[f"albedo.{c}"] for c in "RGB"], axis=-1)
-    # Open Image Denoise wants white where there is nothing but mirrors and glass.
-    mirror = (albedo.mean(axis=-1, keepdims=True) < MIRROR) & (channels["mask"][..., None] > 0.5)
-    albedo = np.where(mirror, np.float32(1), albedo).clip(0, 1)
-    normal = np.stack([channels[f"normal.{c}"] for c in "XYZ"], axis=-1)
+    albedo, normal = (np.stack([channels[name] for name in names], axis=-1) for names in (SHOWN, FACING))
     level = exposure(image)  # without the diffuse part it may be nearly black
     kept = [] if diffuse else [channels[f"diffuse.{c}"] for c in "RGB"]
     for i, plane in enumerate(kept):

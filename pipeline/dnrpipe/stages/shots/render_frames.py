@@ -20,7 +20,7 @@ from .frame_tasks import FrameTask, Way
 from .records import ShotFrame
 from .renderers import Renderer
 
-FRAMES_VERSION = 7
+FRAMES_VERSION = 8
 FRAME_WORKER = "dnrpipe.stages.shots.frame_worker"
 FRAMES_FOLDER, PICTURES_FOLDER = "frames", "pictures"
 """Of a shot's folder."""
