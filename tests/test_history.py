@@ -68,7 +68,8 @@ def frame(
     for i, c in enumerate("RGB"):
         channels[f"chain.{'XYZ'[i]}"] = end[..., i]
         channels |= {f"base.{c}": colour[..., i], f"diffuse.{c}": diffuse[..., i], f"albedo.{c}": diffuse[..., i]}
-    channels |= {"normal.X": 0 * ones, "normal.Y": 0 * ones, "normal.Z": ones}
+        channels |= {f"shown.{c}": diffuse[..., i]}
+    channels |= {f"{kind}.{axis}": ones * (axis == "Z") for kind in ("normal", "facing") for axis in "XYZ"}
     return {name: np.asarray(values, np.float32) for name, values in channels.items()}
 
 

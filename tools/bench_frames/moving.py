@@ -37,12 +37,13 @@ CLOSER, SIDEWAYS = 0.01, 0.4
 PAIRS = 3
 """Pairs of frames one after the other that are traced as references, the last of them at the end."""
 GATHERINGS: dict[str, tuple[float, dict[str, Any]]] = {
+    "gathered x2, edges": (2, {}),
     "gathered x1, edges": (1, {"most_other": MOST_DIFFUSE}),
     "gathered x1": (1, {"most_other": MOST_DIFFUSE, "edges": False}),
     "gathered x0.5": (0.5, {"most_other": MOST_DIFFUSE, "edges": False}),
 }
-"""By name: how many times as many samples of earlier frames the rival keeps as we keep rays, and options of its history:
-the best found. More is worse: the denoiser takes what was looked up often for a pattern."""
+"""By name: how many times as many samples of earlier frames the rival keeps as we keep rays, options of its history: of
+what was tried, the best. More is worse: the denoiser takes what was looked up often for a pattern."""
 
 
 def measure(

@@ -32,7 +32,7 @@ from .sequence import GOLDEN, ORDER, TILE, beginnings, fraction
 MAX_RAYS = 1 << 22
 """Of a launch: bounds its memory (about 1 GiB). Larger pictures are rendered in bands of rows."""
 SHOWN = ("shown.R", "shown.G", "shown.B")
-"""Reflectance of what a pixel shows that is neither mirror, smooth glass nor hole, as the module `auxiliary` defines it;
+"""Reflectance of what a pixel shows that is neither mirror, smooth glass nor hole, as the module `auxiliary` has it;
 premultiplied, for denoisers."""
 FACING = ("facing.X", "facing.Y", "facing.Z")
 """Mean of the shading normals there."""

@@ -28,13 +28,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
 
 from dnrtrain.contract import FRESH_CHANNELS, View
 
-from .base_renderer import CHAIN
+from .base_renderer import CHAIN, FACING, SHOWN
 from .neighbours import AROUND, Pixels
 from .recorded import Recorded, aligned, planes_of
 from .sensors import opaque_camera
@@ -59,12 +60,10 @@ LEAST_WEIGHT = 0.2
 CORNERS = ((0, 0), (1, 0), (0, 1), (1, 1))
 
 COLOURS = tuple(f"{kind}.{c}" for kind in ("diffuse", "base", "albedo") for c in "RGB")
-TAKEN = (
-    *(*COLOURS, "base.A", "noise", "rays", "normal.X", "normal.Y", "normal.Z", "mask", "depth.Z"),
-    *CHAIN,
-)
+MEANS = (*COLOURS, *SHOWN, *FACING, "base.A")
+TAKEN = (*MEANS, "noise", "rays", "normal.X", "normal.Y", "normal.Z", "mask", "depth.Z", *CHAIN)
 """Channels that a history reads, in the kernel's order."""
-GIVEN = (*COLOURS, "base.A", "noise", "rays")
+GIVEN = (*MEANS, "noise", "rays")
 """Channels that it changes; it adds FRESH_CHANNELS, the frame's own."""
 LEAST_ALPHA = 1e-3
 """Of the frame's own base image, where it is brought to the alpha of what is remembered."""
@@ -129,8 +128,8 @@ class History:
         mi = self.mi
         picture = _Picture(mi, width, height)
         planes = [dr.gather(mi.Float, taken, picture.pixel + i * width * height) for i in range(len(TAKEN))]
-        diffuse, base, albedo = (mi.Color3f(*planes[i : i + 3]) for i in (0, 3, 6))
-        alpha, noise, rays = planes[9:12]
+        diffuse, base, *facts = (mi.Color3f(*planes[i : i + 3]) for i in range(0, 15, 3))
+        alpha, noise, rays = planes[15:18]
         specular, bright = base - diffuse, mi.luminance(base)
         seen = picture.seen(camera, planes, self.edges)
         parts = diffuse, specular
@@ -138,13 +137,15 @@ class History:
 
         share, share_d = rays / (rays + past.rays_s), rays / (rays + past.rays_d)
         s, d = dr.lerp(past.s, specular, share), dr.lerp(past.d, diffuse, share_d)
-        albedo, alpha = dr.lerp(past.albedo, albedo, share_d), dr.lerp(past.alpha, alpha, share_d)
+        facts = [dr.lerp(before, fact, share_d) for before, fact in zip(past.facts, facts, strict=True)]
+        alpha = dr.lerp(past.alpha, alpha, share_d)
         light = dr.lerp(past.light, bright, share)
         squares = dr.lerp(past.squares, bright * bright + noise * noise, share)
         error = dr.sqrt(dr.maximum(squares - light * light, 0) * share)  # of all frames by the variance of one's mean
-        given = [*d, *(s + d), *albedo, alpha, error, rays + past.rays_s]
+        given = [*d, *(s + d), *chain.from_iterable(facts), alpha, error, rays + past.rays_s]
         packets = [(*seen.point, dr.select(seen.mask, 1.0, 0.0)), (*seen.normal, squares)]
-        packets += [(*seen.end, rays + past.rays_s), (*s, light), (*d, rays + past.rays_d), (*albedo, alpha)]
+        packets += [(*seen.end, rays + past.rays_s), (*s, light), (*d, rays + past.rays_d)]
+        packets += [(*fact, alpha) for fact in facts]
         return given, [dr.ravel(mi.Vector4f(*packet)) for packet in packets]
 
 
@@ -170,12 +171,12 @@ class _Seen:
 class _Past:
     """What earlier frames say of each pixel, and how many rays of theirs count (0: nothing is known).
 
-    light, squares: luminance of the base image, and the mean of its square.
+    facts: albedo, SHOWN and FACING. light, squares: luminance of the base image, and the mean of its square.
     """
 
     s: Any
     d: Any
-    albedo: Any
+    facts: list[Any]
     alpha: Any
     light: Any
     squares: Any
@@ -188,9 +189,9 @@ def _rested(mi: Any, memory: list[Any]) -> _Past:
     import drjit as dr
 
     pixel = dr.arange(mi.UInt32, dr.width(memory[S]) // 4)
-    facing, end, s, d, rest = (dr.gather(mi.Vector4f, memory[i], pixel) for i in (FACING, END, S, D, REST))
+    turned, end, s, d, *facts = (dr.gather(mi.Vector4f, memory[i], pixel) for i in (NORMAL, END, S, D, *FACTS))
     counts = [dr.minimum(rays, MOST_RESTING) for rays in (end.w, d.w)]
-    return _Past(_rgb(mi, s), _rgb(mi, d), _rgb(mi, rest), rest.w, s.w, facing.w, *counts)
+    return _Past(_rgb(mi, s), _rgb(mi, d), [_rgb(mi, one) for one in facts], facts[0].w, s.w, turned.w, *counts)
 
 
 def _moved(
@@ -208,13 +209,13 @@ def _moved(
     at = _Places(mi, picture, earlier, dr.select(edge, seen.front, seen.point))
     same, sharp = [], at.inside & inner
     for index in at.corners:
-        place, facing = (dr.gather(mi.Vector4f, memory[i], index) for i in (PLACE, FACING))
+        place, facing = (dr.gather(mi.Vector4f, memory[i], index) for i in (PLACE, NORMAL))
         on = (place.w > 0) & (dr.dot(facing.xyz, seen.normal) > TURNED)
         on &= dr.abs(dr.dot(place.xyz - seen.point, seen.normal)) < PLANE * seen.distance
         same.append(at.inside & (edge | (inner & on)))
         sharp &= same[-1]
     weights, known = at.weights(same)
-    facing, end, s, d, rest = (at.bilinear(memory[i], weights) for i in (FACING, END, S, D, REST))
+    facing, end, s, d, *facts = (at.bilinear(memory[i], weights) for i in (NORMAL, END, S, D, *FACTS))
     most_d = dr.select(edge, most_other, MOST_DIFFUSE)
     rays_d = dr.select(known, dr.minimum(d.w, most_d), 0)
     rays_s = dr.select(known & ~narrow, dr.minimum(end.w, most_other), 0)
@@ -227,27 +228,27 @@ def _moved(
     at = _Places(mi, picture, earlier, seen.virtual)
     same, sharp = [], at.inside & narrow
     for index in at.corners:
-        place, facing, end = (dr.gather(mi.Vector4f, memory[i], index) for i in (PLACE, FACING, END))
+        place, facing, end = (dr.gather(mi.Vector4f, memory[i], index) for i in (PLACE, NORMAL, END))
         on = at.inside & narrow & (place.w > 0) & (dr.dot(facing.xyz, seen.normal) > TURNED)
         same.append(on & (dr.norm(end.xyz - seen.end) < near))
         sharp &= same[-1]
     weights, mirrored = at.weights(same)
-    s, end, facing = (at.bilinear(memory[i], weights) for i in (S, END, FACING))
+    s, end, facing = (at.bilinear(memory[i], weights) for i in (S, END, NORMAL))
     colour = dr.select(mirrored, _rgb(mi, at.spline(memory[S], sharp, s)), colour)
     light = dr.select(mirrored, s.w, light)
     squares = dr.select(mirrored, facing.w, squares)
     rays_s = dr.select(mirrored, dr.minimum(end.w, dr.select(sharp, MOST_MIRRORED, most_other)), rays_s)
-    return _Past(colour, d, _rgb(mi, rest), rest.w, light, squares, rays_s, rays_d)
+    return _Past(colour, d, [_rgb(mi, one) for one in facts], facts[0].w, light, squares, rays_s, rays_d)
 
 
 def _rgb(mi: Any, packet: Any) -> Any:
     return mi.Color3f(packet.x, packet.y, packet.z)
 
 
-PACKETS = PLACE, FACING, END, S, D, REST = range(6)
-"""What a frame leaves behind: P, and 1 where there is one; n and the mean square of the
-luminance of base; where the path ends, and R of S; S and the luminance; D and its R; albedo and alpha. Four values a
-pixel, side by side, which are read at once."""
+PACKETS = PLACE, NORMAL, END, S, D, *FACTS = range(8)
+"""What a frame leaves behind: P, and 1 where there is one; n and the mean square of the luminance of base; where the
+path ends, and R of S; S and the luminance; D and its R; albedo, SHOWN and FACING, each with alpha. Four values a pixel,
+side by side, which are read at once."""
 
 
 class _Picture(Pixels):
@@ -259,7 +260,7 @@ class _Picture(Pixels):
 
         mi = self.mi
         (right, up, back, origin), (fl_x, fl_y, cx, cy), _ = camera
-        normal, mask, depth = mi.Normal3f(*planes[12:15]), planes[15] > 0.5, planes[16]
+        normal, mask, depth = mi.Normal3f(*planes[18:21]), planes[21] > 0.5, planes[22]
         nearest = mi.Float(dr.inf)  # of the neighbours that see a surface
         for right_, below in AROUND:
             index = self.index(right_, below)
@@ -270,7 +271,7 @@ class _Picture(Pixels):
         sight = mi.Vector3f(right * x - up * y - back)
         stretch, sight = dr.norm(sight), dr.normalize(sight)
         distance, ahead = dr.select(mask, depth, nearest) * stretch, nearest * stretch
-        length, end = planes[17], mi.Point3f(*planes[18:21])
+        length, end = planes[23], mi.Point3f(*planes[24:27])
         point, front, virtual = (mi.Point3f(origin + sight * far) for far in (distance, ahead, distance + length))
         edge = ~mask & (nearest > 0)
         if edges:
