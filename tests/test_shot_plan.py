@@ -17,7 +17,8 @@ from dnrpipe.core.shot_records import told_frames
 from dnrpipe.stages.base_images import CHUNK, WARM_UP
 from dnrpipe.stages.shots import render_frames
 from dnrpipe.stages.shots.check import held_out
-from dnrpipe.stages.shots.frame_tasks import FrameCommon, Way
+from dnrpipe.stages.shots.frame_tasks import FrameCommon, FrameTask, Way
+from dnrpipe.stages.shots.frame_worker import Worker
 from dnrpipe.stages.shots.open_shot import parse_size, resized
 from dnrpipe.stages.shots.options import Option, Wanted, choose
 from dnrpipe.stages.shots.pilot import Measured, Pilot, _Process, _Window, best_mix, reckoned
@@ -33,7 +34,7 @@ from dnrpipe.stages.shots.plan_shot import (
 )
 from dnrpipe.stages.shots.records import ShotFrame
 from dnrpipe.stages.shots.references import Truth
-from dnrpipe.stages.shots.render_frames import frame_tasks
+from dnrpipe.stages.shots.render_frames import frame_tasks, in_succession
 from dnrpipe.stages.shots.renderers import Renderer
 from dnrpipe.stages.shots.request import carry_out
 from dnrpipe.workers.task_list import TaskResult
@@ -287,6 +288,35 @@ def test_outcomes_come_in_the_order_of_their_tasks(tmp_path, monkeypatch) -> Non
     renderer: Any = SimpleNamespace(common=SimpleNamespace(data=dict), environment={})
     found = render_frames.frame_outcomes(run, renderer, tasks, "frames")
     assert [outcome.result for outcome in found] == [{"seconds": float(i)} for i in range(4)]
+
+
+def test_a_frame_is_rendered_while_the_one_before_is_written(tmp_path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    tasks = in_succession(frame_tasks(frames(3, cut=3), tmp_path, Way(name="path", spp=4), "inputs"))
+    assert [None if task.following is None else task.following.output for task in tasks] == [
+        *(task.output for task in tasks[1:]),
+        None,
+    ]
+    worker: Any = object.__new__(Worker)
+    worker.ahead = None
+    rendered, written, broken = [], [], [1]
+
+    def render(task: FrameTask, _ms: dict[str, float]) -> tuple[list[Any], int]:
+        assert task.following is None
+        rendered.append(tasks.index(next(other for other in tasks if other.output == task.output)))
+        if rendered[-1] in broken:
+            broken.clear()
+            raise ValueError("broken once")
+        return [{}], 0
+
+    def write(task: FrameTask) -> None:
+        written.append((task.output, len(rendered)))
+
+    monkeypatch.setattr(worker, "render", render, raising=False)
+    monkeypatch.setattr(worker, "_write", lambda found: write(found.task), raising=False)
+    for number, task in enumerate(tasks):
+        answer = worker(task.data())
+        assert written[number][0] == task.output and answer["write_seconds"] >= 0
+    assert rendered == [0, 1, 1, 2], "the one that failed beside the first is rendered again"
 
 
 def test_windows_that_show_nothing_do_not_count() -> None:

@@ -40,7 +40,7 @@ from dnrpipe.stages.shots.frame_tasks import FrameTask, Way
 from dnrpipe.stages.shots.make_shot import lpips_of
 from dnrpipe.stages.shots.open_shot import parse_size
 from dnrpipe.stages.shots.references import compared, display_of, shown
-from dnrpipe.stages.shots.render_frames import FRAMES_FOLDER, frame_outcomes
+from dnrpipe.stages.shots.render_frames import FRAMES_FOLDER, frame_outcomes, in_succession
 from dnrpipe.stages.shots.renderers import path_tracer
 from dnrpipe.stages.stage import Run
 from dnrpipe.workers.task_list import run_tasks
@@ -183,6 +183,7 @@ def beside(root: Path, views: Sequence[View], pairs: Sequence[tuple[int, int]]) 
             for number in numbers
         ]
         spent = []
+        tasks = in_succession(tasks)  # as a shot's own
         for task, outcome in zip(tasks, frame_outcomes(run, tracer, tasks, "beside"), strict=True):
             if outcome.result is None:
                 raise SystemExit(f"{task.output}: {outcome.error}")

@@ -46,6 +46,7 @@ def test_a_ball_rolls_and_the_frames_are_right(tmp_path: Path) -> None:
     assert shown[inside, 0].mean() > 2 * shown[inside, 2].mean()  # red, where the frame's numbers say that it is
 
     before = {path.name: path.stat().st_mtime_ns for path in (shot / "frames").glob("*.exr")}
+    second, _ = read_exr(shot / "frames" / "00002.exr")
     (shot / "frames" / "00002.exr").unlink()
     for name in ("00003.png", "00004.png"):  # of frames with moving things one that is not checked, and one that is
         (shot / "pictures" / name).unlink()
@@ -55,6 +56,8 @@ def test_a_ball_rolls_and_the_frames_are_right(tmp_path: Path) -> None:
     after = {path.name: path.stat().st_mtime_ns for path in (shot / "frames").glob("*.exr")}
     assert {name for name in before if after[name] != before[name]} == {"00002.exr", "00003.exr", "00004.exr"}
     np.testing.assert_array_equal(read_exr(shot / "frames" / "00001.exr")[0]["R"], pixels)
+    # Rendered while the first was written, or by itself.
+    np.testing.assert_array_equal(read_exr(shot / "frames" / "00002.exr")[0]["R"], second["R"])
 
 
 @pytest.mark.robustness

@@ -88,6 +88,7 @@ class FrameTask(Task):
         plain: where the base image alone goes, too; of ``neural``. For comparison: it has no picture.
         earlier: the frames of the camera's way that this one remembers (`raytrace.history`), in their order; None: it
             stands alone. number: of the first of them in the camera's way.
+        following: the task that will come next. It is rendered while this frame is written, which keeps all cores busy.
     """
 
     view: View
@@ -101,13 +102,15 @@ class FrameTask(Task):
     picture: Path
     plain: Path | None = None
     fingerprint: str
+    following: FrameTask | None = None
 
 
 class FrameAnswer(Costs):
-    """Also in the header of the file, but for the seconds that writing it took.
+    """Also in the header of the file, but for the seconds that writing it took longer than rendering what follows.
 
     masked: pixels that were not finite and are 0. ms: milliseconds of the parts. The seconds, not the milliseconds,
-    leave out what recording kernels took.
+    leave out what recording kernels took. Rendered while the frame before is written, a frame's have that one's
+    processor seconds of writing.
     """
 
     way: str

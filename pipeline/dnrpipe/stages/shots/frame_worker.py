@@ -6,10 +6,12 @@ scene's view transform.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +44,15 @@ EACH = 16
 Layers = dict[str, np.ndarray]
 
 
+@dataclass(frozen=True)
+class _Rendered:
+    """A frame that is not written yet. layers: see `Worker.render`."""
+
+    task: FrameTask
+    layers: list[Layers]
+    answer: FrameAnswer
+
+
 class Worker:
     """Renders frames. common: a `FrameCommon`; task: a `FrameTask`."""
 
@@ -57,6 +68,7 @@ class Worker:
             functools.partial(Frames, self.engine, settings.bundle, settings.integrator, settings.max_depth)
         )  # by (width, height)
         self.background = Background(self.engine, settings.bundle) if settings.background else None
+        self.ahead: _Rendered | None = None
 
     @functools.cached_property
     def model(self) -> Any:
@@ -71,11 +83,26 @@ class Worker:
 
     def __call__(self, asked: dict[str, Any]) -> FrameAnswer:
         task = FrameTask.model_validate(asked)
+        alone, following = task.model_copy(update={"following": None}), task.following
+        rendered = self.ahead if self.ahead is not None and self.ahead.task == alone else self._rendered(alone)
+        self.ahead = None
+        began, beside = time.monotonic(), 0.0
+        with ThreadPoolExecutor(1) as writer:
+            written = writer.submit(self._write, rendered)
+            if following is not None:
+                # What goes wrong here does so again when the frame is asked for.
+                with contextlib.suppress(Exception):
+                    self.ahead = self._rendered(following)
+                beside = time.monotonic() - began
+            written.result()
+        return {**rendered.answer, "write_seconds": time.monotonic() - began - beside}
+
+    def _rendered(self, task: FrameTask) -> _Rendered:
         ms: dict[str, float] = {}
         if task.way.name == "neural":
             assert self.model is not None  # loaded by now: that is no part of a frame
         watch = Stopwatch()
-        (layers, *plain), lost = self.render(task, ms)
+        found, lost = self.render(task, ms)
         answer: FrameAnswer = {
             **watch.costs(),
             "way": task.way.name,
@@ -83,8 +110,11 @@ class Worker:
             "masked": lost,
             "ms": {name: round(value, 2) for name, value in ms.items()},
         }
-        header = {**answer, "fingerprint": task.fingerprint, "view": task.view.model_dump(mode="json")}
-        began = time.monotonic()
+        return _Rendered(task, found, answer)
+
+    def _write(self, rendered: _Rendered) -> None:
+        task, (layers, *plain) = rendered.task, rendered.layers
+        header = {**rendered.answer, "fingerprint": task.fingerprint, "view": task.view.model_dump(mode="json")}
         for path in (task.output, task.picture):
             path.parent.mkdir(parents=True, exist_ok=True)
         task.picture.unlink(missing_ok=True)  # an older one beside a new frame would pass for its picture
@@ -92,10 +122,8 @@ class Worker:
             picture = beside.submit(self._write_picture, task.picture, layers)
             write_exr(task.output, layers, header, half=HALF)
             picture.result()
-        answer["write_seconds"] = time.monotonic() - began
         if task.plain is not None:
             write_exr(task.plain, plain[0], header, half=HALF)
-        return answer
 
     def render(self, task: FrameTask, ms: dict[str, float]) -> tuple[list[Layers], int]:
         """(channels of LAYERS, float32 [H, W] each, of the frame and, if wanted, of its base image; pixels that were

@@ -27,7 +27,7 @@ from ..trust import SHARES
 from .frame_tasks import NETWORK, FrameTask, Way
 from .records import ShotFrame
 from .references import FEWEST, SEED, SPP, Truth, compared, decibels, display_of, shown
-from .render_frames import frame_outcomes
+from .render_frames import frame_outcomes, in_succession
 from .renderers import Renderer
 
 FRAMES, SIZE = 2, (192, 108)
@@ -117,8 +117,10 @@ class Pilot:
         for _ in range(0 if known else 2):  # the first one readies what its size takes, and takes up to twice as long
             keys.append(None)
             tasks.append(self._task(ways[0], self.windows[0][0], None, None if tracing else (), len(tasks), 0))
+        if not known:
+            tasks[-2:] = in_succession(tasks[-2:])
         found: dict[Way, list[_Window]] = {}
-        start, spent, kept = None, 0.0, self.run.kept
+        start, whole, writing, kept = None, 0.0, 0.0, self.run.kept
         label = "pilot: " + ("path tracing" if tracing else "base image and network")
         with (
             closing(frame_outcomes(self.run, renderer, tasks, "pilot")) as outcomes,
@@ -138,6 +140,8 @@ class Pilot:
                     height=task.view.height,
                 )
                 spent = outcome.result["seconds"] + outcome.result["write_seconds"]
+                # Of a whole frame, what writing the one before took longer than rendering this one.
+                whole, writing = outcome.result["seconds"] + writing, outcome.result["write_seconds"]
                 if start is None:
                     asked = outcome.seconds if kept is None else time.monotonic() - kept.started
                     start = max(0.0, asked - spent)
@@ -154,7 +158,7 @@ class Pilot:
         if not known:
             own = [row.spent for row in found[ways[0]] if self.windows[row.key][0] == self.windows[0][0]]
             pixel = float(np.mean(own)) / _pixels(tasks[0].view)
-            self.processes[tracing] = _Process(start or 0.0, spent / _pixels(tasks[-1].view) / pixel)
+            self.processes[tracing] = _Process(start or 0.0, whole / _pixels(tasks[-1].view) / pixel)
         self.references |= {key: Truth.of(pictures) for key, pictures in drawn.items()}
         self.rows |= found
         return [self._measured(way, rows) for way, rows in found.items()]

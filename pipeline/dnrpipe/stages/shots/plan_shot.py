@@ -25,7 +25,7 @@ from .pilot import LADDER, MOST, Measured, Pilot, reckoned
 from .records import ShotFrame
 from .renderers import Renderer, shipped_renderer
 
-FEWER = (4,)
+FEWER = (4, 6)
 """Rays per pixel of base images that are tried beside the settings'."""
 SMOOTH = (4, 8)
 """The same of base images that are smoothed instead of denoised: that takes as long as three to eight rays do, and does

@@ -22,6 +22,8 @@ from .renderers import Renderer
 
 FRAMES_VERSION = 8
 FRAME_WORKER = "dnrpipe.stages.shots.frame_worker"
+MOST_AHEAD = 1 << 22
+"""Pixels of a frame beside which the next one is rendered."""
 FRAMES_FOLDER, PICTURES_FOLDER = "frames", "pictures"
 """Of a shot's folder."""
 
@@ -92,6 +94,16 @@ def is_whole(task: FrameTask) -> bool:
     return task.picture.exists() and is_made(task.data())
 
 
+def in_succession(tasks: Sequence[FrameTask]) -> list[FrameTask]:
+    """The tasks, each but the last with the one that follows it, which is rendered while it is written. Not of pictures
+    so large that two of them would take too much memory."""
+    followed = zip(tasks, [*tasks[1:], None], strict=True)
+    return [
+        task.model_copy(update={"following": after if task.view.width * task.view.height <= MOST_AHEAD else None})
+        for task, after in followed
+    ]
+
+
 def be_ready(run: Run, renderer: Renderer) -> None:
     """Start the run's kept process, which gets ready for the renderer's frames while this one goes on."""
     if run.kept is not None:
@@ -129,11 +141,12 @@ def render_frames(
     for task in tasks:
         if not task.picture.exists():  # a frame is both of its files
             task.output.unlink(missing_ok=True)
+    made, due = ([task for task in tasks if is_whole(task) is whole] for whole in (True, False))
     run.view_tasks(
         label,
         FRAME_WORKER,
         renderer.common.data(),
-        [task.data() for task in tasks],
+        [task.data() for task in (*made, *in_succession(due))],
         workers=1,  # its kernels keep all cores busy
         book=book,
         environment=renderer.environment,
