@@ -20,7 +20,6 @@ from dnrpipe.core.images import mean_known, rgba
 from dnrpipe.raytrace.base_renderer import CHAIN, BaseRenderer
 from dnrpipe.raytrace.engine import masked
 from dnrpipe.raytrace.history import MOST_DIFFUSE, History
-from dnrpipe.raytrace.sensors import scaled_view
 from dnrpipe.studies.frames.baselines import METHODS, denoised
 from dnrpipe.studies.frames.ours import Ours
 from dnrpipe.studies.frames.scene import BenchScene, Clock
@@ -187,20 +186,17 @@ class Rivals:
 
     def __init__(self, scene: BenchScene, ours: Ours, baselines: list[tuple[int, str]]) -> None:
         self.scene, self.baselines = scene, baselines
-        mi = scene.engine.mi
-        dark = np.zeros((2, 2, 2, 2, 3), np.float32)
-        self.guide = BaseRenderer(mi, scene.engine.scenes[str(scene.bundle)], dark)
+        engine, dark = scene.engine, np.zeros((2, 2, 2, 2, 3), np.float32)
+        self.guide = BaseRenderer(engine.mi, engine.scenes[str(scene.bundle)], dark, unit_scale=engine.unit_scale)
         samples = {spp for spp, _ in baselines}
         self.histories = {
-            (spp, name): History(mi, **options) for spp in samples for name, (_, options) in GATHERINGS.items()
+            (spp, name): History(engine.mi, **options) for spp in samples for name, (_, options) in GATHERINGS.items()
         }
 
     def frame(self, view: View, number: int, clock: Clock, judged: bool) -> dict[str, tuple[Any, float]]:
         """By name: (display picture, ms); of a frame that is not judged nothing but what is gathered."""
         scene, seed = self.scene, 1_000_003 * (number + 1)
-        channels = self.guide.frame(scaled_view(view, scene.engine.unit_scale), 1)
-        for name in ("depth.Z", *CHAIN):
-            channels[name] = channels[name] / scene.engine.unit_scale
+        channels = self.guide.frame(view, 1)
         paths, gathered, guides = {}, {}, {0: (None, 0.0)}
         for spp in {spp for spp, _ in self.baselines}:
             paths[spp] = clock.time(lambda spp=spp: masked(scene.frames.path(view, spp, seed + spp))[0])

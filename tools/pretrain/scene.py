@@ -157,7 +157,6 @@ def _look(
     from dnrpipe.raytrace.lightmap import LightBaker
     from dnrpipe.raytrace.noise import half_noise
     from dnrpipe.raytrace.pictures import finished, repair
-    from dnrpipe.raytrace.sensors import scaled_view
     from dnrpipe.raytrace.texels import grouped_meshes
 
     bundle = workspace.scene / "scene.xml"
@@ -168,10 +167,11 @@ def _look(
     size, spp = LIGHT_MAPS[seed % len(LIGHT_MAPS)]
     light = LightBaker(engine.mi, scene, indirect, grouped_meshes(bundle)).bake(size, spp, seed)
     took("light")
-    scaled = [[scaled_view(view, engine.unit_scale) for view in way] for way in ways]
     views = [way[-1] for way in ways]
     silhouettes = Frames(engine, bundle, "path", 2, (views[0].width, views[0].height))
-    grainy, smooth = (BaseRenderer(engine.mi, scene, light, gloss=gloss) for gloss in (True, False))
+    grainy, smooth = (
+        BaseRenderer(engine.mi, scene, light, gloss=gloss, unit_scale=engine.unit_scale) for gloss in (True, False)
+    )
     history = History(engine.mi)
 
     def base(way: list[View], view: View, chosen: str) -> dict[str, np.ndarray]:
@@ -185,11 +185,10 @@ def _look(
             channels = history.take(way[-1], renderer.frame(way[-1], int(samples), history.number, tiles=tiles))
         else:
             channels = renderer.frame(way[-1], int(samples), tiles=tiles)
-        channels = {**channels, "depth.Z": channels["depth.Z"] / engine.unit_scale}
         channels["coverage"] = silhouettes.coverage(view, channels["mask"] > 0.5, alpha=channels["base.A"])
         return without_grain(channels, renderer) if kind else channels
 
-    bases = {chosen: [base(way, view, chosen) for way, view in zip(scaled, views, strict=True)] for chosen in inputs}
+    bases = {chosen: [base(way, view, chosen) for way, view in zip(ways, views, strict=True)] for chosen in inputs}
     took("base images")
     integrator, _ = engine.integrator(bundle, plan.integrator, DEPTH)
     pictures, noises = [], []

@@ -26,7 +26,7 @@ import numpy as np
 from .engine import masked_channels
 from .lightmap import light_texture
 from .recorded import Recorded, planes_of, prepare_emitters
-from .sensors import Camera, opaque_camera
+from .sensors import Camera, opaque_camera, scaled_view
 from .sequence import GOLDEN, ORDER, TILE, beginnings, fraction
 
 MAX_RAYS = 1 << 22
@@ -63,16 +63,17 @@ class BaseRenderer:
         mi: the mitsuba module, a jit variant set.
         light: E and S of the front and of the back, float32 [2, 2, size, size, 3], row 0 at V = 0.
         gloss: see `SpecularPaths`.
+        unit_scale: the scene's units per unit of the views (`sensors.unit_scale`).
 
     ``lets_through``: a surface lets light straight through, so that also the diffuse part of a pixel has grain.
     Of the last frame: ``repaired`` pixels had samples with parts that were not finite and are left out; ``masked``
     pixels were not finite all the same, and are 0.
     """
 
-    def __init__(self, mi: Any, scene: Any, light: np.ndarray, *, gloss: bool = True) -> None:
+    def __init__(self, mi: Any, scene: Any, light: np.ndarray, *, gloss: bool = True, unit_scale: float = 1.0) -> None:
         from .specular_paths import SpecularPaths  # imports Mitsuba
 
-        self.mi, self.scene = mi, scene
+        self.mi, self.scene, self.unit_scale = mi, scene, unit_scale
         self.repaired = self.masked = 0
         self.paths = SpecularPaths(scene, gloss=gloss)
         self.light = light_texture(mi, light, gloss=self.paths.ends_at_rough)
@@ -85,8 +86,8 @@ class BaseRenderer:
     def frame(self, view: Any, samples: int, number: int = 0, *, tiles: bool = True) -> dict[str, np.ndarray]:
         """Channels of BASE_CHANNELS and of the G-buffer: float32 [H, W] each, linear Rec.709, premultiplied.
 
-        view: in the bundle's units, as are ``depth.Z`` and those of CHAIN. samples: K, rays per pixel. number: of the
-        frame among those that remember; frames of other numbers cast other rays but for the first of each pixel.
+        view: in scene units, as are ``depth.Z`` and those of CHAIN. samples: K, rays per pixel. number: of the frame
+        among those that remember; frames of other numbers cast other rays but for the first of each pixel.
         tiles: samples of neighbouring pixels complement one another, as those want who smooth them; not: as denoisers
         want (`sequence`).
         ``coverage`` is base.A, at most 1. Where cut-outs stand one behind the other, base.A can be above 1 as the
@@ -95,7 +96,7 @@ class BaseRenderer:
         import drjit as dr
 
         mi = self.mi
-        camera = opaque_camera(mi, view)
+        camera = opaque_camera(mi, scaled_view(view, self.unit_scale))
         rays = dr.opaque(mi.UInt32, samples)  # as data: the kernel is the same for all numbers of them
         turn, tiled = dr.opaque(mi.UInt32, number % FRAMES), dr.opaque(mi.UInt32, int(tiles))
         names = (LOST, *MEANS, *CENTRES, NOISE)
@@ -118,6 +119,8 @@ class BaseRenderer:
         channels, self.masked = masked_channels(channels)
         for name in (*GBUFFER, *CHAIN):
             channels[name] *= channels["mask"]
+        for name in ("depth.Z", *CHAIN):
+            channels[name] /= self.unit_scale
         rays = np.full(shape, samples, np.float32)
         return channels | {"coverage": np.minimum(channels["base.A"], 1), "rays": rays}
 

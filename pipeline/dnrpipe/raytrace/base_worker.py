@@ -17,7 +17,6 @@ from .frames import Frames
 from .history import History
 from .light_worker import read_light
 from .recorded import Stopwatch
-from .sensors import scaled_view
 from .smoothing import Smoother
 from .tasks import BakedCommon, BaseAnswer, BaseTask, SampledCommon
 
@@ -41,7 +40,9 @@ class Worker(BundleWorker):
         light = read_light(self.common.light) if isinstance(self.common, BakedCommon) else dark
         scene = self.engine.scenes[str(self.bundle)]
         self.denoise = isinstance(self.common, BakedCommon) and self.common.denoise
-        self.renderer = BaseRenderer(self.engine.mi, scene, light, gloss=not self.denoise)
+        self.renderer = BaseRenderer(
+            self.engine.mi, scene, light, gloss=not self.denoise, unit_scale=self.engine.unit_scale
+        )
         self.smoother = Smoother(self.engine.mi)
         self.silhouettes: dict[tuple[int, int], Frames] = {}
         self.history, self.seen = History(self.engine.mi), list[tuple[View, int | None, int]]()
@@ -80,12 +81,9 @@ class Worker(BundleWorker):
     ) -> dict[str, np.ndarray]:
         """`channels` by the kernel alone: not denoised, not path-traced. number: see `BaseRenderer.frame`. smooth:
         they will be smoothed, not denoised."""
-        renderer, scaled = self.renderer, scaled_view(view, self.engine.unit_scale)
-        tiles = smooth or not self.denoise
-        channels = renderer.frame(scaled, samples or self.common.samples, number, tiles=tiles)
+        renderer, tiles = self.renderer, smooth or not self.denoise
+        channels = renderer.frame(view, samples or self.common.samples, number, tiles=tiles)
         self.repaired, self.masked = self.repaired + renderer.repaired, self.masked + renderer.masked
-        for name in ("depth.Z", *CHAIN):
-            channels[name] /= self.engine.unit_scale
         channels["coverage"] = self._frames(view).coverage(view, channels["mask"] > 0.5, alpha=channels["base.A"])
         return channels
 

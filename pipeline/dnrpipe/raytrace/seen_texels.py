@@ -12,7 +12,6 @@ from dnrtrain.contract import View
 from ..core.cameras import scaled_to
 from .base_renderer import BaseRenderer
 from .denoise import beside
-from .sensors import scaled_view
 
 CELLS = 256
 """Of the atlas' side: fine enough to tell its charts apart, and large enough that small pictures leave no gaps."""
@@ -26,10 +25,10 @@ def seen_cells(mi: Any, scene: Any, views: Sequence[View], unit_scale: float) ->
     views: in scene units; unit_scale: the bundle's units per scene unit. One path a pixel says what mirrors and glass
     show: other paths in each view.
     """
-    renderer = BaseRenderer(mi, scene, np.zeros((2, 2, 2, 2, 3), np.float32), gloss=False)
+    renderer = BaseRenderer(mi, scene, np.zeros((2, 2, 2, 2, 3), np.float32), gloss=False, unit_scale=unit_scale)
     cells = np.zeros((CELLS, CELLS), bool)
     for number, view in enumerate(views):
-        channels = renderer.frame(scaled_view(scaled_to(view, SIDE), unit_scale), 1, number)
+        channels = renderer.frame(scaled_to(view, SIDE), 1, number)
         for mask, *place in (("mask", "uv.U", "uv.V"), ("chain.mask", "chain.U", "chain.V")):
             hit = channels[mask] > 0.5
             column, row = ((channels[name][hit] * CELLS).astype(int).clip(0, CELLS - 1) for name in place)

@@ -20,11 +20,10 @@ from dnrtrain.exr import write_exr
 from dnrtrain.model import render_views
 
 from ...core.errors import UserError
-from ...raytrace.base_renderer import CHAIN, BaseRenderer
+from ...raytrace.base_renderer import BaseRenderer
 from ...raytrace.base_worker import denoised, with_coverage
 from ...raytrace.history import History
 from ...raytrace.light_worker import read_light
-from ...raytrace.sensors import scaled_view
 from ...raytrace.smoothing import Smoother
 from ...stages.base_images import light_path
 from .scene import BenchScene, Clock
@@ -76,7 +75,9 @@ class Ours:
                 raise UserError(f"{light}: the light is not baked; run `dnrpipe finetune` with model.base=baked first")
             mitsuba_scene = scene.engine.scenes[str(scene.bundle)]
             gloss = not scene.settings.base.denoise
-            self.renderer = BaseRenderer(scene.engine.mi, mitsuba_scene, read_light(light), gloss=gloss)
+            self.renderer = BaseRenderer(
+                scene.engine.mi, mitsuba_scene, read_light(light), gloss=gloss, unit_scale=scene.engine.unit_scale
+            )
             counts = samples or (scene.settings.base.samples,)
         self.smoother = Smoother(scene.engine.mi)
         denoises = self.renderer is not None and scene.settings.base.denoise
@@ -141,14 +142,10 @@ class Ours:
         if self.renderer is None or samples is None:
             channels, ms = clock.time(partial(self.scene.frames.gbuffer, view))
             return channels, {"G-buffer": ms}
-        scale = self.scene.engine.unit_scale
         number = 0 if history is None else history.number
-        asked = (scaled_view(view, scale), samples, number)
-        channels, ms = clock.time(partial(self.renderer.frame, *asked, tiles=smooth is not False))
+        channels, ms = clock.time(partial(self.renderer.frame, view, samples, number, tiles=smooth is not False))
         mask, alpha = channels["mask"] > 0.5, channels["base.A"]
         coverage, finer = clock.time(partial(self.scene.frames.coverage, view, mask, alpha=alpha))
-        for name in ("depth.Z", *CHAIN):
-            channels[name] /= scale
         parts = {"base image and G-buffer": ms, "silhouettes": finer}
         if history is not None:
             channels, parts["history"] = clock.time(partial(history.take, view, channels))
