@@ -296,6 +296,7 @@ def test_a_frame_is_rendered_while_the_one_before_is_written(tmp_path, monkeypat
         *(task.output for task in tasks[1:]),
         None,
     ]
+    assert in_succession([]) == []
     worker: Any = object.__new__(Worker)
     worker.ahead = None
     rendered, written, broken = [], [], [1]

@@ -97,11 +97,9 @@ def is_whole(task: FrameTask) -> bool:
 def in_succession(tasks: Sequence[FrameTask]) -> list[FrameTask]:
     """The tasks, each but the last with the one that follows it, which is rendered while it is written. Not of pictures
     so large that two of them would take too much memory."""
-    followed = zip(tasks, [*tasks[1:], None], strict=True)
-    return [
-        task.model_copy(update={"following": after if task.view.width * task.view.height <= MOST_AHEAD else None})
-        for task, after in followed
-    ]
+    small = [task.view.width * task.view.height <= MOST_AHEAD for task in tasks]
+    after = [following if fits else None for following, fits in zip(tasks[1:], small, strict=False)]
+    return [task.model_copy(update={"following": one}) for task, one in zip(tasks, [*after, None], strict=False)]
 
 
 def be_ready(run: Run, renderer: Renderer) -> None:
