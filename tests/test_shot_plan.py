@@ -121,6 +121,14 @@ def test_as_few_rays_as_cost_next_to_nothing() -> None:
     assert choose([few, smeared, most], Wanted())[0] is most, "PSNR alone is not enough"
 
 
+def test_of_ways_whose_price_is_the_same_the_best_is_taken() -> None:
+    corrected, plain = option("neural", 75.0, 32.6, 0.03, spp=6), option("base", 76.0, 32.7, 0.04, spp=8)
+    best = option("neural", 91.0, 33.05, 0.05, spp=8)
+    assert choose([corrected, plain, best], Wanted())[0] is plain
+    dearer = plain.model_copy(update={"seconds": 80.0})
+    assert choose([corrected, dearer, best], Wanted())[0] is corrected
+
+
 def test_smoothed_frames_are_as_clean_as_denoised_ones() -> None:
     """Or not taken, where nothing is wanted: windows tell grain poorly."""
     clean = option("base", 40, 33.0, 0.107, spp=4)

@@ -14,6 +14,8 @@ from .frame_tasks import Way
 NEAR = 0.5, 1.1
 """Decibels below, and times the LPIPS of, the best of baked light that cheaper frames of it may have: half as many rays
 are half a decibel where a frame is good."""
+SAME_PRICE = 1.05
+"""Times the seconds of the cheapest that is near, within which the best is taken: seconds vary by more than that."""
 SMOOTH_ENOUGH = 1.02
 """Times the LPIPS of denoised frames that smoothed ones of as many rays may have: windows tell grain poorly, since the
 references' own noise is in their LPIPS (`interior`: .112 and .107, in whole frames of 1280x720 .110 and .051)."""
@@ -130,7 +132,9 @@ def choose(options: Sequence[Option], wanted: Wanted) -> tuple[Option, str]:
         return least is None or own.lpips is None or own.lpips <= least * SMOOTH_ENOUGH
 
     best = max(filter(is_clean, baked), key=quality)
-    aim = min((own for own in baked if is_clean(own) and is_near(own, best)), key=lambda own: own.seconds)
+    near = [own for own in baked if is_clean(own) and is_near(own, best)]
+    cheapest = min(own.seconds for own in near)
+    aim = max((own for own in near if own.seconds <= SAME_PRICE * cheapest), key=quality)
     steady = next((o for o in options if o.way.name == "path" and o.way.spp == STEADY and o.reaches(*USUAL)), None)
     if steady is not None and not is_near(aim, steady):
         aim = steady  # good already: light was baked to save time, not to have less than that
