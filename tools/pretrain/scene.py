@@ -174,21 +174,21 @@ def _look(
     )
     history = History(engine.mi)
 
-    def base(way: list[View], view: View, chosen: str) -> dict[str, np.ndarray]:
-        """The base image called so, with its G-buffer."""
+    def base(way: list[View], chosen: str) -> dict[str, np.ndarray]:
+        """The base image called so of the way's last view, with its G-buffer."""
         samples, _, kind = chosen.partition(" ")
-        renderer, tiles = smooth if kind else grainy, not kind
+        renderer, tiles, view = smooth if kind else grainy, not kind, way[-1]
         if kind == "remembered":
             history.begin()
             for frame in way[:-1]:
                 history.take(frame, renderer.frame(frame, int(samples), history.number, tiles=tiles))
-            channels = history.take(way[-1], renderer.frame(way[-1], int(samples), history.number, tiles=tiles))
+            channels = history.take(view, renderer.frame(view, int(samples), history.number, tiles=tiles))
         else:
-            channels = renderer.frame(way[-1], int(samples), tiles=tiles)
+            channels = renderer.frame(view, int(samples), tiles=tiles)
         channels["coverage"] = silhouettes.coverage(view, channels["mask"] > 0.5, alpha=channels["base.A"])
         return without_grain(channels, renderer) if kind else channels
 
-    bases = {chosen: [base(way, view, chosen) for way, view in zip(ways, views, strict=True)] for chosen in inputs}
+    bases = {chosen: [base(way, chosen) for way in ways] for chosen in inputs}
     took("base images")
     integrator, _ = engine.integrator(bundle, plan.integrator, DEPTH)
     pictures, noises = [], []

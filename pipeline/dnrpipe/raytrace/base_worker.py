@@ -166,7 +166,8 @@ def with_coverage(channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def denoised(channels: dict[str, np.ndarray], *, diffuse: bool = True) -> dict[str, np.ndarray]:
     """base.R/G/B without grain. diffuse: whether their diffuse part has some, too.
 
-    The auxiliary images are not called clean: measured, that is better by half a decibel and more.
+    The auxiliary images are not called clean: with the few rays that they come from, that is as good or better on most
+    scenes (docs/experiments.md).
     """
     image = np.stack([channels[name] for name in COLOUR[:3]], axis=-1)
     albedo, normal = (np.stack([channels[name] for name in names], axis=-1) for names in (SHOWN, FACING))

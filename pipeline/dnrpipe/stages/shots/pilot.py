@@ -114,11 +114,10 @@ class Pilot:
                     rendered = way if number in (0, last) else base_of(way)
                     keys.append(key if number == last else None)
                     tasks.append(self._task(rendered, at, place, earlier, len(tasks), seed))
-        for _ in range(0 if known else 2):  # the first one readies what its size takes, and takes up to twice as long
-            keys.append(None)
-            tasks.append(self._task(ways[0], self.windows[0][0], None, None if tracing else (), len(tasks), 0))
-        if not known:
-            tasks[-2:] = in_succession(tasks[-2:])
+        if not known:  # the first one readies what its size takes, and takes up to twice as long
+            asked_for = ways[0], self.windows[0][0], None, None if tracing else ()
+            keys += [None, None]
+            tasks += in_succession([self._task(*asked_for, len(tasks) + i, 0) for i in (0, 1)])
         found: dict[Way, list[_Window]] = {}
         start, whole, writing, kept = None, 0.0, 0.0, self.run.kept
         label = "pilot: " + ("path tracing" if tracing else "base image and network")

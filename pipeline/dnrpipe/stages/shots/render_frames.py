@@ -136,10 +136,12 @@ def render_frames(
             detail={"way": result["way"], "ms": result["ms"]},
         )
 
+    made: list[FrameTask] = []
+    due: list[FrameTask] = []
     for task in tasks:
         if not task.picture.exists():  # a frame is both of its files
             task.output.unlink(missing_ok=True)
-    made, due = ([task for task in tasks if is_whole(task) is whole] for whole in (True, False))
+        (made if is_whole(task) else due).append(task)
     run.view_tasks(
         label,
         FRAME_WORKER,
