@@ -50,6 +50,7 @@ from dnrtrain.contract import View, write_cameras
 from dnrtrain.exr import read_exr
 
 from .bench_frames.motion import Surface, flicker
+from .bench_frames.moving_tables import FLICKER
 
 ROOT = Path(__file__).resolve().parents[1]
 OUT = ROOT / "docs" / "results" / "shots.json"
@@ -194,13 +195,11 @@ def beside(root: Path, views: Sequence[View], pairs: Sequence[tuple[int, int]]) 
         return folder_of_rung(root, way.spp, way.quality, take) / f"{number:05d}.exr"
 
     traced([(REFERENCE, take) for take in TAKES])
-    truth: dict[int, Any] = {
-        n: sum(shown(display, path_of(REFERENCE, take, n)) for take in TAKES) / len(TAKES) for n in numbers
-    }
+    takes = [{n: shown(display, path_of(REFERENCE, take, n)) for n in numbers} for take in TAKES]
     surfaces = {n: surface_of(views[n], path_of(REFERENCE, TAKES[0], n)) for n in numbers}
 
     def figures(file_of: Any) -> dict[str, float]:
-        return quality({n: shown(display, file_of(n)) for n in numbers}, truth, surfaces, pairs, lpips)
+        return quality({n: shown(display, file_of(n)) for n in numbers}, takes, surfaces, pairs, lpips)
 
     ours = figures(lambda n: root / "shots" / "arc" / FRAMES_FOLDER / f"{n + 1:05d}.exr")
     rungs: list[dict[str, Any]] = []
@@ -250,14 +249,13 @@ def by_cycles(root: Path, frames: int, ours: dict[str, float]) -> list[dict[str,
     for take in TAKES:
         rendered([CYCLES_REFERENCE], ["denoised"], take)
     takes = [pictures(f"{CYCLES_REFERENCE} spp denoised", take) for take in TAKES]
-    truth = {n: sum(take[n] for take in takes) / len(takes) for n in numbers}
     rungs: list[dict[str, Any]] = []
     for ladder in CYCLES_LADDER:
         answer = rendered(ladder, list(CYCLES_DENOISERS), 0)
         for spp in ladder:
             for method, denoiser in CYCLES_DENOISERS.items():
                 name = f"{spp} spp {method}"
-                found = quality(pictures(name, 0), truth, surfaces, pairs, lpips)
+                found = quality(pictures(name, 0), takes, surfaces, pairs, lpips)
                 rungs.append(
                     {"spp": spp, "quality": denoiser, "frame": float(np.median(answer.seconds[name])), **found}
                 )
@@ -294,12 +292,16 @@ def folder_of_rung(root: Path, spp: int, denoiser: str, take: int) -> Path:
 
 def quality(
     pictures: dict[int, Any],
-    truth: dict[int, Any],
+    takes: Sequence[dict[int, Any]],
     surfaces: dict[int, Surface],
     pairs: Sequence[tuple[int, int]],
     lpips: Any,
 ) -> dict[str, float]:
-    """psnr, ssim, lpips and flip, means over the frames; flicker over the pairs."""
+    """psnr, ssim, lpips and flip, means over the frames; flicker and flicker_rms over the pairs.
+
+    takes: two references whose noise is independent. Their mean is the truth.
+    """
+    truth = {n: sum(take[n] for take in takes) / len(takes) for n in pictures}
     rows = [
         {
             **compared(picture, truth[n], lpips),
@@ -308,12 +310,15 @@ def quality(
         for n, picture in pictures.items()
     ]
     found = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
-    planes = {n: picture_of(picture[0]).astype(np.float64) for n, picture in pictures.items()}
-    true = {n: picture_of(picture[0]).astype(np.float64) for n, picture in truth.items()}
-    changes = [
-        flicker([planes[a], planes[b]], [true[a], true[b]], [surfaces[a], surfaces[b]])["flicker"] for a, b in pairs
-    ]
-    return {**found, "flicker": float(np.mean(changes))}
+    planes, true, first, second = (
+        {n: picture_of(picture[0]).astype(np.float64) for n, picture in kind.items()}
+        for kind in (pictures, truth, *takes)
+    )
+    changes = []
+    for pair in pairs:
+        ours, theirs, *halves, seen = ([kind[n] for n in pair] for kind in (planes, true, first, second, surfaces))
+        changes.append(flicker(ours, theirs, seen, (halves[0], halves[1])))
+    return found | {name: float(np.mean([change[name] for change in changes])) for name in FLICKER}
 
 
 def surface_of(view: View, path: Path) -> Surface:
@@ -393,17 +398,22 @@ def _table(machine: str, rows: Sequence[dict[str, Any]]) -> str:
         chosen = row["chosen"]["way"]
         way = f"{chosen['name']}{', smoothed,' if chosen.get('smooth') else ''} {chosen['spp']}"
         cells = [row["scene"], row["size"], way, f"{row['before']:.0f}", f"{row['frame']:.2f}"]
-        cells += [f"{own['psnr']:.2f}", f"{own['lpips']:.4f}", f"{own['flip']:.4f}", f"{own['flicker']:.4f}"]
+        cells += [f"{own['psnr']:.2f}", f"{own['lpips']:.4f}", f"{own['flip']:.4f}", flicker_of(own)]
         if rung is None:
             last = last_rung(row)
-            cells += [f"not by {named(last)}", f"> {last['frame']:.2f}", f"{last['flicker']:.4f}"]
+            cells += [f"not by {named(last)}", f"> {last['frame']:.2f}", flicker_of(last)]
             cells += [f"{ours:.0f}", f"> {REEL * last['frame']:.0f}", f"< {ours / (REEL * last['frame']):.2f}"]
         else:
-            cells += [named(rung), f"{rung['frame']:.2f}", f"{rung['flicker']:.4f}"]
+            cells += [named(rung), f"{rung['frame']:.2f}", flicker_of(rung)]
             cells += [f"{ours:.0f}", f"{REEL * rung['frame']:.0f}", f"{ours / (REEL * rung['frame']):.2f}"]
         cells += [break_even(row, name) for name in ("psnr", "lpips")]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def flicker_of(figures: dict[str, float]) -> str:
+    """x 1000; rows of before the second was known lack it."""
+    return " / ".join(f"{1000 * figures[name]:.1f}" for name in FLICKER if name in figures)
 
 
 def break_even(row: dict[str, Any], name: str) -> str:

@@ -20,7 +20,7 @@ import numpy as np
 
 from dnrtrain.contract import View
 
-from ...core.cameras import spread, window
+from ...core.cameras import scaled_to, spread, window
 from ...core.errors import UserError
 from ..stage import Run
 from ..trust import SHARES
@@ -38,6 +38,8 @@ LADDER, MOST = (1, 4, 8), 64
 """Samples per pixel of path-traced pictures, at most a quarter of a reference's: else the denoiser's bias would not
 show; and the most that are reckoned from them (`reckoned`)."""
 REFERENCE = Way(name="path", spp=SPP)
+WHOLE = 640
+"""Pixels of a whole frame's longer side, at most: pixels of larger ones take as long."""
 LEAD = 4
 """Frames before a frame of the pilot that it remembers."""
 SAME, LEAST_LPIPS = 99.0, 1e-6
@@ -202,9 +204,9 @@ class Pilot:
         return range(first, index)
 
     def _view(self, index: int, place: tuple[float, float] | None) -> View:
-        """A window of a frame; None: the whole frame."""
+        """A window of a frame; None: the whole frame, scaled to at most WHOLE."""
         view = self.frames[index].view
-        return view if place is None else window(view, *SIZE, place)
+        return scaled_to(view, WHOLE) if place is None else window(view, *SIZE, place)
 
     def _task(
         self,
