@@ -39,7 +39,7 @@ from dnrpipe.core.ledger import break_even_frames
 from dnrpipe.core.scene_files import split_views
 from dnrpipe.core.workspace import Workspace
 from dnrpipe.stages.evaluate import BASELINE_VIEWS
-from dnrpipe.studies.cells.intervals import Difference, summarise
+from dnrpipe.studies.cells.intervals import difference, summarise
 from dnrpipe.studies.frames.pareto_front import crossover, frontier
 from dnrtrain.atomic import write_json
 
@@ -182,7 +182,7 @@ def markdown(results: dict[str, Any]) -> str:
         if found is not None:
             worst, least = min(found.scenes.items(), key=lambda item: item[1])
             told = f"over {len(found.scenes)} scenes, {len(both)} pairs, worst {least:+.2f} ({worst})"
-            lines.append(f"- {name} to {other}: {interval(found)} dB {told}")
+            lines.append(f"- {name} to {other}: {difference(found)} dB {told}")
     both = [(mean(scene, "untrained", "seconds"), mean(scene, "fresh", "seconds")) for scene in scenes]
     shares = [ours / fresh for ours, fresh in both if ours and fresh]
     if shares:
@@ -225,13 +225,6 @@ def rival_seconds(rungs: list[dict[str, float]], figure: str, own: float) -> flo
     line = [points[name] for name in frontier(points)]
     found = crossover(line, sign * own)
     return line[-1][0] if found is None else found
-
-
-def interval(found: Difference) -> str:
-    """Mean over scenes and its 95% interval (Student)."""
-    if found.half is None:
-        return f"{found.mean:+.2f}"
-    return f"{found.mean:+.2f} [{found.mean - found.half:+.2f}, {found.mean + found.half:+.2f}]"
 
 
 if __name__ == "__main__":

@@ -45,8 +45,8 @@ class Worker(BundleWorker):
         )
         self.smoother = Smoother(self.engine.mi)
         self.silhouettes: dict[tuple[int, int], Frames] = {}
-        self.history, self.seen = History(self.engine.mi), list[tuple[View, int | None, int]]()
-        """Of the frames ``seen``, with their rays per pixel and the number of the first."""
+        self.history, self.seen = History(self.engine.mi), list[tuple[View, int | None, int, bool]]()
+        """Of the frames ``seen``, with their rays per pixel, the number of the first, and whether they are smoothed."""
         self.repaired = self.masked = 0  # pixels of the view at hand: samples left out, set to zero
 
     def __call__(self, asked: dict[str, Any]) -> BaseAnswer:
@@ -98,10 +98,10 @@ class Worker(BundleWorker):
     ) -> dict[str, np.ndarray]:
         """`channels` of a view, with what the frames ``earlier`` of a camera's way saw, the first of that number.
 
-        Those that were the last to be seen, by as many rays, are not rendered again: one frame after the other costs
-        one each.
+        Those that were the last to be seen, by as many rays for the same use, are not rendered again: one frame after
+        the other costs one each.
         """
-        way = [(other, samples, number) for other in (*earlier, view)]
+        way = [(other, samples, number, smooth) for other in (*earlier, view)]
         known = len(self.seen) if self.seen == way[: len(self.seen)] and len(self.seen) < len(way) else 0
         if not known:
             self.history.begin(number)
