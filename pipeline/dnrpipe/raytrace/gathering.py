@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from .lightmap import FEWER, LEAST_RHO, LightBaker, light_texture
+from .lightmap import LEAST_RHO, LightBaker, light_texture
 from .lobes import media_of
 from .sequence import GOLDEN, fraction
 
@@ -35,8 +35,6 @@ COARSE, COARSE_PATHS = 256, 1 << 22
 """Least side of the coarse map, and its paths: 64 per texel of that side."""
 FINER = 8
 """Sides of the light map per side of the coarse one, at most."""
-MORE = 1.25
-"""Rays that a texel may have over those it is to have."""
 DIRECT = 2
 """Samples of emitters per gathered ray: one costs a quarter of it, and half the noise is theirs."""
 
@@ -51,7 +49,7 @@ class GatheringBaker(LightBaker):
 
     Args:
         integrator, gloss: of the coarse map, as `LightBaker`'s, but one bounce less: gathering adds it.
-        seen: of the fine map; all of the coarse one lights it.
+        pixels: of the fine map; all of the coarse one lights it.
         caustics: False: light that comes from mirror-like lobes is left out.
     """
 
@@ -64,39 +62,29 @@ class GatheringBaker(LightBaker):
         *,
         gloss: bool = True,
         caustics: bool,
-        seen: np.ndarray | None = None,
+        pixels: np.ndarray | None = None,
     ) -> None:
-        super().__init__(mi, scene, integrator, groups, gloss=gloss, seen=seen)
-        self.caustics, self.gathers = caustics, False
+        super().__init__(mi, scene, integrator, groups, gloss=gloss)
+        self.fine_pixels, self.caustics, self.gathers = pixels, caustics, False
 
     def bake(self, size: int, spp: int, seed: int) -> np.ndarray:
         """As `LightBaker.bake`. spp: gathered rays per texel."""
         side = min(size, max(COARSE, size // FINER))
         coarse = super().bake(side, max(1, COARSE_PATHS // side**2), 2 * seed)
         traced, lost = self.integrator, self.lost
-        self.integrator, self.gathers = self._gathered(coarse), True
+        self.integrator, self.pixels, self.gathers = self._gathered(coarse), self.fine_pixels, True
         try:
             emitters = functools.partial(self._light, indirect=False)
             surfaces = functools.partial(self._light, direct=False)
             light = self._map(surfaces, size, spp, 8 * seed + 4, LEAST_RHO)
             light += self._map(emitters, size, DIRECT * spp, 8 * seed + 6, LEAST_RHO)
         finally:
-            self.integrator, self.gathers = traced, False
+            self.integrator, self.pixels, self.gathers = traced, None, False
         self.lost += lost
         return np.stack([light, [enlarged(image, size) for image in coarse[1]]])
 
     def _gathered(self, coarse: np.ndarray) -> Gathered:
         return Gathered(self.mi, self.scene, coarse, gloss=self.glossy, caustics=self.caustics)
-
-    def _shares(self, texels: np.ndarray, size: int, spp: int) -> list[tuple[np.ndarray, int]]:
-        """As `LightBaker._shares`; of gathered rays a power of two, which is spread best, a quarter more at most."""
-        if not self.gathers:
-            return [(np.ones(len(texels), bool), spp)]
-        shares = super()._shares(texels, size, spp)
-        if len(shares) < 2:
-            return shares
-        most = 1 << int(MORE * shares[0][1]).bit_length() - 1
-        return [(which, count) for (which, _), count in zip(shares, (most, max(1, most // FEWER)), strict=True)]
 
     def _numbers(self, sampler: Any, texel: Any, index: Any, count: int, seed: Any) -> Any:
         return SpreadNumbers(self.mi, sampler, texel, index, count, seed) if self.gathers else sampler

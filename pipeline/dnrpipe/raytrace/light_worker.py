@@ -16,7 +16,7 @@ from dnrtrain.contract import NPZ_ERRORS
 from .engine import BundleWorker
 from .gathering import GatheringBaker, can_gather
 from .lightmap import LightBaker
-from .seen_texels import seen_cells
+from .seen_texels import pixels_of_cells
 from .tasks import LightAnswer, LightTask, costs_since
 from .texels import grouped_meshes
 from .visibility import ROULETTE_DEPTH, integrator_settings
@@ -35,8 +35,8 @@ class Worker(BundleWorker):
         task = LightTask.model_validate(asked)
         started, cpu = time.monotonic(), time.process_time()
         scene, groups = self.engine.scenes[str(self.bundle)], grouped_meshes(self.bundle)
-        seen = seen_cells(self.engine.mi, scene, task.views, self.engine.unit_scale) if task.views else None
-        baker = light_baker(self.engine.mi, scene, groups, task, seen)
+        pixels = pixels_of_cells(self.engine.mi, scene, task.views, self.engine.unit_scale) if task.views else None
+        baker = light_baker(self.engine.mi, scene, groups, task, pixels)
         light = baker.bake(task.size, task.spp, task.seed)
         with atomic_path(task.output) as temporary, temporary.open("wb") as file:
             np.savez(file, light=light, fingerprint=np.array(task.fingerprint))
@@ -54,15 +54,15 @@ def light_baker(
     scene: Any,
     groups: Sequence[tuple[Path, np.ndarray]],
     task: LightTask,
-    seen: np.ndarray | None = None,
+    pixels: np.ndarray | None = None,
 ) -> LightBaker:
     """What bakes the light as the task wants it. Paths are traced where rays are wanted but the scene has media."""
     indirect = indirect_integrator(mi, scene, task.integrator, task.max_depth)
     if not task.gather or indirect is None or not can_gather(scene):
-        return LightBaker(mi, scene, indirect, groups, gloss=task.gloss, seen=seen)
+        return LightBaker(mi, scene, indirect, groups, gloss=task.gloss, pixels=pixels)
     coarse = indirect_integrator(mi, scene, task.integrator, task.max_depth - 1)
     caustics = task.integrator != "path-without-caustics"
-    return GatheringBaker(mi, scene, coarse, groups, gloss=task.gloss, caustics=caustics, seen=seen)
+    return GatheringBaker(mi, scene, coarse, groups, gloss=task.gloss, caustics=caustics, pixels=pixels)
 
 
 def indirect_integrator(mi: Any, scene: Any, kind: str, max_depth: int) -> Any:

@@ -17,6 +17,7 @@ follows the rest of the path, from the first bounce on, with all its effects.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -45,8 +46,16 @@ MOST_BURIED = 0.5
 """Share of the sides that can be seen above which none counts as buried."""
 LEAST_RHO = 1e-3
 """Texels that reflect less hold no light worth knowing."""
-FEWER = 8
-"""Samples of a texel that views see over those of one that none does."""
+FIRST = 8
+"""A texel's samples over those that it has before others go where they are needed (`_further`)."""
+TOGETHER = 16
+"""Side of the cells of texels whose noise is told together: one texel's few samples do not tell its own."""
+FAINT = 0.05
+"""Of the mean light: what is darker than that counts as if it was so bright, for a picture has blacks."""
+UNSEEN = 1 / 64
+"""Pixels of a texel that no view sees, over the mean."""
+SPREAD = 1 / 8, 4.0
+"""Least and most of a texel's samples over the mean."""
 
 
 def light_texture(mi: Any, light: np.ndarray, *, gloss: bool) -> tuple[Any, Any, Any]:
@@ -73,6 +82,12 @@ def look_up_light(mi: Any, light: tuple[Any, Any, Any], uv: Any, back: Any, acti
     return texture.eval(mi.Point2f(uv.x, uv.y * top + dr.select(back, start, 0)), active)
 
 
+def _powers(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of at least 0 as the sum of a power of two, and of half of that or nothing; 0 for less than 1."""
+    power = np.where(counts < 1, 0, 1 << np.log2(np.maximum(counts, 1)).astype(int))
+    return power, np.where(counts >= 1.5 * power, power // 2, 0)
+
+
 class LightBaker:
     """Bakes E and S of one scene.
 
@@ -82,7 +97,8 @@ class LightBaker:
             direct light alone.
         groups: see `texels.AtlasSurface`.
         gloss: S is wanted; otherwise it is 0.
-        seen: see `seen_texels.seen_cells`: texels elsewhere get few of the samples. None: all get as many.
+        pixels: of views, by cells of the atlas [n, n] (`seen_texels.pixels_of_cells`): where there are many, texels get
+            more samples. None: all texels count as much.
 
     ``lost`` counts the samples of the last bake that were not finite; each is left out of its texel's mean.
     """
@@ -95,9 +111,9 @@ class LightBaker:
         groups: Sequence[tuple[Path, np.ndarray]] = (),
         *,
         gloss: bool = True,
-        seen: np.ndarray | None = None,
+        pixels: np.ndarray | None = None,
     ) -> None:
-        self.mi, self.scene, self.integrator, self.seen = mi, scene, integrator, seen
+        self.mi, self.scene, self.integrator, self.pixels = mi, scene, integrator, pixels
         self.surface = AtlasSurface(mi, scene, groups)
         self.lift = float(LIFT * scene.bbox().bounding_sphere().radius)
         self.lets_through = lets_through(mi, scene)
@@ -111,7 +127,7 @@ class LightBaker:
     def bake(self, size: int, spp: int, seed: int) -> np.ndarray:
         """E and S of the front and of the back, float32 [2, 2, size, size, 3], row 0 at V = 0; no noise, no gaps.
 
-        spp: samples per texel, in the mean over all where only some are seen.
+        spp: samples per texel, in the mean over all.
         The denoiser is shown where in space each texel lies and where it faces, so that charts that are neighbours in
         the atlas alone stay apart. Of closed meshes one side is traced: the other cannot be seen.
         """
@@ -190,23 +206,53 @@ class LightBaker:
         self, sample: Any, texels: np.ndarray, size: int, spp: int, seed: int, side: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """Numerator and denominator, [T, 3] each, means of each texel's samples; counts what was lost."""
-        means = np.zeros((len(texels), 6), np.float32)
-        for which, count in self._shares(texels, size, spp):
-            sums = self._traced(sample, texels[which], size, count, seed, side)
-            self.lost += round(float(sums[:, 6].sum(dtype=np.float64)))
-            means[which] = sums[:, :6] / count
+        half = spp // (2 * FIRST)
+        first = [half, half] if half else [spp]
+        parts = [self._traced(sample, texels, size, n, 4 * seed + turn, side) for turn, n in enumerate(first)]
+        sums, counts = np.sum(parts, axis=0), np.full(len(texels), sum(first))
+        if half:
+            one, other = (part[:, :3] / half for part in parts)
+            powers = self._further(texels, size, (one + other) / 2, one - other, spp - 2 * half)
+            for turn, further in enumerate(powers, start=2):
+                for count in np.unique(further[further > 0]):
+                    which = further == count
+                    sums[which] += self._traced(sample, texels[which], size, int(count), 4 * seed + turn, side)
+                counts += further
+        self.lost += round(float(sums[:, 6].sum(dtype=np.float64)))
+        means = (sums[:, :6] / counts[:, None]).astype(np.float32)
         return means[:, :3], means[:, 3:]
 
-    def _shares(self, texels: np.ndarray, size: int, spp: int) -> list[tuple[np.ndarray, int]]:
-        """Which of the texels get how many samples: as many in all as if each had ``spp``."""
-        if self.seen is None:
-            return [(np.ones(len(texels), bool), spp)]
-        rows, columns = ((at * len(self.seen)) // size for at in (texels // size, texels % size))
-        seen = self.seen[rows, columns]
-        share = float(seen.mean())
-        least = max(1, round(spp / (share * FEWER + 1 - share)))
-        most = round((spp - (1 - share) * least) / share) if share else least
-        return [(which, count) for which, count in ((seen, most), (~seen, least)) if which.any()]
+    def _further(
+        self, texels: np.ndarray, size: int, light: np.ndarray, change: np.ndarray, spp: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """How many samples more each texel gets, at most as many in all as if each had ``spp``: [T] and [T], powers of
+        two or 0, which are spread best; the second half of the first or none.
+
+        light, change: mean of two estimates of what the texels send back, and their difference [T, 3].
+        A texel of n samples whose variance is v adds pixels v / n to the error of the views' pictures; as they are
+        displayed, about as the square root of light, pixels v / (n light). The sum is least where n goes as the square
+        root of that without n (Neyman 1934). Noise counts by its own square root once more, for the map is denoised,
+        which takes most of it where it is large (measured: docs/experiments.md). Cells of many texels say it, so that a
+        texel's own luck hardly decides on its samples, which would bias its mean.
+        """
+        rows, columns = texels // size, texels % size
+        cell = rows // TOGETHER * size + columns // TOGETHER
+        number = np.maximum(np.bincount(cell), 1)
+        noise, level = (np.bincount(cell, values.mean(axis=1)) / number for values in (change**2, light))
+        worth = np.sqrt(noise / np.maximum(level, max(FAINT * float(light.mean()), 1e-12)))[cell]
+        if self.pixels is not None:
+            side = len(self.pixels)
+            seen = self.pixels[rows * side // size, columns * side // size]
+            worth = worth * np.maximum(seen, UNSEEN * max(float(seen.mean()), 1e-12))
+        share = np.sqrt(worth)
+        share = share / share.mean() if share.any() else np.ones(len(share))
+        share = share.clip(*SPREAD)
+        low, high = spp / 16, spp * 16
+        for _ in range(12):
+            middle = math.sqrt(low * high)
+            fits = sum(_powers(share * middle)).mean() <= spp
+            low, high = (middle, high) if fits else (low, middle)
+        return _powers(share * low)
 
     @staticmethod
     def _smooth(
