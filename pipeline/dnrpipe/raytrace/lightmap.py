@@ -82,10 +82,10 @@ def look_up_light(mi: Any, light: tuple[Any, Any, Any], uv: Any, back: Any, acti
     return texture.eval(mi.Point2f(uv.x, uv.y * top + dr.select(back, start, 0)), active)
 
 
-def _powers(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of at least 0 as the sum of a power of two, and of half of that or nothing; 0 for less than 1."""
-    power = np.where(counts < 1, 0, 1 << np.log2(np.maximum(counts, 1)).astype(int))
-    return power, np.where(counts >= 1.5 * power, power // 2, 0)
+def _powers(counts: np.ndarray) -> np.ndarray:
+    """The powers of two next to numbers above 0; 0 next to less than a half."""
+    rounded = np.rint(np.log2(counts)).astype(int)
+    return np.where(rounded < 0, 0, 1 << rounded.clip(0))
 
 
 class LightBaker:
@@ -208,25 +208,22 @@ class LightBaker:
         """Numerator and denominator, [T, 3] each, means of each texel's samples; counts what was lost."""
         half = spp // (2 * FIRST)
         first = [half, half] if half else [spp]
-        parts = [self._traced(sample, texels, size, n, 4 * seed + turn, side) for turn, n in enumerate(first)]
+        parts = [self._traced(sample, texels, size, n, 3 * seed + turn, side) for turn, n in enumerate(first)]
         sums, counts = np.sum(parts, axis=0), np.full(len(texels), sum(first))
         if half:
             one, other = (part[:, :3] / half for part in parts)
-            powers = self._further(texels, size, (one + other) / 2, one - other, spp - 2 * half)
-            for turn, further in enumerate(powers, start=2):
-                for count in np.unique(further[further > 0]):
-                    which = further == count
-                    sums[which] += self._traced(sample, texels[which], size, int(count), 4 * seed + turn, side)
-                counts += further
+            further = self._further(texels, size, (one + other) / 2, one - other, spp - 2 * half)
+            for count in np.unique(further[further > 0]):
+                which = further == count
+                sums[which] += self._traced(sample, texels[which], size, int(count), 3 * seed + 2, side)
+            counts += further
         self.lost += round(float(sums[:, 6].sum(dtype=np.float64)))
         means = (sums[:, :6] / counts[:, None]).astype(np.float32)
         return means[:, :3], means[:, 3:]
 
-    def _further(
-        self, texels: np.ndarray, size: int, light: np.ndarray, change: np.ndarray, spp: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """How many samples more each texel gets, at most as many in all as if each had ``spp``: [T] and [T], powers of
-        two or 0, which are spread best; the second half of the first or none.
+    def _further(self, texels: np.ndarray, size: int, light: np.ndarray, change: np.ndarray, spp: int) -> np.ndarray:
+        """How many samples more each texel gets [T]: a power of two, which is spread best, or none; at most as many in
+        all as if each had ``spp``.
 
         light, change: mean of two estimates of what the texels send back, and their difference [T, 3].
         A texel of n samples whose variance is v adds pixels v / n to the error of the views' pictures; as they are
@@ -250,7 +247,7 @@ class LightBaker:
         low, high = spp / 16, spp * 16
         for _ in range(12):
             middle = math.sqrt(low * high)
-            fits = sum(_powers(share * middle)).mean() <= spp
+            fits = _powers(share * middle).mean() <= spp
             low, high = (middle, high) if fits else (low, middle)
         return _powers(share * low)
 
