@@ -83,7 +83,7 @@ def _error(baked: list[np.ndarray], truth: np.ndarray, chart: tuple[slice, slice
 
 
 def test_samples_go_by_pixels_and_noise_and_brightness(tmp_path: Path) -> None:
-    """As many in all, whatever asks for them; powers of two of each texel."""
+    """As many in all, whatever asks for them, and of each texel a power of two."""
     cells = np.zeros((2, 2), np.float32)
     cells[0, 0] = 1
     scene = corner_room(tmp_path, GREY, GREY, {"type": "constant"})
@@ -94,16 +94,16 @@ def test_samples_go_by_pixels_and_noise_and_brightness(tmp_path: Path) -> None:
     def further(baker: LightBaker, light: np.ndarray, change: np.ndarray) -> np.ndarray:
         counts = baker._further(texels, 64, light, change, 16)
         assert set(np.unique(counts)) <= {0, *(1 << k for k in range(10))}
-        assert 0.5 * 16 < counts.mean() <= 16
+        assert counts.mean() == pytest.approx(16, rel=0.03)
         return counts
 
     assert set(further(even, ones, 0 * ones)) == {16} == set(further(even, ones, ones))
     noisy = further(even, ones, np.where(left, 16.0, 1.0)[:, None] * ones)
-    assert set(noisy[left] / noisy[~left]) == {4.0}
+    assert noisy[left].mean() == pytest.approx(4 * noisy[~left].mean(), rel=0.1)
     bright = further(even, np.where(left, 16.0, 1.0)[:, None] * ones, ones)
-    assert set(bright[~left] / bright[left]) == {2.0}
+    assert bright[~left].mean() == pytest.approx(2 * bright[left].mean(), rel=0.1)
     looked_at = further(seen, ones, ones)
-    assert set(looked_at[left & top]) == {32} and looked_at[~(left & top)].max() <= 4
+    assert looked_at[left & top].mean() > 10 * looked_at[~(left & top)].mean()
 
 
 def _plain(total: np.ndarray, weight: np.ndarray, texels: np.ndarray, size: int) -> np.ndarray:

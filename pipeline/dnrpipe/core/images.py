@@ -67,4 +67,4 @@ def write_png(path: Path, image: np.ndarray) -> None:
     from PIL import Image
 
     with atomic_path(path) as temporary:
-        Image.fromarray(eight_bit(image)).save(temporary)
+        Image.fromarray(eight_bit(image)).save(temporary, compress_level=3)  # a third of the time, a tenth more bytes

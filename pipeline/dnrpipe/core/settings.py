@@ -125,7 +125,7 @@ class BaseSettings(Strict):
     )
     light_where: Literal["auto", "everywhere", "seen"] = Field(
         default="auto",
-        description="texels that get most of these: all alike, or those that views see; auto: the latter in shots",
+        description="where texels count: all alike, or by the pixels that see them; auto: the latter in shots",
     )
     samples: int = Field(default=8, ge=1, le=64, description="rays per pixel of a base image")
     denoise: bool = Field(

@@ -17,7 +17,6 @@ follows the rest of the path, from the first bounce on, with all its effects.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -82,10 +81,11 @@ def look_up_light(mi: Any, light: tuple[Any, Any, Any], uv: Any, back: Any, acti
     return texture.eval(mi.Point2f(uv.x, uv.y * top + dr.select(back, start, 0)), active)
 
 
-def _powers(counts: np.ndarray) -> np.ndarray:
-    """The powers of two next to numbers above 0; 0 next to less than a half."""
-    rounded = np.rint(np.log2(counts)).astype(int)
-    return np.where(rounded < 0, 0, 1 << rounded.clip(0))
+def _powers(wanted: np.ndarray) -> np.ndarray:
+    """Each the power of two above or below, 0 below 1, by chance so that the mean stays; the same ones every time."""
+    low = np.where(wanted < 1, 0, 1 << np.log2(np.maximum(wanted, 1)).astype(int))
+    step = np.maximum(low, 1)
+    return low + step * (np.random.default_rng(0).random(len(wanted)) < (wanted - low) / step)
 
 
 class LightBaker:
@@ -222,8 +222,8 @@ class LightBaker:
         return means[:, :3], means[:, 3:]
 
     def _further(self, texels: np.ndarray, size: int, light: np.ndarray, change: np.ndarray, spp: int) -> np.ndarray:
-        """How many samples more each texel gets [T]: a power of two, which is spread best, or none; at most as many in
-        all as if each had ``spp``.
+        """How many samples more each texel gets [T]: a power of two, which is spread best, or none. In all they are
+        about as many as if each had ``spp``.
 
         light, change: mean of two estimates of what the texels send back, and their difference [T, 3].
         A texel of n samples whose variance is v adds pixels v / n to the error of the views' pictures; as they are
@@ -244,12 +244,7 @@ class LightBaker:
         share = np.sqrt(worth)
         share = share / share.mean() if share.any() else np.ones(len(share))
         share = share.clip(*SPREAD)
-        low, high = spp / 16, spp * 16
-        for _ in range(12):
-            middle = math.sqrt(low * high)
-            fits = _powers(share * middle).mean() <= spp
-            low, high = (middle, high) if fits else (low, middle)
-        return _powers(share * low)
+        return _powers(share * (spp / share.mean()))
 
     @staticmethod
     def _smooth(
