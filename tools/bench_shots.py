@@ -301,7 +301,7 @@ def quality(
 
     takes: two references whose noise is independent. Their mean is the truth.
     """
-    truth = {n: sum(take[n] for take in takes) / len(takes) for n in pictures}
+    truth: dict[int, Any] = {n: sum(take[n] for take in takes) / len(takes) for n in pictures}
     rows = [
         {
             **compared(picture, truth[n], lpips),
@@ -316,8 +316,8 @@ def quality(
     )
     changes = []
     for pair in pairs:
-        ours, theirs, *halves, seen = ([kind[n] for n in pair] for kind in (planes, true, first, second, surfaces))
-        changes.append(flicker(ours, theirs, seen, (halves[0], halves[1])))
+        ours, theirs, one, other = ([kind[n] for n in pair] for kind in (planes, true, first, second))
+        changes.append(flicker(ours, theirs, [surfaces[n] for n in pair], (one, other)))
     return found | {name: float(np.mean([change[name] for change in changes])) for name in FLICKER}
 
 
