@@ -75,7 +75,7 @@ def test_samples_go_where_views_look_and_are_as_many(tmp_path: Path, gathered: b
     for chart, quieter in ((FLOOR, True), (WALL, False)):
         error = {name: _error(baked, truth, chart) for name, baked in pictures.items()}
         assert np.mean([one[chart] for one in pictures["seen"]]) == pytest.approx(truth[chart].mean(), rel=0.02)
-        assert error["seen"] < 0.92 * error["even"] if quieter else error["seen"] > 1.3 * error["even"], error
+        assert error["seen"] < 0.85 * error["even"] if quieter else error["seen"] > 1.3 * error["even"], error
 
 
 def _error(baked: list[np.ndarray], truth: np.ndarray, chart: tuple[slice, slice]) -> float:
