@@ -86,7 +86,7 @@ class GatheringBaker(LightBaker):
     def _gathered(self, coarse: np.ndarray) -> Gathered:
         return Gathered(self.mi, self.scene, coarse, gloss=self.glossy, caustics=self.caustics)
 
-    def _numbers(self, sampler: Any, texel: Any, index: Any, count: int, seed: Any) -> Any:
+    def _numbers(self, sampler: Any, texel: Any, index: Any, count: Any, seed: Any) -> Any:
         return SpreadNumbers(self.mi, sampler, texel, index, count, seed) if self.gathers else sampler
 
 
@@ -97,6 +97,9 @@ class Gathered:
         light: E and S of the front and of the back, float32 [2, 2, size, size, 3], row 0 at V = 0.
         gloss: rays end at rough lobes, where S says what these see. caustics: False: rays end at mirror-like lobes.
     """
+
+    ends_at_emitters = True
+    """Its paths end at emitters that they meet first: `LightBaker` need not look for these."""
 
     def __init__(self, mi: Any, scene: Any, light: np.ndarray, *, gloss: bool, caustics: bool) -> None:
         from .specular_paths import SpecularPaths  # imports Mitsuba
@@ -124,15 +127,15 @@ class SpreadNumbers:
         sampler: of single numbers, and of what loops draw.
         texel: of each sample.
         index: of the samples within their texels.
-        count: of a texel's samples.
+        count: of their texels' samples.
         seed: mi.UInt32.
     """
 
-    def __init__(self, mi: Any, sampler: Any, texel: Any, index: Any, count: int, seed: Any) -> None:
-        import drjit as dr
-
+    def __init__(self, mi: Any, sampler: Any, texel: Any, index: Any, count: Any, seed: Any) -> None:
         self.mi, self.sampler, self.texel, self.index = mi, sampler, texel, index
-        self.last = dr.opaque(mi.UInt32, (1 << (count - 1).bit_length()) - 1)  # as data: one kernel for all counts
+        self.last = count - 1
+        for bits in (1, 2, 4, 8, 16):
+            self.last = self.last | (self.last >> bits)  # the next power of two, less one
         self.seed, self.drawn = seed << 8, 0
 
     def next_1d(self) -> Any:

@@ -100,7 +100,7 @@ def register(mi: Any) -> None:
             valid, diffused, was_delta = mi.Bool(False), mi.Bool(self.after_diffuse), mi.Bool(True)
             # The last scattering, with the density of the direction in which the path left it.
             before, density = dr.zeros(mi.SurfaceInteraction3f), mi.Float(1)
-            si = scene.ray_intersect(ray, mi.RayFlags.All, True, active)
+            si = scene.ray_intersect(ray, mi.RayFlags.All, not self.after_diffuse, active)
             if dr.hint(self.hide_emitters, mode="scalar"):
                 si = self._past_lamps(scene, ray, si, active)
             while active:
