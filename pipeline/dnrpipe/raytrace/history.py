@@ -100,8 +100,8 @@ class History:
         mi, size, first = self.mi, (view.height, view.width), self.before is None
         if self.before is None or (self.before[0].height, self.before[0].width) != size:
             pixels = view.width * view.height
-            self.before = view, [mi.Float(aligned([np.zeros(4 * pixels)])) for _ in PACKETS]
-        planes = mi.Float(aligned([channels[name] for name in TAKEN]))
+            self.before = view, [mi.Float(aligned(np.zeros(4 * pixels))) for _ in PACKETS]
+        planes = [mi.Float(aligned(channels[name])) for name in TAKEN]
         earlier, memory = self.before
         resting = not first and view.c2w == earlier.c2w and view.intrinsics == earlier.intrinsics
         cameras = opaque_camera(mi, view), opaque_camera(mi, earlier)
@@ -113,12 +113,12 @@ class History:
         return {**channels, **found, **dict(zip(FRESH_CHANNELS, own, strict=True))}
 
     def _kernel(
-        self, taken: Any, memory: list[Any], camera: Any, earlier: Any, width: int, height: int, resting: bool
+        self, planes: list[Any], memory: list[Any], camera: Any, earlier: Any, width: int, height: int, resting: bool
     ) -> tuple[list[Any], list[Any]]:
         """(planes of GIVEN, what the next frame remembers). Recorded once for a size, moving and resting.
 
         Args:
-            taken: planes of TAKEN one after the other.
+            planes: of TAKEN.
             memory: of the frame before; zeros where there is none.
             camera, earlier: see `opaque_camera`.
             resting: whether they are the same.
@@ -127,7 +127,6 @@ class History:
 
         mi = self.mi
         picture = _Picture(mi, width, height)
-        planes = [dr.gather(mi.Float, taken, picture.pixel + i * width * height) for i in range(len(TAKEN))]
         diffuse, base, *facts = (mi.Color3f(*planes[i : i + 3]) for i in range(0, 15, 3))
         alpha, noise, rays = planes[15:18]
         specular, bright = base - diffuse, mi.luminance(base)

@@ -127,14 +127,16 @@ def planes_of(values: Sequence[Any], shape: tuple[int, int]) -> list[np.ndarray]
     return found
 
 
-def aligned(planes: list[np.ndarray]) -> np.ndarray:
-    """The planes one after the other, float32, at an address that is a multiple of 64.
+def aligned(plane: np.ndarray) -> np.ndarray:
+    """The plane, flat, float32, at an address that is a multiple of 64: itself where it is, as Dr.Jit's memory is.
 
     Dr.Jit takes memory as it is, and records a kernel anew for memory that is aligned otherwise.
     """
-    count = sum(plane.size for plane in planes)
-    buffer = np.empty(count + 16, np.float32)
+    flat = np.ascontiguousarray(plane, np.float32).ravel()
+    if flat.ctypes.data % 64 == 0:
+        return flat
+    buffer = np.empty(flat.size + 16, np.float32)
     start = -buffer.ctypes.data // 4 % 16
-    flat = buffer[start : start + count]
-    np.concatenate([plane.ravel() for plane in planes], out=flat)
-    return flat
+    copy = buffer[start : start + flat.size]
+    copy[:] = flat
+    return copy

@@ -47,17 +47,16 @@ class Smoother:
     def __call__(self, channels: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """The channels with ``base.R/G/B`` smoothed; float32 [H, W] each, linear Rec.709, premultiplied."""
         height, width = channels["mask"].shape
-        planes = self.mi.Float(aligned([channels[name] for name in TAKEN]))
+        planes = [self.mi.Float(aligned(channels[name])) for name in TAKEN]
         found = self.kernel(planes, width, height)
         return {**channels, **dict(zip(TAKEN[:3], planes_of(found, (height, width)), strict=True))}
 
-    def _kernel(self, taken: Any, width: int, height: int) -> list[Any]:
-        """Base image [3][height * width]. Recorded once for a size. taken: planes of TAKEN one after the other."""
+    def _kernel(self, planes: list[Any], width: int, height: int) -> list[Any]:
+        """Base image [3][height * width]. Recorded once for a size. planes: of TAKEN."""
         import drjit as dr
 
         mi = self.mi
         pixels = Pixels(mi, width, height)
-        planes = [dr.gather(mi.Float, taken, pixels.pixel + i * width * height) for i in range(len(TAKEN))]
         around = [pixels.index(*place) for place in AROUND]
         diffuse = mi.Color3f(*planes[3:6])
         specular, normal, noise = mi.Color3f(*planes[:3]) - diffuse, mi.Normal3f(*planes[6:9]), planes[11]
