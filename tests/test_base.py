@@ -405,6 +405,20 @@ def test_rough_metal_shows_what_its_lobe_sees_of_the_wall_without_grain(tmp_path
     assert rough < 0.06 * ours[near, 1].mean()
 
 
+def test_a_lamp_behind_the_wall_shows_in_no_glossy_floor(tmp_path: Path) -> None:
+    """Whether something is in between is asked for what counts alone: here all light comes from the lamp."""
+    metal = {"type": "twosided", "b": {"type": "roughconductor", "alpha": 0.4}}
+    wall = {"type": "twosided", "b": {"type": "diffuse", "reflectance": rgb(0.0, 0.0, 0.0)}}
+    dark = np.zeros((2, 2, 4, 4, 3), np.float32)
+    for where, shines in ((0.5, True), (1.5, False)):  # the wall stands at 1
+        lamp = {"type": "point", "position": [0.0, where, 0.7], "intensity": rgb(3, 3, 3)}
+        scene = corner_room(tmp_path, metal, wall, lamp)
+        channels, truth = BaseRenderer(mi, scene, dark, gloss=False).frame(camera(0.0), 16), traced(scene, camera(0.0))
+        floor = (channels["uv.U"] < 0.5) & (truth[..., 3] > 0.99)
+        assert (truth[floor, 0].mean() > 0.1) == shines
+        np.testing.assert_allclose(colour(channels)[floor, 0].mean(), truth[floor, 0].mean(), rtol=0.05, atol=1e-6)
+
+
 @pytest.mark.parametrize(("opacity", "within"), [(1.0, 0.03), (0.4, 0.05)])
 def test_brushed_metal_shows_coated_walls_as_bright_as_they_are(tmp_path: Path, opacity: float, within: float) -> None:
     """Behind its wide lobe the wall's coat counts as diffuse; where the wall lets light through, paths go on."""
