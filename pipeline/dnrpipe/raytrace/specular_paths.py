@@ -218,8 +218,7 @@ class SpecularPaths:
             fine = dr.all(dr.isfinite(direct))
             lost |= ~fine
             counts = fine & (dr.max(direct) > LEAST_SHARE * dr.max(radiance))
-            blocked = scene.ray_test(si.spawn_ray_to(source.p), counts)
-            radiance += dr.select(counts & ~blocked, direct, 0)
+            radiance += dr.select(counts & ~self._is_blocked(scene, si, source, counts), direct, 0)
 
             # ---------------------- The mirror-like rest ----------------------
             null = mi.has_flag(bsdf_sample.sampled_type, mi.BSDFFlags.Null)
@@ -321,6 +320,10 @@ class SpecularPaths:
         if not self.has_emitters:
             return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0.0)
         return scene.sample_emitter_direction(si, mi.Point2f(u[3], u[4]), False, active)
+
+    def _is_blocked(self, scene: Any, si: Any, source: Any, active: Any) -> Any:
+        """Whether something is between the surface and the place on an emitter."""
+        return scene.ray_test(si.spawn_ray_to(source.p), active) if self.has_emitters else mi.Bool(False)
 
     def _looks(self, bsdf: Any, si: Any, active: Any) -> tuple[Any, Any, Any, Any]:
         """(rho, the share of light that does not pass straight on, what a coat adds to rho for a wide lobe that sees
