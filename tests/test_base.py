@@ -419,6 +419,33 @@ def test_a_lamp_behind_the_wall_shows_in_no_glossy_floor(tmp_path: Path) -> None
         np.testing.assert_allclose(colour(channels)[floor, 0].mean(), truth[floor, 0].mean(), rtol=0.05, atol=1e-6)
 
 
+@pytest.mark.parametrize("samples", [1, 2, 5, 8])
+def test_a_faint_coat_is_followed_by_few_samples_and_as_bright(
+    samples: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from dnrpipe.raytrace import specular_paths  # imports Mitsuba
+
+    floor = {"type": "plastic", "diffuse_reflectance": rgb(0.2, 0.2, 0.2)}
+    wall = {"type": "diffuse", "reflectance": rgb(0.8, 0.8, 0.8)}
+    floor, wall = ({"type": "twosided", "b": bsdf} for bsdf in (floor, wall))
+    scene = corner_room(tmp_path, floor, wall, {"type": "constant"})
+    light = np.ones((2, 2, 4, 4, 3), np.float32)
+
+    def coat() -> np.ndarray:
+        renderer, found = BaseRenderer(mi, scene, light), []
+        for number in range(16):  # frames, whose samples complement one another
+            channels = renderer.frame(camera(), samples, number)
+            found.append(channels["base.R"] - channels["diffuse.R"])
+        return np.array(found)
+
+    few = coat()
+    monkeypatch.setattr(specular_paths, "FAINT", 0.0)
+    every = coat()
+    assert every.mean() > 0.01
+    assert few.mean() == pytest.approx(every.mean(), rel=0.003)
+    assert (samples > 1) == bool(np.abs(few - every).max() > 0.01)
+
+
 @pytest.mark.parametrize(("opacity", "within"), [(1.0, 0.03), (0.4, 0.05)])
 def test_brushed_metal_shows_coated_walls_as_bright_as_they_are(tmp_path: Path, opacity: float, within: float) -> None:
     """Behind its wide lobe the wall's coat counts as diffuse; where the wall lets light through, paths go on."""

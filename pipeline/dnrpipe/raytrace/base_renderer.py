@@ -29,6 +29,9 @@ from .recorded import Recorded, planes_of, prepare_emitters
 from .sensors import Camera, opaque_camera, scaled_view
 from .sequence import GOLDEN, ORDER, TILE, beginnings, fraction
 
+FOURTH = 4
+"""Of a pixel's samples, each fourth follows what the first surface shows faintly, in place of the others: with FAINT of
+`specular_paths`, 4 to 18 % of the kernel's time for 0.07 dB (`materials`, `drums`)."""
 MAX_RAYS = 1 << 22
 """Of a launch: bounds its memory (about 1 GiB). Larger pictures are rendered in bands of rows."""
 SHOWN = ("shown.R", "shown.G", "shown.B")
@@ -54,6 +57,11 @@ BRIGHTEST = 1e15
 LOST = "lost"
 """Whether a part of the sample was not finite and is left out; of a pixel, the share of such samples."""
 GBUFFER = ("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "object.Id", "depth.Z")
+
+
+def split(samples: int) -> tuple[int, int]:
+    """How many of a pixel's samples follow faint paths (each FOURTH, from the first on), and how many do not."""
+    return -(-samples // FOURTH), samples - -(-samples // FOURTH)
 
 
 class BaseRenderer:
@@ -97,7 +105,10 @@ class BaseRenderer:
 
         mi = self.mi
         camera = opaque_camera(mi, scaled_view(view, self.unit_scale))
-        rays = dr.opaque(mi.UInt32, samples)  # as data: the kernel is the same for all numbers of them
+        # As data: the kernels are the same for all numbers of rays.
+        rays = dr.opaque(mi.UInt32, samples)
+        parts = [dr.opaque(mi.UInt32, max(count, 1)) for count in split(samples)]
+        weights = [dr.opaque(mi.Float, weight) for weight in (samples / split(samples)[0], 0)]
         turn, tiled = dr.opaque(mi.UInt32, number % FRAMES), dr.opaque(mi.UInt32, int(tiles))
         names = (LOST, *MEANS, *CENTRES, NOISE)
         shape = (view.height, view.width)
@@ -109,7 +120,8 @@ class BaseRenderer:
             first = min(first, view.height - rows)
             start = dr.opaque(mi.UInt32, first)
             size = view.width, rows, samples
-            values = self.kernel(self.scene, self.light, self.tables, camera, rays, turn, tiled, start, *size)
+            counts = rays, parts, weights
+            values = self.kernel(self.scene, self.light, self.tables, camera, counts, turn, tiled, start, *size)
             dr.eval(values)
             band = dict(zip(names, planes_of(values, (rows, view.width)), strict=True))
             for name, plane in channels.items():
@@ -130,7 +142,7 @@ class BaseRenderer:
         light: Any,
         tables: Any,
         camera: Camera,
-        rays: Any,
+        counts: tuple[Any, list[Any], list[Any]],
         turn: Any,
         tiled: Any,
         start: Any,
@@ -140,40 +152,73 @@ class BaseRenderer:
     ) -> list[Any]:
         """Values [height * width] of LOST, MEANS, CENTRES and NOISE.
 
-        Recorded once, replayed for every view of that size and as many rays.
-        A pixel's samples lie side by side; the first goes through the pixel's centre.
+        Recorded once, replayed for every view of that size and as many rays. Of either part of `split`, a pixel's
+        samples lie side by side, so that packets of the second part have no faint paths to wait for. A pixel's first
+        sample goes through its centre.
 
         Args:
             light: a `light_texture`.
             tables: places within a tile, steps of the random numbers.
             camera: see `opaque_camera`.
-            rays: ``samples``, as data.
+            counts: as data, ``samples``, those of `split` and what their faint paths weigh.
             turn: number of the frame.
             tiled: 1: in tiles, 0: scattered.
             start: the first row.
         """
         import drjit as dr
 
+        mi, cut = self.mi, 3 + len(MEANS)
+        (rays, parts, weights), (_, _, across) = counts, camera
+        firsts: list[Any] = []
+        sums = [mi.Float(0)] * cut
+        for part, count in enumerate(split(samples)):
+            if not count:
+                break
+            index = dr.arange(mi.UInt32, width * height * count)
+            pixel, sample = index // parts[part], index % parts[part]
+            sample = sample * FOURTH if part == 0 else sample + sample // (FOURTH - 1) + 1
+            place = pixel % across, start + pixel // across
+            values = self._samples(scene, light, tables, camera, place, sample, rays, turn, tiled, weights[part])
+            dr.eval(values)  # together: each sum alone would run it all again
+            sums = [total + dr.block_sum(value, count) for total, value in zip(sums, values, strict=False)]
+            if part == 0:
+                first = dr.arange(mi.UInt32, width * height) * count
+                firsts = [dr.gather(mi.Float, value, first) for value in values[cut:]]
+        *means, bright, squares = [total / samples for total in sums]
+        noise = dr.sqrt(dr.maximum(squares - bright * bright, 0) / max(samples - 1, 1))
+        return [*means, *firsts, noise]
+
+    def _samples(
+        self,
+        scene: Any,
+        light: Any,
+        tables: Any,
+        camera: Camera,
+        place: tuple[Any, Any],
+        sample: Any,
+        rays: Any,
+        turn: Any,
+        tiled: Any,
+        faint: Any,
+    ) -> list[Any]:
+        """Values of samples: LOST, MEANS, luminance and its square, CENTRES.
+
+        place: columns and rows. sample: their numbers within their pixels, of ``rays``. faint: see `SpecularPaths`.
+        """
+        import drjit as dr
+
         mi = self.mi
-        index = dr.arange(mi.UInt32, width * height * samples)
-        pixel, sample = index // rays, index % rays
-        axes, film, across = camera
-        x, y = pixel % across, start + pixel // across
+        axes, film, _ = camera
+        x, y = place
         order = mi.Float(sample * (TILE * TILE)) + beginnings(mi, x, y, tables[0], tiled == 1)
         number = order + mi.Float(turn * rays * (TILE * TILE))
         order = fraction((order + 0.5) / mi.Float(rays * (TILE * TILE)) + mi.Float(turn) * GOLDEN[0])
-        place = dr.select(sample == 0, 0, mi.Float(sample + turn * (rays - 1)))
-        right = mi.Float(x) + fraction(0.5 + place * GOLDEN[0]) - film[2]
-        down = mi.Float(y) + fraction(0.5 + place * GOLDEN[1]) - film[3]
+        shift = dr.select(sample == 0, 0, mi.Float(sample + turn * (rays - 1)))
+        right = mi.Float(x) + fraction(0.5 + shift * GOLDEN[0]) - film[2]
+        down = mi.Float(y) + fraction(0.5 + shift * GOLDEN[1]) - film[3]
         direction = axes[0] * (right / film[0]) - axes[1] * (down / film[1]) - axes[2]
         ray = mi.Ray3f(mi.Point3f(axes[3]), dr.normalize(direction))
-        values = self.paths.trace(scene, light, tables[1], ray, -axes[2], number, order)
+        values = self.paths.trace(scene, light, tables[1], ray, -axes[2], number, order, faint)
         bright = dr.minimum(mi.luminance(mi.Color3f(*values[1:4])), BRIGHTEST)
-        values.insert(1 + len(MEANS), bright * bright)
-        values.insert(1 + len(MEANS), bright)
-        dr.eval(values)  # together: each sum alone would run it all again
-        cut = 3 + len(MEANS)
-        *means, bright, squares = [dr.block_sum(value, samples) / samples for value in values[:cut]]
-        noise = dr.sqrt(dr.maximum(squares - bright * bright, 0) / max(samples - 1, 1))
-        first = dr.arange(mi.UInt32, width * height) * samples
-        return [*means, *(dr.gather(mi.Float, value, first) for value in values[cut:]), noise]
+        cut = 1 + len(MEANS)
+        return [*values[:cut], bright, bright * bright, *values[cut:]]

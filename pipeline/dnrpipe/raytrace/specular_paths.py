@@ -40,6 +40,8 @@ LEAST_THROUGHPUT, LEAST_BY_CHANCE = 1e-2, 1e-3
 """Fainter paths end, such as those that two polished floors mirror one after the other: with 1e-3 the kernel took
 1.4 times as long for 0.03 dB behind the corrector (`drums`: 0.2 dB). The second is of paths from surfaces, which chance
 ends anyway."""
+FAINT = 0.1
+"""Throughput behind the first surface below which half the samples do for a path. Most coats reflect less."""
 LEAST_SHARE = 1e-3
 """Of a path's light: what a lobe shows of an emitter counts from it on. Most narrow lobes show less, for which no ray
 is cast to see what is in between: a tenth of the kernel's time."""
@@ -98,6 +100,7 @@ class SpecularPaths:
         forward: Any,
         number: Any,
         order: Any,
+        faint: Any = None,
         sampler: Any = None,
     ) -> list[Any]:
         """One sample along each ray -> the values that `base_renderer` names by LOST, MEANS and CENTRES, in that order.
@@ -108,6 +111,7 @@ class SpecularPaths:
             forward: where the camera looks, in world space.
             number: the samples' places in the sequences; negative: there is no ray.
             order: their places among those of a tile, in [0, 1): which of them the first glass reflects.
+            faint: what paths weigh that the first surface reflects or lets through faintly; 0: they end. None: 1.
             sampler: numbers come from it instead of the sequences, and faint chains end by chance (Russian roulette).
         """
         origin = mi.Point3f(ray.o)
@@ -230,6 +234,9 @@ class SpecularPaths:
             radiance += dr.select(rough, throughput * around, 0)
 
             # ------------------------- The next vertex ------------------------
+            if dr.hint(faint is not None, mode="scalar"):
+                is_faint = straight & onwards & ~null & (dr.max(throughput) < FAINT)
+                throughput *= dr.select(is_faint, faint, 1)
             alive = onwards & (bsdf_sample.pdf > 0) & (dr.max(throughput) > least)
             if dr.hint(not self.caustics, mode="scalar"):
                 alive &= null | ~is_sharp(mi, bsdf_sample)
