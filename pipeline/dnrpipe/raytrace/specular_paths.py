@@ -41,7 +41,7 @@ LEAST_THROUGHPUT, LEAST_BY_CHANCE = 1e-2, 1e-3
 1.4 times as long for 0.03 dB behind the corrector (`drums`: 0.2 dB). The second is of paths from surfaces, which chance
 ends anyway."""
 FAINT = 0.1
-"""Throughput behind the first surface below which half the samples do for a path. Most coats reflect less."""
+"""Throughput behind the first surface below which a few samples do, which weigh the more. Most coats reflect less."""
 LEAST_SHARE = 1e-3
 """Of a path's light: what a lobe shows of an emitter counts from it on. Most narrow lobes show less, for which no ray
 is cast to see what is in between: a tenth of the kernel's time."""
