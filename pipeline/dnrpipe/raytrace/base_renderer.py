@@ -30,8 +30,8 @@ from .sensors import Camera, opaque_camera, scaled_view
 from .sequence import GOLDEN, ORDER, TILE, beginnings, fraction
 
 FOURTH = 4
-"""Of a pixel's samples, each fourth follows what the first surface shows faintly, in place of the others: with FAINT of
-`specular_paths`, 4 to 18 % of the kernel's time for 0.07 dB (`materials`, `drums`)."""
+"""Of a pixel's samples, each fourth follows what the first surface shows faintly, in place of the others, where a
+denoiser smooths what they lack: with FAINT of `specular_paths`, 4 to 18 % of the kernel's time for 0.07 dB."""
 MAX_RAYS = 1 << 22
 """Of a launch: bounds its memory (about 1 GiB). Larger pictures are rendered in bands of rows."""
 SHOWN = ("shown.R", "shown.G", "shown.B")
@@ -96,8 +96,8 @@ class BaseRenderer:
 
         view: in scene units, as are ``depth.Z`` and those of CHAIN. samples: K, rays per pixel. number: of the frame
         among those that remember; frames of other numbers cast other rays but for the first of each pixel.
-        tiles: samples of neighbouring pixels complement one another, as those want who smooth them; not: as denoisers
-        want (`sequence`).
+        tiles: samples of neighbouring pixels complement one another, and all follow faint paths, as those want who
+        smooth them; not: as denoisers want (`sequence`, FOURTH).
         ``coverage`` is base.A, at most 1. Where cut-outs stand one behind the other, base.A can be above 1 as the
         colours are: each surface adds its opaque share.
         """
@@ -108,7 +108,7 @@ class BaseRenderer:
         # As data: the kernels are the same for all numbers of rays.
         rays = dr.opaque(mi.UInt32, samples)
         parts = [dr.opaque(mi.UInt32, max(count, 1)) for count in split(samples)]
-        weights = [dr.opaque(mi.Float, weight) for weight in (samples / split(samples)[0], 0)]
+        weights = [dr.opaque(mi.Float, w) for w in ((1, 1) if tiles else (samples / split(samples)[0], 0))]
         turn, tiled = dr.opaque(mi.UInt32, number % FRAMES), dr.opaque(mi.UInt32, int(tiles))
         names = (LOST, *MEANS, *CENTRES, NOISE)
         shape = (view.height, view.width)
