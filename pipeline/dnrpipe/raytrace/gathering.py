@@ -115,7 +115,7 @@ class Gathered:
         mi = self.mi
         forward, number, order = mi.Vector3f(ray.d), dr.select(active, mi.Float(0), -1), mi.Float(0)
         values = self.paths.trace(
-            scene, self.light, self.paths.steps, mi.Ray3f(ray), forward, number, order, numbers.sampler
+            scene, self.light, self.paths.steps, mi.Ray3f(ray), forward, number, order, sampler=numbers.sampler
         )
         return mi.Spectrum(*values[1:4]), active, []
 
