@@ -61,7 +61,8 @@ GBUFFER = ("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "object.Id", "dep
 
 def split(samples: int) -> tuple[int, int]:
     """How many of a pixel's samples follow faint paths (each FOURTH, from the first on), and how many do not."""
-    return -(-samples // FOURTH), samples - -(-samples // FOURTH)
+    few = -(-samples // FOURTH)
+    return few, samples - few
 
 
 class BaseRenderer:
@@ -218,7 +219,7 @@ class BaseRenderer:
         down = mi.Float(y) + fraction(0.5 + shift * GOLDEN[1]) - film[3]
         direction = axes[0] * (right / film[0]) - axes[1] * (down / film[1]) - axes[2]
         ray = mi.Ray3f(mi.Point3f(axes[3]), dr.normalize(direction))
-        values = self.paths.trace(scene, light, tables[1], ray, -axes[2], number, order, faint)
+        values = self.paths.trace(scene, light, tables[1], ray, -axes[2], number, order, faint=faint)
         bright = dr.minimum(mi.luminance(mi.Color3f(*values[1:4])), BRIGHTEST)
         cut = 1 + len(MEANS)
         return [*values[:cut], bright, bright * bright, *values[cut:]]
