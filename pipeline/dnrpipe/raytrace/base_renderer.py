@@ -59,10 +59,9 @@ LOST = "lost"
 GBUFFER = ("normal.X", "normal.Y", "normal.Z", "uv.U", "uv.V", "object.Id", "depth.Z")
 
 
-def split(samples: int) -> tuple[int, int]:
-    """How many of a pixel's samples follow faint paths (each FOURTH, from the first on), and how many do not."""
-    few = -(-samples // FOURTH)
-    return few, samples - few
+def split(samples: int) -> tuple[list[int], list[int]]:
+    """Numbers of a pixel's samples that follow faint paths (each FOURTH, from the first on), and of the others."""
+    return list(range(0, samples, FOURTH)), [number for number in range(samples) if number % FOURTH]
 
 
 class BaseRenderer:
@@ -106,10 +105,15 @@ class BaseRenderer:
 
         mi = self.mi
         camera = opaque_camera(mi, scaled_view(view, self.unit_scale))
-        # As data: the kernels are the same for all numbers of rays.
+        # As data: one kernel serves both parts and all numbers of rays.
         rays = dr.opaque(mi.UInt32, samples)
-        parts = [dr.opaque(mi.UInt32, max(count, 1)) for count in split(samples)]
-        weights = [dr.opaque(mi.Float, w) for w in ((1, 1) if tiles else (samples / split(samples)[0], 0))]
+        few, others = split(samples)
+        weights = (few, 1 if tiles else samples / len(few)), (others, 1 if tiles else 0)
+        parts = [
+            (mi.UInt32(numbers), dr.opaque(mi.UInt32, len(numbers)), dr.opaque(mi.Float, weight))
+            for numbers, weight in weights
+            if numbers
+        ]
         turn, tiled = dr.opaque(mi.UInt32, number % FRAMES), dr.opaque(mi.UInt32, int(tiles))
         names = (LOST, *MEANS, *CENTRES, NOISE)
         shape = (view.height, view.width)
@@ -121,8 +125,7 @@ class BaseRenderer:
             first = min(first, view.height - rows)
             start = dr.opaque(mi.UInt32, first)
             size = view.width, rows, samples
-            counts = rays, parts, weights
-            values = self.kernel(self.scene, self.light, self.tables, camera, counts, turn, tiled, start, *size)
+            values = self.kernel(self.scene, self.light, self.tables, camera, rays, parts, turn, tiled, start, *size)
             dr.eval(values)
             band = dict(zip(names, planes_of(values, (rows, view.width)), strict=True))
             for name, plane in channels.items():
@@ -143,7 +146,8 @@ class BaseRenderer:
         light: Any,
         tables: Any,
         camera: Camera,
-        counts: tuple[Any, list[Any], list[Any]],
+        rays: Any,
+        parts: list[tuple[Any, Any, Any]],
         turn: Any,
         tiled: Any,
         start: Any,
@@ -161,7 +165,8 @@ class BaseRenderer:
             light: a `light_texture`.
             tables: places within a tile, steps of the random numbers.
             camera: see `opaque_camera`.
-            counts: as data, ``samples``, those of `split` and what their faint paths weigh.
+            rays: ``samples``, as data.
+            parts: of `split`: the samples' numbers, how many they are, what their faint paths weigh.
             turn: number of the frame.
             tiled: 1: in tiles, 0: scattered.
             start: the first row.
@@ -169,20 +174,18 @@ class BaseRenderer:
         import drjit as dr
 
         mi, cut = self.mi, 3 + len(MEANS)
-        (rays, parts, weights), (_, _, across) = counts, camera
+        _, _, across = camera
         firsts: list[Any] = []
         sums = [mi.Float(0)] * cut
-        for part, count in enumerate(split(samples)):
-            if not count:
-                break
+        for numbers, many, faint in parts:
+            count = dr.width(numbers)
             index = dr.arange(mi.UInt32, width * height * count)
-            pixel, sample = index // parts[part], index % parts[part]
-            sample = sample * FOURTH if part == 0 else sample + sample // (FOURTH - 1) + 1
+            pixel, sample = index // many, dr.gather(mi.UInt32, numbers, index % many)
             place = pixel % across, start + pixel // across
-            values = self._samples(scene, light, tables, camera, place, sample, rays, turn, tiled, weights[part])
+            values = self._samples(scene, light, tables, camera, place, sample, rays, turn, tiled, faint)
             dr.eval(values)  # together: each sum alone would run it all again
             sums = [total + dr.block_sum(value, count) for total, value in zip(sums, values, strict=False)]
-            if part == 0:
+            if not firsts:
                 first = dr.arange(mi.UInt32, width * height) * count
                 firsts = [dr.gather(mi.Float, value, first) for value in values[cut:]]
         *means, bright, squares = [total / samples for total in sums]
