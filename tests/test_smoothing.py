@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from dnrpipe.raytrace.recorded import aligned
 from dnrpipe.raytrace.sequence import ORDER, TILE
 from dnrpipe.raytrace.smoothing import Smoother
 
@@ -60,3 +61,15 @@ def test_nothing_crosses_from_one_object_to_another() -> None:
     assert np.abs(together - 0.3 - light).max() > 0.005, "on one object it does"
     clean = smoother(wall(light, noise=0.0))["base.B"]
     assert np.abs(clean - 0.3 - light).max() < 1e-5
+
+
+def test_channels_in_one_memory_are_read_apart_when_they_are_not() -> None:
+    """Recorded with the normal, the object and the mask in one plane, then called with another normal."""
+    left = np.arange(WIDTH) < WIDTH // 2
+    light = np.where(left, 1.0, 1.02) * np.ones((HEIGHT, 1))
+    one = aligned(np.ones((HEIGHT, WIDTH))).reshape(HEIGHT, WIDTH)
+    shared = wall(light) | {"normal.Z": one, "object.Id": one, "mask": one}
+    turned = {"normal.Z": one * left, "normal.X": one * ~left}
+    smoother = Smoother(mi)
+    assert np.abs(smoother(shared)["base.B"] - 0.3 - light).max() > 0.005, "one object"
+    assert np.abs(smoother(shared | turned)["base.B"] - 0.3 - light).max() < 1e-5

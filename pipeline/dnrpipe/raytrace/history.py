@@ -37,7 +37,7 @@ from dnrtrain.contract import FRESH_CHANNELS, View
 
 from .base_renderer import CHAIN, FACING, SHOWN
 from .neighbours import AROUND, Pixels
-from .recorded import Recorded, aligned, planes_of
+from .recorded import Recorded, inputs_of, planes_of
 from .sensors import opaque_camera
 
 MOST_DIFFUSE, MOST_MIRRORED, MOST_OTHER = 3.0, 16.0, 6.0
@@ -100,8 +100,8 @@ class History:
         mi, size, first = self.mi, (view.height, view.width), self.before is None
         if self.before is None or (self.before[0].height, self.before[0].width) != size:
             pixels = view.width * view.height
-            self.before = view, [mi.Float(aligned(np.zeros(4 * pixels))) for _ in PACKETS]
-        planes = [mi.Float(aligned(channels[name])) for name in TAKEN]
+            self.before = view, inputs_of(mi, (np.zeros(4 * pixels) for _ in PACKETS))
+        planes = inputs_of(mi, (channels[name] for name in TAKEN))
         earlier, memory = self.before
         resting = not first and view.c2w == earlier.c2w and view.intrinsics == earlier.intrinsics
         cameras = opaque_camera(mi, view), opaque_camera(mi, earlier)

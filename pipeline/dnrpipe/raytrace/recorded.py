@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
@@ -124,6 +124,22 @@ def planes_of(values: Sequence[Any], shape: tuple[int, int]) -> list[np.ndarray]
         shared = plane.ctypes.data in known or not plane.flags.writeable
         known.add(plane.ctypes.data)
         found.append(plane.copy() if shared else plane)
+    return found
+
+
+def inputs_of(mi: Any, planes: Iterable[np.ndarray]) -> list[Any]:
+    """The planes as flat Dr.Jit arrays for a recorded function, each in memory of its own.
+
+    On a CPU they are numpy's memory where it is aligned. Of planes in one memory all but the first are copies: Dr.Jit
+    would record them as one argument, and go on reading the first where they differ in a later call.
+    """
+    found, known = [], set()
+    for plane in planes:
+        flat = aligned(plane)
+        if flat.ctypes.data in known:
+            flat = aligned(flat.copy())
+        known.add(flat.ctypes.data)
+        found.append(mi.Float(flat))
     return found
 
 

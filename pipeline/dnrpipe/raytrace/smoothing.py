@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from .neighbours import AROUND, Pixels
-from .recorded import Recorded, aligned, planes_of
+from .recorded import Recorded, inputs_of, planes_of
 
 LOOSE = 1.5
 """Standard deviations of a pixel's mean within which a neighbour shows the same. Measured with four and eight rays,
@@ -47,7 +47,7 @@ class Smoother:
     def __call__(self, channels: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """The channels with ``base.R/G/B`` smoothed; float32 [H, W] each, linear Rec.709, premultiplied."""
         height, width = channels["mask"].shape
-        planes = [self.mi.Float(aligned(channels[name])) for name in TAKEN]
+        planes = inputs_of(self.mi, (channels[name] for name in TAKEN))
         found = self.kernel(planes, width, height)
         return {**channels, **dict(zip(TAKEN[:3], planes_of(found, (height, width)), strict=True))}
 
