@@ -145,6 +145,10 @@ def test_baked_light_that_is_worse_than_good_path_tracing_is_not_taken() -> None
     assert choose([steady, baked], Wanted()) == (steady, "baked light is worse here")
     as_good = baked.model_copy(update={"psnr": 34.6, "lpips": 0.021})
     assert choose([steady, as_good], Wanted())[0] is as_good
+    more = baked.model_copy(update={"way": Way(name="base", spp=16, smooth=True), "psnr": 34.6, "lpips": 0.021})
+    assert choose([steady, baked, more], Wanted())[0] is more, "as good, and cheaper still"
+    assert choose([steady, baked, more.model_copy(update={"seconds": 101})], Wanted())[0] is steady
+    assert choose([steady, baked.model_copy(update={"psnr": 34.5, "lpips": 0.02}), more], Wanted())[0] is not more
     poor = steady.model_copy(update={"psnr": 30.0, "lpips": 0.05})
     assert choose([poor, baked.model_copy(update={"psnr": 29.0})], Wanted())[0].way.name == "base", "not good itself"
 

@@ -107,16 +107,16 @@ def test_settings_that_a_shot_finds_keep_where_it_runs(scene: Path, tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("bounced", "small", "lights"),
+    ("bounced", "lost", "lights"),
     [
         (0.1, False, [(1024, 64), (1024, 16)]),
         (0.6, False, [(1024, 128), (1024, 32)]),
-        (0.1, True, [(2048, 16), (1024, 16)]),
+        (0.1, True, [(2048, 32), (2048, 16)]),
     ],
 )
 def test_light_is_chosen_for_each_shot(
     bounced: float,
-    small: bool,
+    lost: bool,
     lights: list[tuple[int, int]],
     scene: Path,
     tmp_path: Path,
@@ -124,7 +124,7 @@ def test_light_is_chosen_for_each_shot(
 ) -> None:
     plan = SimpleNamespace(pilot=SimpleNamespace(beyond=lambda depth: bounced))
     monkeypatch.setattr(make_shot, "resolve_plan", lambda run: plan)
-    summary = SimpleNamespace(atlas=SimpleNamespace(has_small_charts=small))
+    summary = SimpleNamespace(atlas=SimpleNamespace(loses_most=lost))
     monkeypatch.setattr(make_shot, "read_summary", lambda folder: summary)
     root = str(tmp_path / "scene.dnr")
     session = hold(scene, workspace=root)

@@ -114,11 +114,6 @@ class AtlasFacts(SceneRecord):
     texels_per_unit: dict[str, float]
 
     @property
-    def has_small_charts(self) -> bool:
-        """Whether the scene is of more parts than Blender unwraps: few texels each."""
-        return self.method == "charts"
-
-    @property
     def loses_most(self) -> bool:
         """Whether light of the usual number of texels is much too blurred: most triangles hold none."""
         return self.triangles_without_texel > MOST_LOST

@@ -6,7 +6,6 @@ Everything lies in ``shots/NAME`` of the workspace: ``frames/`` (EXR), ``picture
 
 from __future__ import annotations
 
-import math
 import shutil
 import time
 from collections.abc import Sequence
@@ -48,7 +47,7 @@ CHECKED = 2
 """Frames of a shot that are traced to check it."""
 PLAN_VERSION = 18
 LIGHT_SIDE, MORE = 1024, (1, 2, 4)
-"""Texels of the light map's side, and times as many paths, or texels where charts are small, for more pixels."""
+"""Texels of the light map's side, and times as many paths a texel for more pixels."""
 BATCH = 8
 """Bundles of single frames that are on disk at once."""
 
@@ -126,16 +125,14 @@ def shot_light(run: Run, pixels: int) -> Settings:
     """The run's settings with what suits a shot of so many pixels where they leave the light map's to us.
 
     Its paths go where the shot looks. There are more of them (MORE) as long as the shot has as many pixels, so that
-    light takes a small part of the time: more a texel, or as many of more texels where the atlas has small charts,
-    which are blurred before they are noisy (figures: docs/experiments.md).
+    light takes a small part of the time (figures: docs/experiments.md).
     """
     settings, plan = run.settings, resolve_plan(run)
-    small_charts = read_summary(run.workspace.scene).atlas.has_small_charts
+    side = LIGHT_SIDE * (2 if read_summary(run.workspace.scene).atlas.loses_most else 1)
     spp = SPP["gathered" if light_plan(settings, plan).gathered else "traced"]
     found = []
     for more in MORE:
-        side = LIGHT_SIDE * (math.isqrt(more) if small_charts else 1)
-        chosen = {"light_where": "seen", "light_size": side, "light_spp": spp * (1 if small_charts else more)}
+        chosen = {"light_where": "seen", "light_size": side, "light_spp": spp * more}
         left = {name: value for name, value in chosen.items() if getattr(settings.base, name) == "auto"}
         found.append(settings.model_copy(update={"base": settings.base.model_copy(update=left)}))
     return [each for each in found if each is found[0] or light_plan(each, plan).paths <= pixels][-1]

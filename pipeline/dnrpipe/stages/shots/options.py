@@ -28,7 +28,8 @@ there it does, but for `jewels`, whose caustics baked light leaves out."""
 STEADY = 4
 """Samples per pixel; with fewer, denoised frames flicker."""
 PATIENCE = 8
-"""Samples per pixel, as many as base images have rays, beyond which nobody waits who asked for nothing."""
+"""Samples per pixel, as many as base images have rays, beyond which nobody waits who asked for nothing, unless it is
+for base images that cost less than STEADY path-traced samples and are as good."""
 
 
 class Wanted(BaseModel):
@@ -91,8 +92,9 @@ def choose(options: Sequence[Option], wanted: Wanted) -> tuple[Option, str]:
 
     With a time: the best PSNR that fits in; the quickest where none does. With a quality: the cheapest that reaches it;
     the best where none does. With neither, the wanted quality is the best of baked light's, with as few rays as cost it
-    next to nothing (`NEAR`): the cheapest option that has both its PSNR and its LPIPS. Where light is not weighed it is
-    what baked light usually has (`USUAL`), or the best that at most PATIENCE samples give.
+    next to nothing (`NEAR`): the cheapest option that has both its PSNR and its LPIPS. Where STEADY path-traced samples
+    have more, it is theirs, give or take as much. Where light is not weighed it is what baked light usually has
+    (`USUAL`), or the best that at most PATIENCE samples give.
 
     Raises ValueError: no options.
     """
@@ -131,13 +133,16 @@ def choose(options: Sequence[Option], wanted: Wanted) -> tuple[Option, str]:
         least = denoised.get(own.way.spp) if own.way.smooth else None
         return least is None or own.lpips is None or own.lpips <= least * SMOOTH_ENOUGH
 
-    best = max(filter(is_clean, baked), key=quality)
-    near = [own for own in baked if is_clean(own) and is_near(own, best)]
+    clean = [own for own in baked if is_clean(own)]
+    usual = [own for own in clean if not own.way.smooth or own.way.spp <= PATIENCE]
+    best = max(usual, key=quality)
+    near = [own for own in usual if is_near(own, best)]
     cheapest = min(own.seconds for own in near)
     aim = max((own for own in near if own.seconds <= SAME_PRICE * cheapest), key=quality)
     steady = next((o for o in options if o.way.name == "path" and o.way.spp == STEADY and o.reaches(*USUAL)), None)
     if steady is not None and not is_near(aim, steady):
-        aim = steady  # good already: light was baked to save time, not to have less than that
+        # Good already: light was baked to save time, not to have less than that.
+        aim = min((steady, *(own for own in clean if is_near(own, steady))), key=lambda option: option.seconds)
     enough = [option for option in options if option.reaches(aim.psnr, aim.lpips)]
     found = min(enough, key=lambda option: option.seconds)
     if found is aim:

@@ -27,9 +27,10 @@ from .renderers import Renderer, shipped_renderer
 
 FEWER = (4, 6)
 """Rays per pixel of base images that are tried beside the settings'."""
-SMOOTH = (4, 8)
+SMOOTH = (4, 8, 16)
 """The same of base images that are smoothed instead of denoised: that takes as long as three to eight rays do, and does
-less where most light comes straight from a sky or lies baked on matt surfaces."""
+less where most light comes straight from a sky or lies baked on matt surfaces. The last is for where few path-traced
+samples are good already (`choose`)."""
 SAVED = 0.5
 """Of a frame of STEADY samples, what a base image as good takes less where it is smoothed, give or take."""
 DEEP, MOST_DEEP = 8, 0.02
