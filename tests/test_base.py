@@ -434,7 +434,7 @@ def test_a_faint_coat_is_followed_by_few_samples_and_as_bright(
     def coat() -> np.ndarray:
         renderer, found = BaseRenderer(mi, scene, light), []
         for number in range(16):  # frames, whose samples complement one another
-            channels = renderer.frame(camera(), samples, number, tiles=False)
+            channels = renderer.frame(camera(), samples, number, tiles=False, thin=True)
             found.append(channels["base.R"] - channels["diffuse.R"])
         return np.array(found)
 

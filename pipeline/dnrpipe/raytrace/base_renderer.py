@@ -30,8 +30,8 @@ from .sensors import Camera, opaque_camera, scaled_view
 from .sequence import GOLDEN, ORDER, TILE, beginnings, fraction
 
 FOURTH = 4
-"""Of a pixel's samples, each fourth follows what the first surface shows faintly, in place of the others, where a
-denoiser smooths what they lack: with FAINT of `specular_paths`, 4 to 18 % of the kernel's time for 0.07 dB."""
+"""Of a pixel's samples, each fourth follows what the first surface shows faintly, in place of the others, where that is
+wanted: with FAINT of `specular_paths`, 3 to 22 % of the time of a shot's frames."""
 MAX_RAYS = 1 << 22
 """Of a launch: bounds its memory (about 1 GiB). Larger pictures are rendered in bands of rows."""
 SHOWN = ("shown.R", "shown.G", "shown.B")
@@ -91,13 +91,15 @@ class BaseRenderer:
         # Recorded at the first call: tracing the plugins anew would take longer than the frame itself.
         self.kernel = Recorded(self._kernel, scene)
 
-    def frame(self, view: Any, samples: int, number: int = 0, *, tiles: bool = True) -> dict[str, np.ndarray]:
+    def frame(
+        self, view: Any, samples: int, number: int = 0, *, tiles: bool = True, thin: bool = False
+    ) -> dict[str, np.ndarray]:
         """Channels of BASE_CHANNELS and of the G-buffer: float32 [H, W] each, linear Rec.709, premultiplied.
 
         view: in scene units, as are ``depth.Z`` and those of CHAIN. samples: K, rays per pixel. number: of the frame
         among those that remember; frames of other numbers cast other rays but for the first of each pixel.
-        tiles: samples of neighbouring pixels complement one another, and all follow faint paths, as those want who
-        smooth them; not: as denoisers want (`sequence`, FOURTH).
+        tiles: samples of neighbouring pixels complement one another, as those want who smooth them; not: as denoisers
+        want (`sequence`). thin: few samples follow faint paths (FOURTH); not: all do.
         ``coverage`` is base.A, at most 1. Where cut-outs stand one behind the other, base.A can be above 1 as the
         colours are: each surface adds its opaque share.
         """
@@ -108,7 +110,7 @@ class BaseRenderer:
         # As data: one kernel serves both parts and all numbers of rays.
         rays = dr.opaque(mi.UInt32, samples)
         few, others = split(samples)
-        weights = (few, 1 if tiles else samples / len(few)), (others, 1 if tiles else 0)
+        weights = (few, samples / len(few) if thin else 1), (others, 0 if thin else 1)
         parts = [
             (mi.UInt32(numbers), dr.opaque(mi.UInt32, len(numbers)), dr.opaque(mi.Float, weight))
             for numbers, weight in weights

@@ -40,6 +40,7 @@ class Worker(BundleWorker):
         light = read_light(self.common.light) if isinstance(self.common, BakedCommon) else dark
         scene = self.engine.scenes[str(self.bundle)]
         self.denoise = isinstance(self.common, BakedCommon) and self.common.denoise
+        self.thin = isinstance(self.common, BakedCommon) and self.common.thin
         self.renderer = BaseRenderer(
             self.engine.mi, scene, light, gloss=not self.denoise, unit_scale=self.engine.unit_scale
         )
@@ -82,7 +83,8 @@ class Worker(BundleWorker):
         """`channels` by the kernel alone: not denoised, not path-traced. number: see `BaseRenderer.frame`. smooth:
         they will be smoothed, not denoised."""
         renderer, tiles = self.renderer, smooth or not self.denoise
-        channels = renderer.frame(view, samples or self.common.samples, number, tiles=tiles)
+        thin = self.thin and not tiles
+        channels = renderer.frame(view, samples or self.common.samples, number, tiles=tiles, thin=thin)
         self.repaired, self.masked = self.repaired + renderer.repaired, self.masked + renderer.masked
         channels["coverage"] = self._frames(view).coverage(view, channels["mask"] > 0.5, alpha=channels["base.A"])
         return channels

@@ -210,13 +210,15 @@ class LightAnswer(Costs):
 class BakedCommon(BundleCommon):
     """Base images by baked light. samples: rays per pixel. light: file of the light map.
 
-    denoise: rough lobes are followed instead of looked up, and Open Image Denoise takes the grain.
+    denoise: rough lobes are followed instead of looked up, and Open Image Denoise takes the grain. thin: before it few
+    samples follow faint paths (`BaseRenderer.frame`).
     """
 
     kind: Literal["baked"]
     samples: int
     light: Path
     denoise: bool
+    thin: bool = False
 
 
 class SampledCommon(BundleCommon):

@@ -77,5 +77,6 @@ def _neural(run: Run, background: bool, *, checkpoint: Path | None) -> Renderer:
     base = base_renderer(run.workspace, run.settings, run.effect_plan)
     with run.timed("baking light: process"):
         bake_light(run, base)
-    update = {"base": base.common, "checkpoint": checkpoint}
+    # A shot looks closely, where faint paths are dear: following few of them saves more than it costs.
+    update = {"base": base.common | {"thin": True}, "checkpoint": checkpoint}
     return Renderer(tracer.common.model_copy(update=update), tracer.environment | base.environment)
