@@ -14,6 +14,7 @@ from dnrpipe.core.cameras import look_at_view
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import CameraSettings, resolve
 from dnrpipe.core.shot_records import told_frames
+from dnrpipe.raytrace.temporal_filter import Finished
 from dnrpipe.stages.base_images import CHUNK, WARM_UP
 from dnrpipe.stages.shots import render_frames
 from dnrpipe.stages.shots.check import held_out
@@ -310,26 +311,60 @@ def test_a_frame_is_rendered_while_the_one_before_is_written(tmp_path, monkeypat
     ]
     assert in_succession([]) == []
     worker: Any = object.__new__(Worker)
-    worker.ahead = None
-    rendered, written, broken = [], [], [1]
+    worker.known = []
+    rendered, filtered, written, broken = [], [], [], [2]
 
     def render(task: FrameTask, _ms: dict[str, float]) -> tuple[list[Any], int]:
-        assert task.following is None
-        rendered.append(tasks.index(next(other for other in tasks if other.output == task.output)))
+        assert task == task.alone
+        rendered.append(int(task.output.stem) - 1)
         if rendered[-1] in broken:
             broken.clear()
             raise ValueError("broken once")
-        return [{}], 0
+        return [{"number": rendered[-1]}], 0
 
-    def write(task: FrameTask) -> None:
-        written.append((task.output, len(rendered)))
+    def mix(frame: Finished, before: Finished | None, after: Finished | None) -> dict[str, Any]:
+        filtered.append([each and each.layers["number"] for each in (before, frame, after)])
+        return {"number": "filtered"}
+
+    def write(found: Any) -> None:
+        written.append((found.task.output, found.task.fingerprint, found.layers))
 
     monkeypatch.setattr(worker, "render", render, raising=False)
-    monkeypatch.setattr(worker, "_write", lambda found: write(found.task), raising=False)
+    monkeypatch.setattr(worker, "filter", mix, raising=False)
+    monkeypatch.setattr(worker, "_write", write, raising=False)
     for number, task in enumerate(tasks):
         answer = worker(task.data())
-        assert written[number][0] == task.output and answer["write_seconds"] >= 0
-    assert rendered == [0, 1, 1, 2], "the one that failed beside the first is rendered again"
+        assert written[number] == (task.output, task.fingerprint, [{"number": "filtered"}])
+        assert answer["write_seconds"] >= 0 and "temporal filter" in answer["ms"]
+    assert rendered == [0, 1, 2, 2], "the one that failed beside the first is rendered again"
+    assert filtered == [[None, 0, 1], [0, 1, 2], [1, 2, None]], "with the others as they were rendered"
+
+
+def test_frames_are_filtered_with_those_next_to_them(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    """Not across a cut, not where things move, not with a lens, not if three of them are too large."""
+
+    def others(shot: list[ShotFrame]) -> list[tuple[str | None, str | None]]:
+        tasks = frame_tasks(shot, tmp_path, Way(name="path", spp=4), "inputs")
+        return [(task.before and task.before.view.name, task.after and task.after.view.name) for task in tasks]
+
+    shot = frames(5, cut=3)
+    names = [frame.view.name for frame in shot]
+    assert others(shot) == [
+        *((None, names[1]), (names[0], names[2]), (names[1], None)),
+        *((None, names[4]), (names[3], None)),
+    ]
+    moving = [*shot[:2], shot[2].model_copy(update={"moving": ("ball",)})]
+    assert others(moving) == [(None, names[1]), (names[0], None), (None, None)]
+    lens = {"focus_distance": 1.0, "aperture_radius": 0.1}
+    assert others([frame.model_copy(update={"lens": lens}) for frame in shot]) == [(None, None)] * 5
+    large = [
+        frame.model_copy(update={"view": frame.view.model_copy(update={"width": 3840, "height": 2160})})
+        for frame in shot
+    ]
+    assert others(large) == [(None, None)] * 5
+    tasks, again = (frame_tasks(frames(count, cut=9), tmp_path, Way(name="path", spp=4), "inputs") for count in (3, 4))
+    same = [a.fingerprint == b.fingerprint for a, b in zip(tasks, again, strict=False)]
+    assert same == [True, True, False], "the last one has another after it now"
 
 
 def test_windows_that_show_nothing_do_not_count() -> None:

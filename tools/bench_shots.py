@@ -271,8 +271,8 @@ def opened(root: Path) -> Run:
 
 
 def places(frames: int) -> tuple[int, int]:
-    """Of the frames that are compared; with each of them goes the one before."""
-    return frames // 3, frames - 1
+    """Of the frames that are compared; with each of them goes the one before. Not the last, which has none after it."""
+    return frames // 3, frames - 2
 
 
 def root_of(folder: Path, scene: str, size: str) -> Path:

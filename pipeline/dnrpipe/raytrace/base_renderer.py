@@ -107,10 +107,10 @@ class BaseRenderer:
 
         mi = self.mi
         camera = opaque_camera(mi, scaled_view(view, self.unit_scale))
-        # As data: one kernel serves both parts and all numbers of rays.
+        # As data: one kernel serves all parts and all numbers of rays.
         rays = dr.opaque(mi.UInt32, samples)
-        few, others = split(samples)
-        weights = (few, samples / len(few) if thin else 1), (others, 0 if thin else 1)
+        few, others = split(samples) if thin else (list(range(samples)), [])
+        weights = (few, samples / len(few)), (others, 0)
         parts = [
             (mi.UInt32(numbers), dr.opaque(mi.UInt32, len(numbers)), dr.opaque(mi.Float, weight))
             for numbers, weight in weights
@@ -159,16 +159,16 @@ class BaseRenderer:
     ) -> list[Any]:
         """Values [height * width] of LOST, MEANS, CENTRES and NOISE.
 
-        Recorded once, replayed for every view of that size and as many rays. Of either part of `split`, a pixel's
-        samples lie side by side, so that packets of the second part have no faint paths to wait for. A pixel's first
-        sample goes through its centre.
+        Recorded once, replayed for every view of that size and as many rays. Of either part, a pixel's samples lie side
+        by side, so that packets of the second one have no faint paths to wait for. A pixel's first sample goes through
+        its centre.
 
         Args:
             light: a `light_texture`.
             tables: places within a tile, steps of the random numbers.
             camera: see `opaque_camera`.
             rays: ``samples``, as data.
-            parts: of `split`: the samples' numbers, how many they are, what their faint paths weigh.
+            parts: of `split`, or all: the samples' numbers, how many they are, what their faint paths weigh.
             turn: number of the frame.
             tiled: 1: in tiles, 0: scattered.
             start: the first row.

@@ -6,7 +6,7 @@ Notation
              P as the path goes on (primary surface replacement; Zimmer et al. 2015)
     D, S     diffuse part of a base image, and the rest of it
     K        rays per pixel of a frame, R of all frames that count in a pixel
-    corners  the four pixels of the earlier frame around a point's place in it
+    corners  the four pixels of the earlier frame around a point's place in it (`reprojection`)
 
     D_t = lerp(D_t-1 where P was, D of frame t, K / R)        S_t likewise, where V was
 
@@ -36,8 +36,8 @@ import numpy as np
 from dnrtrain.contract import FRESH_CHANNELS, View
 
 from .base_renderer import CHAIN, FACING, SHOWN
-from .neighbours import AROUND, Pixels
 from .recorded import Recorded, inputs_of, planes_of
+from .reprojection import TURNED, Picture, Places, Surfaces
 from .sensors import opaque_camera
 
 MOST_DIFFUSE, MOST_MIRRORED, MOST_OTHER = 3.0, 16.0, 6.0
@@ -45,19 +45,12 @@ MOST_DIFFUSE, MOST_MIRRORED, MOST_OTHER = 3.0, 16.0, 6.0
 lookup blurs a little, light moves on what is not a mirror, and D has no grain but at edges."""
 MOST_RESTING = 512.0
 """Where the camera has not moved."""
-PLANE = 0.01
-"""Distance from P's tangent plane over distance to the camera up to which a point lies on the same surface."""
-TURNED = 0.8
-"""Least cosine between its normal and P's."""
 FLAT = 0.9998
 """Least cosine between normals of neighbouring pixels of a flat mirror: about a degree."""
 DISPLACED = 4.0
 """Pixels, as large as they are at the end of a path, up to which two ends show the same."""
-SPREAD, REACH = 2.5, 2
-"""Standard deviations of the neighbourhood within which S, and D at edges, stay; pixels it reaches to each side."""
-LEAST_WEIGHT = 0.2
-"""Share of the corners, by their distance, that must lie on the same surface."""
-CORNERS = ((0, 0), (1, 0), (0, 1), (1, 1))
+SPREAD = 2.5
+"""Standard deviations of the neighbourhood within which S, and D at edges, stay."""
 
 COLOURS = tuple(f"{kind}.{c}" for kind in ("diffuse", "base", "albedo") for c in "RGB")
 MEANS = (*COLOURS, *SHOWN, *FACING, "base.A")
@@ -67,8 +60,6 @@ GIVEN = (*MEANS, "noise", "rays")
 """Channels that it changes; it adds FRESH_CHANNELS, the frame's own."""
 LEAST_ALPHA = 1e-3
 """Of the frame's own base image, where it is brought to the alpha of what is remembered."""
-HALF, TINY = 0.5, 1e-4
-"""Pixels: how far a picture goes beyond the centres of its outer ones; what keeps a place off the last."""
 
 
 class History:
@@ -126,12 +117,12 @@ class History:
         import drjit as dr
 
         mi = self.mi
-        picture = _Picture(mi, width, height)
+        picture = Picture(mi, width, height)
         diffuse, base, *facts = (mi.Color3f(*planes[i : i + 3]) for i in range(0, 15, 3))
         alpha, noise, rays = planes[15:18]
         specular, bright = base - diffuse, mi.luminance(base)
-        seen = picture.seen(camera, planes, self.edges)
-        parts = diffuse, specular
+        seen = _seen(mi, picture, camera, planes, self.edges)
+        own, parts = seen.own, (diffuse, specular)
         past = _rested(mi, memory) if resting else _moved(mi, picture, earlier, memory, seen, parts, self.most_other)
 
         share, share_d = rays / (rays + past.rays_s), rays / (rays + past.rays_d)
@@ -142,7 +133,7 @@ class History:
         squares = dr.lerp(past.squares, bright * bright + noise * noise, share)
         error = dr.sqrt(dr.maximum(squares - light * light, 0) * share)  # of all frames by the variance of one's mean
         given = [*d, *(s + d), *chain.from_iterable(facts), alpha, error, rays + past.rays_s]
-        packets = [(*seen.point, dr.select(seen.mask, 1.0, 0.0)), (*seen.normal, squares)]
+        packets = [(*own.point, dr.select(own.mask, 1.0, 0.0)), (*own.normal, squares)]
         packets += [(*seen.end, rays + past.rays_s), (*s, light), (*d, rays + past.rays_d)]
         packets += [(*fact, alpha) for fact in facts]
         return given, [dr.ravel(mi.Vector4f(*packet)) for packet in packets]
@@ -150,20 +141,14 @@ class History:
 
 @dataclass(frozen=True)
 class _Seen:
-    """What a frame sees, an array element per pixel: n, P, whether there is one, whether neighbours lie on other
-    surfaces and where the one in front is, whether all face as P does; V, the end of the path and its length behind P;
-    distance of P from the camera."""
+    """What a frame sees, an array element per pixel: its surfaces; whether a pixel's neighbours face as it does; V; the
+    end of the path and its length behind P."""
 
-    normal: Any
-    point: Any
-    mask: Any
-    edge: Any
-    front: Any
+    own: Surfaces
     even: Any
     virtual: Any
     end: Any
     length: Any
-    distance: Any
 
 
 @dataclass(frozen=True)
@@ -194,23 +179,23 @@ def _rested(mi: Any, memory: list[Any]) -> _Past:
 
 
 def _moved(
-    mi: Any, picture: _Picture, earlier: Any, memory: list[Any], seen: _Seen, parts: tuple[Any, Any], most_other: float
+    mi: Any, picture: Picture, earlier: Any, memory: list[Any], seen: _Seen, parts: tuple[Any, Any], most_other: float
 ) -> _Past:
     """Looked up where P and V were. parts: D and S of the frame."""
     import drjit as dr
 
     diffuse, specular = parts
-    edge, inner = seen.edge, seen.mask & ~seen.edge
+    own, edge = seen.own, seen.own.edge
+    inner = own.mask & ~edge
     narrow = (seen.length > 0) & seen.even & ~edge
-    near = DISPLACED * (seen.distance + seen.length) / earlier[1][0]
+    near = DISPLACED * (own.distance + seen.length) / earlier[1][0]
 
     # ------------------------- Where P was ----------------------------
-    at = _Places(mi, picture, earlier, dr.select(edge, seen.front, seen.point))
+    at = Places(mi, picture, earlier, dr.select(edge, own.front, own.point))
     same, sharp = [], at.inside & inner
     for index in at.corners:
         place, facing = (dr.gather(mi.Vector4f, memory[i], index) for i in (PLACE, NORMAL))
-        on = (place.w > 0) & (dr.dot(facing.xyz, seen.normal) > TURNED)
-        on &= dr.abs(dr.dot(place.xyz - seen.point, seen.normal)) < PLANE * seen.distance
+        on = (place.w > 0) & own.holds(place.xyz, facing.xyz)
         same.append(at.inside & (edge | (inner & on)))
         sharp &= same[-1]
     weights, known = at.weights(same)
@@ -220,15 +205,15 @@ def _moved(
     rays_s = dr.select(known & ~narrow, dr.minimum(end.w, most_other), 0)
     followed = edge & at.inside
     s, d = at.spline(memory[S], followed, s), _rgb(mi, at.spline(memory[D], sharp | followed, d))
-    colour, light, squares = picture.clipped(_rgb(mi, s), specular), s.w, facing.w
-    d = dr.select(edge, picture.clipped(d, diffuse), d)
+    colour, light, squares = picture.clipped(_rgb(mi, s), specular, SPREAD), s.w, facing.w
+    d = dr.select(edge, picture.clipped(d, diffuse, SPREAD), d)
 
     # ------------------------- Where V was ----------------------------
-    at = _Places(mi, picture, earlier, seen.virtual)
+    at = Places(mi, picture, earlier, seen.virtual)
     same, sharp = [], at.inside & narrow
     for index in at.corners:
         place, facing, end = (dr.gather(mi.Vector4f, memory[i], index) for i in (PLACE, NORMAL, END))
-        on = at.inside & narrow & (place.w > 0) & (dr.dot(facing.xyz, seen.normal) > TURNED)
+        on = at.inside & narrow & (place.w > 0) & (dr.dot(facing.xyz, own.normal) > TURNED)
         same.append(on & (dr.norm(end.xyz - seen.end) < near))
         sharp &= same[-1]
     weights, mirrored = at.weights(same)
@@ -240,6 +225,20 @@ def _moved(
     return _Past(colour, d, [_rgb(mi, one) for one in facts], facts[0].w, light, squares, rays_s, rays_d)
 
 
+def _seen(mi: Any, picture: Picture, camera: Any, planes: list[Any], edges: bool) -> _Seen:
+    """What the frame sees. planes: of TAKEN. edges: see `Picture.surfaces`."""
+    import drjit as dr
+
+    normal, mask, depth = mi.Normal3f(*planes[18:21]), planes[21] > 0.5, planes[22]
+    own = picture.surfaces(camera, normal, mask, depth, edges=edges)
+    length, end = planes[23], mi.Point3f(*planes[24:27])
+    virtual = mi.Point3f(camera[0][3] + own.sight * (own.distance + length))
+    even = mi.Bool(True)
+    for right, below in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        even &= dr.dot(dr.gather(mi.Normal3f, normal, picture.index(right, below)), normal) > FLAT
+    return _Seen(own, even, virtual, end, length)
+
+
 def _rgb(mi: Any, packet: Any) -> Any:
     return mi.Color3f(packet.x, packet.y, packet.z)
 
@@ -248,135 +247,3 @@ PACKETS = PLACE, NORMAL, END, S, D, *FACTS = range(8)
 """What a frame leaves behind: P, and 1 where there is one; n and the mean square of the luminance of base; where the
 path ends, and R of S; S and the luminance; D and its R; albedo, SHOWN and FACING, each with alpha. Four values a pixel,
 side by side, which are read at once."""
-
-
-class _Picture(Pixels):
-    """What a frame shows at its pixels and about them."""
-
-    def seen(self, camera: Any, planes: list[Any], edges: bool) -> _Seen:
-        """What the frame sees. planes: of TAKEN. edges: False: none but about surfaces."""
-        import drjit as dr
-
-        mi = self.mi
-        (right, up, back, origin), (fl_x, fl_y, cx, cy), _ = camera
-        normal, mask, depth = mi.Normal3f(*planes[18:21]), planes[21] > 0.5, planes[22]
-        nearest = mi.Float(dr.inf)  # of the neighbours that see a surface
-        for right_, below in AROUND:
-            index = self.index(right_, below)
-            beside = dr.select(dr.gather(mi.Bool, mask, index), dr.gather(mi.Float, depth, index), dr.inf)
-            nearest = dr.minimum(nearest, beside)
-        nearest = dr.select(dr.isfinite(nearest), nearest, 0)
-        x, y = (mi.Float(self.x) + 0.5 - cx) / fl_x, (mi.Float(self.y) + 0.5 - cy) / fl_y
-        sight = mi.Vector3f(right * x - up * y - back)
-        stretch, sight = dr.norm(sight), dr.normalize(sight)
-        distance, ahead = dr.select(mask, depth, nearest) * stretch, nearest * stretch
-        length, end = planes[23], mi.Point3f(*planes[24:27])
-        point, front, virtual = (mi.Point3f(origin + sight * far) for far in (distance, ahead, distance + length))
-        edge = ~mask & (nearest > 0)
-        if edges:
-            edge |= mask & self.is_edge(point, normal, distance, mask)
-        return _Seen(normal, point, mask, edge, front, self.is_even(normal), virtual, end, length, distance)
-
-    def is_edge(self, point: Any, normal: Any, distance: Any, mask: Any) -> Any:
-        """Whether some of the eight neighbours lie on another surface."""
-        import drjit as dr
-
-        mi, edge = self.mi, self.mi.Bool(False)
-        for right, below in AROUND:
-            index = self.index(right, below)
-            beside, facing = dr.gather(mi.Point3f, point, index), dr.gather(mi.Normal3f, normal, index)
-            edge |= ~dr.gather(mi.Bool, mask, index) | (dr.dot(facing, normal) <= TURNED)
-            edge |= dr.abs(dr.dot(beside - point, normal)) >= PLANE * distance
-        return edge
-
-    def is_even(self, normal: Any) -> Any:
-        """Whether the normals of the four neighbours agree with the pixel's."""
-        import drjit as dr
-
-        even = self.mi.Bool(True)
-        for right, below in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-            even &= dr.dot(dr.gather(self.mi.Normal3f, normal, self.index(right, below)), normal) > FLAT
-        return even
-
-    def clipped(self, earlier: Any, colour: Any) -> Any:
-        """``earlier`` brought to what the neighbourhood of each pixel shows of ``colour``: mean and standard deviation
-        of nine pixels."""
-        import drjit as dr
-
-        mi = self.mi
-        total, squares = mi.Color3f(0), mi.Color3f(0)
-        for right, below in AROUND:
-            beside = dr.gather(mi.Color3f, colour, self.index(REACH * right, REACH * below))
-            total, squares = total + beside, squares + beside * beside
-        mean = total / 9
-        spread = SPREAD * dr.sqrt(dr.maximum(squares / 9 - mean * mean, 0))
-        return dr.clip(earlier, mean - spread, mean + spread)
-
-
-class _Places:
-    """Where points are in the picture of the frame before."""
-
-    def __init__(self, mi: Any, picture: _Picture, camera: Any, points: Any) -> None:
-        import drjit as dr
-
-        (right, up, back, origin), (fl_x, fl_y, cx, cy), _ = camera
-        self.mi, self.width, self.height = mi, picture.width, picture.height
-        local = points - origin
-        depth = -dr.dot(local, back)
-        ahead = depth > 0
-        depth = dr.select(ahead, depth, 1)
-        x = cx + fl_x * dr.dot(local, right) / depth - 0.5
-        y = cy - fl_y * dr.dot(local, up) / depth - 0.5
-        last_x, last_y = self.width - 1, self.height - 1
-        self.inside = ahead & (x > -HALF) & (y > -HALF) & (x < last_x + HALF) & (y < last_y + HALF)
-        x, y = dr.clip(x, 0, last_x - TINY), dr.clip(y, 0, last_y - TINY)
-        column, row = dr.floor(x), dr.floor(y)
-        self.across, self.down = x - column, y - row
-        self.column, self.row = mi.Int32(column), mi.Int32(row)
-        self.corners = [self.index(*corner) for corner in CORNERS]
-
-    def index(self, right: int, below: int) -> Any:
-        """Of the pixels so far from the upper left corner."""
-        import drjit as dr
-
-        column = dr.clip(self.column + right, 0, self.width - 1)
-        return dr.clip(self.row + below, 0, self.height - 1) * self.width + column
-
-    def weights(self, same: list[Any]) -> tuple[list[Any], Any]:
-        """(weights of the corners, which sum to 1 or are 0; whether enough of them count)."""
-        import drjit as dr
-
-        shares = []
-        for (right, below), counts in zip(CORNERS, same, strict=True):
-            share = (self.across if right else 1 - self.across) * (self.down if below else 1 - self.down)
-            shares.append(dr.select(counts, share, 0))
-        total = shares[0] + shares[1] + shares[2] + shares[3]
-        enough = total > LEAST_WEIGHT
-        return [dr.select(enough, share / total, 0) for share in shares], enough
-
-    def bilinear(self, values: Any, weights: list[Any]) -> Any:
-        """Values at the places, 0 where nothing counts. values: four a pixel."""
-        import drjit as dr
-
-        kind = self.mi.Vector4f
-        pairs = zip(self.corners, weights, strict=True)
-        return sum((weight * dr.gather(kind, values, index) for index, weight in pairs), kind(0))
-
-    def spline(self, values: Any, active: Any, otherwise: Any) -> Any:
-        """Values at the places by Catmull-Rom splines, not below 0, where ``active``. values: four a pixel."""
-        import drjit as dr
-
-        across, down = _catmull_rom(self.across), _catmull_rom(self.down)
-        found = self.mi.Vector4f(0)
-        for j in range(4):
-            for i in range(4):
-                index = self.index(i - 1, j - 1)
-                found += across[i] * down[j] * dr.gather(self.mi.Vector4f, values, index, active)
-        return dr.select(active, dr.maximum(found, 0), otherwise)
-
-
-def _catmull_rom(t: Any) -> tuple[Any, Any, Any, Any]:
-    """Weights of the pixels at -1, 0, 1 and 2, for t in [0, 1)."""
-    first, last = t * (t - 0.5 - 0.5 * t * t), 0.5 * t * t * (t - 1)
-    second = 1 + t * t * (1.5 * t - 2.5)
-    return first, second, 1 - first - second - last, last

@@ -30,7 +30,7 @@ from ..workers.view_tasks import only_answer, warn_of_repairs
 from .effect_plan import resolve_plan
 from .stage import Run
 
-LIGHT_VERSION, BASE_VERSION, DENOISE_VERSION = 12, 26, 4
+LIGHT_VERSION, BASE_VERSION, DENOISE_VERSION = 12, 27, 4
 RENDERED = ("baked", "direct", "path")
 """Kinds of base images that are rendered into files of their own."""
 TEXELS, MANY, MOST = 8, 1024, 4096

@@ -88,7 +88,10 @@ class FrameTask(Task):
         plain: where the base image alone goes, too; of ``neural``. For comparison: it has no picture.
         earlier: the frames of the camera's way that this one remembers (`raytrace.history`), in their order; None: it
             stands alone. number: of the first of them in the camera's way.
-        following: the task that will come next. It is rendered while this frame is written, which keeps all cores busy.
+        before, after: what renders the frames next to it, with which it is filtered (`raytrace.temporal_filter`); they
+            stand `alone`.
+        following: the task that will come next. What it takes is rendered while this frame is written, which keeps all
+            cores busy.
     """
 
     view: View
@@ -102,7 +105,19 @@ class FrameTask(Task):
     picture: Path
     plain: Path | None = None
     fingerprint: str
+    before: FrameTask | None = None
+    after: FrameTask | None = None
     following: FrameTask | None = None
+
+    @property
+    def alone(self) -> FrameTask:
+        """Renders the frame, not filtered. The same for the same frame, whichever asks for it."""
+        return self.model_copy(update={"before": None, "after": None, "following": None, "fingerprint": ""})
+
+    @property
+    def takes(self) -> list[FrameTask]:
+        """Renders what the frame is made of, in the camera's order."""
+        return [each for each in (self.before, self.alone, self.after) if each is not None]
 
 
 class FrameAnswer(Costs):

@@ -11,7 +11,7 @@ import functools
 import os
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from dnrpipe.raytrace.denoise import denoise
 from dnrpipe.raytrace.engine import Engine, masked, masked_channels
 from dnrpipe.raytrace.frames import Frames
 from dnrpipe.raytrace.recorded import Stopwatch, timed
+from dnrpipe.raytrace.temporal_filter import Finished, TemporalFilter
 from dnrtrain.dataset import view_in_memory
 from dnrtrain.display import DisplayTransform
 from dnrtrain.exr import compress_by, write_exr
@@ -41,6 +42,8 @@ MAX_RAYS = 1 << 22
 """Of a launch of the path tracer: bounds its memory."""
 EACH = 16
 """Samples per pixel of a launch at most: a kernel is recorded for each number of them."""
+KNOWN = 3
+"""Frames that are kept: one and those next to it."""
 Layers = dict[str, np.ndarray]
 
 
@@ -68,7 +71,9 @@ class Worker:
             functools.partial(Frames, self.engine, settings.bundle, settings.integrator, settings.max_depth)
         )  # by (width, height)
         self.background = Background(self.engine, settings.bundle) if settings.background else None
-        self.ahead: _Rendered | None = None
+        self.filter = TemporalFilter(self.engine.mi)
+        self.known: list[_Rendered] = []
+        """The last frames that were rendered, not filtered."""
 
     @functools.cached_property
     def model(self) -> Any:
@@ -83,21 +88,51 @@ class Worker:
 
     def __call__(self, asked: dict[str, Any]) -> FrameAnswer:
         task = FrameTask.model_validate(asked)
-        alone, following = task.model_copy(update={"following": None}), task.following
-        rendered = self.ahead if self.ahead is not None and self.ahead.task == alone else self._rendered(alone)
-        self.ahead = None
+        finished = self._finished(task)
         began, beside = time.monotonic(), 0.0
         with ThreadPoolExecutor(1) as writer:
-            written = writer.submit(self._write, rendered)
-            if following is not None:
+            written = writer.submit(self._write, finished)
+            if task.following is not None:
                 # What goes wrong here does so again when the frame is asked for.
                 with contextlib.suppress(Exception):
-                    self.ahead = self._rendered(following)
+                    for each in task.following.takes:
+                        self._rendered(each)
                 beside = time.monotonic() - began
             written.result()
-        return {**rendered.answer, "write_seconds": time.monotonic() - began - beside}
+        return {**finished.answer, "write_seconds": time.monotonic() - began - beside}
+
+    def _finished(self, task: FrameTask) -> _Rendered:
+        """Filtered. The answer counts what the frame and the filter took, not what those next to it did."""
+        three = [None if each is None else self._rendered(each) for each in (task.before, task.alone, task.after)]
+        before, own, after = three
+        assert own is not None
+        if before is None and after is None:
+            return replace(own, task=task)
+        ms, watch = dict(own.answer["ms"]), Stopwatch()
+        pictures = [
+            [None if each is None else Finished(each.task.view, each.layers[i]) for each in three]
+            for i in range(len(own.layers))
+        ]
+        layers = timed(ms, "temporal filter", lambda: [self._filtered(*picture) for picture in pictures])
+        costs = watch.costs()
+        answer: FrameAnswer = {
+            **own.answer,
+            "seconds": own.answer["seconds"] + costs["seconds"],
+            "cpu_seconds": own.answer["cpu_seconds"] + costs["cpu_seconds"],
+            "peak_mb": costs["peak_mb"],
+            "ms": {name: round(value, 2) for name, value in ms.items()},
+        }
+        return _Rendered(task, layers, answer)
+
+    def _filtered(self, before: Finished | None, frame: Finished | None, after: Finished | None) -> Layers:
+        assert frame is not None
+        return self.filter(frame, before, after)
 
     def _rendered(self, task: FrameTask) -> _Rendered:
+        """Not filtered. task: one that stands `alone`. The last KNOWN are not rendered again."""
+        for known in self.known:
+            if known.task == task:
+                return known
         ms: dict[str, float] = {}
         if task.way.name == "neural":
             assert self.model is not None  # loaded by now: that is no part of a frame
@@ -110,7 +145,9 @@ class Worker:
             "masked": lost,
             "ms": {name: round(value, 2) for name, value in ms.items()},
         }
-        return _Rendered(task, found, answer)
+        rendered = _Rendered(task, found, answer)
+        self.known = [*self.known, rendered][-KNOWN:]
+        return rendered
 
     def _write(self, rendered: _Rendered) -> None:
         task, (layers, *plain) = rendered.task, rendered.layers

@@ -27,7 +27,7 @@ from ..trust import SHARES
 from .frame_tasks import NETWORK, FrameTask, Way
 from .records import ShotFrame
 from .references import FEWEST, SEED, SPP, Truth, compared, decibels, display_of, shown
-from .render_frames import frame_outcomes, in_succession
+from .render_frames import frame_outcomes, goes_on, in_succession, next_to
 from .renderers import Renderer
 
 FRAMES, SIZE = 2, (192, 108)
@@ -104,22 +104,18 @@ class Pilot:
         known = tracing in self.processes
         references = [] if self.references else [REFERENCE] * FEWEST
         for turn, way in enumerate([*references, *ways]):
-            seed = SEED + turn if turn < len(references) else 0
             for key, (index, place) in enumerate(self.windows):
-                lead = [] if tracing else list(self._lead(index))
-                steps = [*lead, index] if lead or tracing else [index, index]
-                last = len(steps) - 1
-                for number, at in enumerate(steps):
-                    earlier = None if tracing else tuple(self._view(i, place) for i in lead[:number])
-                    # What a frame remembers are base images. The first one readies the network all the same: later,
-                    # that would cost the memory.
-                    rendered = way if number in (0, last) else base_of(way)
-                    keys.append(key if number == last else None)
-                    tasks.append(self._task(rendered, at, place, earlier, len(tasks), seed))
+                if turn < len(references):
+                    steps = [self._task(way, index, place, None, len(tasks), SEED + turn)]
+                else:
+                    steps = self._steps(way, index, place, len(tasks))
+                keys += [*[None] * (len(steps) - 1), key]
+                tasks += steps
         if not known:  # the first one readies what its size takes, and takes up to twice as long
             asked_for = ways[0], self.windows[0][0], None, None if tracing else ()
+            first, second = (self._task(*asked_for, len(tasks) + i, i) for i in (0, 1))
             keys += [None, None]
-            tasks += in_succession([self._task(*asked_for, len(tasks) + i, 0) for i in (0, 1)])
+            tasks += in_succession([first, second.model_copy(update={"before": first})])
         found: dict[Way, list[_Window]] = {}
         start, whole, writing, kept = None, 0.0, 0.0, self.run.kept
         label = "pilot: " + ("path tracing" if tracing else "base image and network")
@@ -196,10 +192,33 @@ class Pilot:
             shows=any(found["psnr"] < SAME for found in every),
         )
 
+    def _steps(self, way: Way, index: int, place: tuple[float, float], number: int) -> list[FrameTask]:
+        """Tasks of which the last renders a window of a frame as it is in the shot. Those before render what it takes,
+        or get the process ready for it. number: of the first of them."""
+        before, after = next_to(self.frames, index)
+        lead = [] if way.name == "path" else list(self._lead(index))
+        first = lead[0] if lead else index
+
+        def task(way: Way, at: int, number: int) -> FrameTask:
+            earlier = None if way.name == "path" else tuple(self._view(i, place) for i in range(first, at))
+            return self._task(way, at, place, earlier, number, at)
+
+        steps = lead or ([index] if before is None else [before])
+        # What a frame remembers are base images. The first one readies the network all the same: later, that would cost
+        # the memory.
+        ways = [way if i == 0 or at == before else base_of(way) for i, at in enumerate(steps)]
+        ready = [task(*each, number + i) for i, each in enumerate(zip(ways, steps, strict=True))]
+        number += len(ready)
+        others = {
+            "before": None if before is None else ready[-1],
+            "after": None if after is None else task(way, after, number + 1),
+        }
+        return [*ready, task(way, index, number).model_copy(update=others)]
+
     def _lead(self, index: int) -> range:
-        """Frames before one that stand still like it, at most LEAD."""
+        """Frames before one that it goes on from, at most LEAD."""
         first = index
-        while first > 0 and index - first < LEAD and not self.frames[first - 1].moving:
+        while first > 0 and index - first < LEAD and goes_on(self.frames[first - 1], self.frames[index]):
             first -= 1
         return range(first, index)
 

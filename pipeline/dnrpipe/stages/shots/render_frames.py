@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import closing
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from dnrtrain.contract import View
 
 from ...core.ledger import Purpose
 from ...core.workspace import digest
@@ -20,10 +23,10 @@ from .frame_tasks import FrameTask, Way
 from .records import ShotFrame
 from .renderers import Renderer
 
-FRAMES_VERSION = 8
+FRAMES_VERSION = 9
 FRAME_WORKER = "dnrpipe.stages.shots.frame_worker"
-MOST_AHEAD = 1 << 22
-"""Pixels of a frame beside which the next one is rendered."""
+MOST_AT_ONCE = 1 << 22
+"""Pixels of a frame beside which others are kept in memory."""
 FRAMES_FOLDER, PICTURES_FOLDER = "frames", "pictures"
 """Of a shot's folder."""
 
@@ -49,41 +52,65 @@ def frame_tasks(
     alone: bool = False,
 ) -> list[FrameTask]:
     """The tasks that render the frames by ``way``. A frame of baked light remembers those before it, back to the last
-    cut and to the begin of its chunk (`base_images.CHUNK`).
+    cut and to the begin of its chunk (`base_images.CHUNK`). All are filtered with those next to them (`next_to`).
 
     inputs: of all that decides a frame but its view and way. numbers: places in ``frames`` to render; None: all.
     trust: see `FrameTask`. alone: no frame remembers, as training saw none that does: measured, 0.5 dB worse.
     """
-    tasks: list[FrameTask] = []
-    for place in range(len(frames)) if numbers is None else numbers:
+
+    def task(place: int) -> FrameTask:
         frame = frames[place]
         first = place
         remembers = way.name != "path" and not alone
         if remembers:
             begin = max(0, place - place % CHUNK - WARM_UP)
-            while first > begin and _goes_on(frames[first - 1], frame):
+            while first > begin and goes_on(frames[first - 1], frame):
                 first -= 1
         earlier = tuple(other.view for other in frames[first:place]) if remembers else None
         decided = [inputs, trust, frame.view.model_dump(mode="json"), way.model_dump(mode="json"), frame.lens]
         known = None if earlier is None else [first, *(other.model_dump(mode="json") for other in earlier)]
-        tasks.append(
-            FrameTask(
-                view=frame.view,
-                way=way,
-                lens=frame.lens,
-                earlier=earlier,
-                number=first if remembers else 0,
-                trust=trust,
-                seed=frame.number % (1 << 16),
-                output=frame_path(folder, frame),
-                picture=picture_path(folder, frame),
-                fingerprint=digest([FRAMES_VERSION, *decided, known]),
-            )
+        return FrameTask(
+            view=frame.view,
+            way=way,
+            lens=frame.lens,
+            earlier=earlier,
+            number=first if remembers else 0,
+            trust=trust,
+            seed=frame.number % (1 << 16),
+            output=frame_path(folder, frame),
+            picture=picture_path(folder, frame),
+            fingerprint=digest([FRAMES_VERSION, *decided, known]),
         )
-    return tasks
+
+    def filtered(place: int) -> FrameTask:
+        own = task(place)
+        before, after = (None if other is None else task(other) for other in next_to(frames, place))
+        prints = [None if each is None else each.fingerprint for each in (before, own, after)]
+        others = {"before": before and before.alone, "after": after and after.alone}
+        return own.model_copy(update={**others, "fingerprint": digest(prints)})
+
+    return [filtered(place) for place in (range(len(frames)) if numbers is None else numbers)]
 
 
-def _goes_on(before: ShotFrame, after: ShotFrame) -> bool:
+def next_to(frames: Sequence[ShotFrame], place: int) -> tuple[int | None, int | None]:
+    """Places of the frames before and after one with which it is filtered. None: a cut, or the shot ends; things move,
+    whose motion the filter does not know; a lens is out of focus, where no pixel shows one place alone; or three
+    pictures are too large for the memory."""
+    frame = frames[place]
+    if frame.moving or frame.lens is not None or not _is_small(frame.view):
+        return None, None
+    before, after = (
+        other if 0 <= other < len(frames) and goes_on(frames[other], frame) else None
+        for other in (place - 1, place + 1)
+    )
+    return before, after
+
+
+def _is_small(view: View) -> bool:
+    return view.width * view.height <= MOST_AT_ONCE
+
+
+def goes_on(before: ShotFrame, after: ShotFrame) -> bool:
     """Whether two frames belong together: of one camera and one size, and nothing has moved."""
     same = (before.view.width, before.view.height) == (after.view.width, after.view.height)
     return same and before.camera == after.camera and before.moving == after.moving
@@ -97,8 +124,7 @@ def is_whole(task: FrameTask) -> bool:
 def in_succession(tasks: Sequence[FrameTask]) -> list[FrameTask]:
     """The tasks, each but the last with the one that follows it, which is rendered while it is written. Not of pictures
     so large that two of them would take too much memory."""
-    small = [task.view.width * task.view.height <= MOST_AHEAD for task in tasks]
-    after = [following if fits else None for following, fits in zip(tasks[1:], small, strict=False)]
+    after = [following if _is_small(task.view) else None for task, following in pairwise(tasks)]
     return [task.model_copy(update={"following": one}) for task, one in zip(tasks, [*after, None], strict=False)]
 
 
