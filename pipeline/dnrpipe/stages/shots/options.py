@@ -22,14 +22,16 @@ references' own noise is in their LPIPS (`interior`: .112 and .107, in whole fra
 
 USUAL = 31.0, 0.03
 """PSNR and LPIPS that base images of eight rays have on the pilot's windows, give or take (`food` 31.6 dB, .024; `ship`
-32.4, .029; `drums` 29.7, .018). Five example scenes of ten have it by path tracing with STEADY samples, quickly
+32.4, .029; `drums` 29.7, .018). Five example scenes of ten have it by path tracing with QUICK samples, quickly
 denoised, in no more time (31.6 to 36.5 dB): there light would not pay. The others are far from it (19.8 to 29.1 dB):
 there it does, but for `jewels`, whose caustics baked light leaves out."""
-STEADY = 4
-"""Samples per pixel; with fewer, denoised frames flicker."""
+STEADY = 2
+"""Samples per pixel; with fewer, frames flicker."""
+QUICK = 4
+"""Samples per pixel that are path-traced first, quickly denoised: what a shot takes where they are good."""
 PATIENCE = 8
 """Samples per pixel, as many as base images have rays, beyond which nobody waits who asked for nothing, unless it is
-for base images that cost less than STEADY path-traced samples and are as good."""
+for base images that cost less than STEADY to QUICK path-traced samples and are as good."""
 
 
 class Wanted(BaseModel):
@@ -92,9 +94,9 @@ def choose(options: Sequence[Option], wanted: Wanted) -> tuple[Option, str]:
 
     With a time: the best PSNR that fits in; the quickest where none does. With a quality: the cheapest that reaches it;
     the best where none does. With neither, the wanted quality is the best of baked light's, with as few rays as cost it
-    next to nothing (`NEAR`): the cheapest option that has both its PSNR and its LPIPS. Where STEADY path-traced samples
-    have more, it is theirs, give or take as much. Where light is not weighed it is what baked light usually has
-    (`USUAL`), or the best that at most PATIENCE samples give.
+    next to nothing (`NEAR`): the cheapest option that has both its PSNR and its LPIPS. Where STEADY to QUICK samples,
+    path-traced, have more and what baked light usually has (`USUAL`), it is theirs, give or take as much. Where light
+    is not weighed it is the usual, or the best that at most PATIENCE samples give.
 
     Raises ValueError: no options.
     """
@@ -139,7 +141,8 @@ def choose(options: Sequence[Option], wanted: Wanted) -> tuple[Option, str]:
     near = [own for own in usual if is_near(own, best)]
     cheapest = min(own.seconds for own in near)
     aim = max((own for own in near if own.seconds <= SAME_PRICE * cheapest), key=quality)
-    steady = next((o for o in options if o.way.name == "path" and o.way.spp == STEADY and o.reaches(*USUAL)), None)
+    few = [o for o in options if o.way.name == "path" and STEADY <= o.way.spp <= QUICK and o.reaches(*USUAL)]
+    steady = min(few, key=lambda option: option.seconds, default=None)
     if steady is not None and not is_near(aim, steady):
         # Good already: light was baked to save time, not to have less than that.
         aim = min((steady, *(own for own in clean if is_near(own, steady))), key=lambda option: option.seconds)

@@ -20,7 +20,7 @@ from ..base_images import base_renderer, light_plan
 from ..stage import Run
 from ..worth import worth
 from .frame_tasks import Way
-from .options import STEADY, USUAL, Option, Wanted
+from .options import QUICK, USUAL, Option, Wanted
 from .pilot import LADDER, MOST, Measured, Pilot, reckoned
 from .records import ShotFrame
 from .renderers import Renderer, shipped_renderer
@@ -32,7 +32,7 @@ SMOOTH = (4, 8, 16)
 less where most light comes straight from a sky or lies baked on matt surfaces. The last is for where few path-traced
 samples are good already (`choose`)."""
 SAVED = 0.5
-"""Of a frame of STEADY samples, what a base image as good takes less where it is smoothed, give or take."""
+"""Of a frame of QUICK samples, what a base image as good takes less where it is smoothed, give or take."""
 DEEP, MOST_DEEP = 8, 0.02
 """Surfaces of a path beyond which light is no more that of matt surfaces, which reflect too little, but of glass behind
 glass; and the share of such light from which on baking does not pay. Base images follow glass as far as path tracing
@@ -67,8 +67,8 @@ def weigh(
     moving = sum(bool(frame.moving) for frame in frames)
     shape = Shape(len(frames) - moving, moving, view.width * view.height, _conversion_seconds(run))
     pilot = Pilot(run, frames, folder, lpips)
-    steady = Way(name="path", spp=STEADY, quality="balanced")
-    quick = pilot.measure(tracer, [steady])
+    quickest = Way(name="path", spp=QUICK, quality="balanced")
+    quick = pilot.measure(tracer, [quickest])
     option, told = path_option(quick[0], shape), quick[0].lpips is not None and quick[0].shows
     if told and option.reaches(*USUAL) and wanted.aimless and not _light_is_ready(run):
         baking, saved = _baking_seconds(run, quick[0]), SAVED * _planned(shape, wanted) * option.frame
@@ -77,9 +77,9 @@ def weigh(
         if atlas.loses_most:  # `bricks`: 31.1 dB, where path tracing has 35
             why = f"{atlas.triangles_without_texel:.0%} of the triangles are too small for a texel of it"
         if why:
-            run.console.say(f"baked light is not weighed: {steady.told}, are as good as it usually is, and {why}")
+            run.console.say(f"baked light is not weighed: {quickest.told}, are as good as it usually is, and {why}")
             return _running([option], tracing=True), None
-    others = [steady.model_copy(update={"spp": spp}) for spp in LADDER if spp != STEADY]
+    others = [quickest.model_copy(update={"spp": spp}) for spp in LADDER if spp != QUICK]
     measured = pilot.measure(tracer, [*others, *(Way(name="path", spp=spp) for spp in LADDER)])
     quick += measured[: len(others)]
     rungs = [*reckoned(quick, max(LADDER)), *reckoned(measured[len(others) :], MOST)]
