@@ -598,9 +598,10 @@ def test_frames_that_remember_are_the_same_when_a_sequence_is_taken_up_again(
     common |= {"light": str(tmp_path / "light.npz"), "denoise": False}
     ways = [camera(0.3 + 0.02 * number).model_dump(mode="json") for number in range(4)]
 
-    def rendered_by(worker: Worker, number: int, earlier: bool = True) -> dict[str, np.ndarray]:
-        task = {"view": ways[number], "output": str(tmp_path / "v.exr"), "fingerprint": "f"}
-        worker(task | {"earlier": ways[:number] if earlier else None})
+    def rendered_by(worker: Worker, number: int, earlier: bool = True, filtered: bool = False) -> dict[str, np.ndarray]:
+        task = {"view": ways[number], "output": str(tmp_path / "v.exr"), "fingerprint": "f", "filtered": filtered}
+        after = (ways[number + 1 :] or [None])[0]
+        worker(task | {"earlier": ways[:number] if earlier else None, "after": after})
         return read_exr(tmp_path / "v.exr")[0]
 
     steady, resumed = Worker(common), Worker(common)
@@ -611,6 +612,17 @@ def test_frames_that_remember_are_the_same_when_a_sequence_is_taken_up_again(
     assert (frames[0]["rays"][inside] == 2).all() and np.median(frames[3]["rays"][inside]) == 8
     alone = rendered_by(resumed, 3, earlier=False)
     assert (alone["rays"][inside] == 2).all() and not (alone["base.R"] == again["base.R"]).all()
+
+    steady, resumed = Worker(common), Worker(common)
+    mean = [rendered_by(steady, number, filtered=True) for number in range(4)]
+    again = rendered_by(resumed, 2, filtered=True)
+    assert all((mean[2][name] == again[name]).all() for name in again)
+    assert steady.renderer.kernel.n_recordings == 1 and set(again) == set(frames[2])
+    changed = {name for name in again if not (again[name] == frames[2][name]).all()}
+    assert changed == {"base.R", "base.G", "base.B"}, "between the frames next to it"
+    deep = inside & np.roll(inside, 6, 0) & np.roll(inside, -6, 0) & np.roll(inside, 6, 1) & np.roll(inside, -6, 1)
+    apart, before = (np.abs(way[2]["base.G"] - way[1]["base.G"])[deep].mean() for way in (mean, frames))
+    assert apart < 0.7 * before
 
 
 def test_scenes_without_emitters_are_dark(tmp_path: Path) -> None:

@@ -54,6 +54,8 @@ def test_a_path_traced_shot_is_as_good_as_the_rung_that_it_is() -> None:
     """At its own seconds: a rung's few frames vary; and none of the rungs need look as good as the shot by chance."""
     way = {"way": {"name": "path", "spp": 4}}
     assert equal_rung(row(chosen=way, frame=2.2), ("psnr", "lpips")) == rung(4, 2.2, 29.0, 0.06)
+    filtered = row(chosen=way, frame=2.2, filtered=True)
+    assert equal_rung(filtered, ("psnr", "lpips")) == rung(16, 8.0, 33.0, 0.04), "better than its samples alone"
 
 
 def test_where_nothing_is_as_good_the_last_rungs_bound_the_ratio() -> None:

@@ -24,7 +24,7 @@ def _variant(mitsuba_variant: str) -> None:
 def finished(x: float, **scene: Any) -> Finished:
     """A frame of a camera at x."""
     channels = frame(camera(x), **scene)
-    layers = {c: channels[f"base.{c}"] for c in "RGBA"} | {"object.Id": channels["mask"]}
+    layers = {c: channels[f"base.{c}"] for c in "RGBA"}
     return Finished(camera(x), layers | {name: channels[name] for name in ("depth.Z", *_normals())})
 
 
@@ -64,12 +64,13 @@ def test_noise_becomes_less_and_what_is_there_stays() -> None:
 def test_a_frame_alone_is_as_it_was() -> None:
     own, before, after = three(noise=0.1)
     temporal = TemporalFilter(mi)
-    np.testing.assert_array_equal(rgb(temporal(own, None, None)), rgb(own.layers))
+    other = Finished(camera(STEP, side=SIDE // 2), {})
+    for before_, after_ in ((None, None), (other, None), (None, other)):
+        np.testing.assert_array_equal(rgb(temporal(own, before_, after_)), rgb(own.layers))
     one, both = rgb(temporal(own, before, None)), rgb(temporal(own, before, after))
     assert rms(one - rgb(own.layers)) > 0.02 and rms(one - both) > 0.02
     assert temporal.kernel.n_recordings == 1, "with and without a frame after it"
-    other = rgb(temporal(own, None, before))
-    np.testing.assert_allclose(other, one, atol=1e-5)
+    np.testing.assert_allclose(rgb(temporal(own, None, before)), one, atol=1e-5)
 
 
 def test_alpha_stays_and_rims_take_of_no_others() -> None:

@@ -130,6 +130,7 @@ def measured(scene: Path, root: Path, size: tuple[int, int], frames: int) -> dic
         "before": max(0.0, after - frames * frame),
         "frame": frame,
         "chosen": shot["chosen"],
+        "filtered": True,
         "why": shot["why"],
         "expected": shot["expected"],
         "spent": shot["spent"],
@@ -341,11 +342,12 @@ def equal_rung(row: dict[str, Any], names: Sequence[str]) -> dict[str, Any] | No
     """The cheapest path tracing that is as good as ours by each of the figures, Mitsuba's or Cycles'; None: not by the
     last rung of either.
 
-    A shot that is path-traced is as good as the rung that it is, whose frames take what the shot's do: there are more
-    of those, and seconds of few frames vary by up to a fifth.
+    A shot that is path-traced and not filtered, as older ones, is as good as the rung that it is, whose frames take
+    what the shot's do: there are more of those, and seconds of few frames vary by up to a fifth.
     """
     own = Way.model_validate(row["chosen"]["way"])  # in records, defaults are left out
-    same = [own.name == "path" and (rung["spp"], rung["quality"]) == (own.spp, own.quality) for rung in row["rungs"]]
+    plain = own.name == "path" and not row.get("filtered")
+    same = [plain and (rung["spp"], rung["quality"]) == (own.spp, own.quality) for rung in row["rungs"]]
     enough = [
         rung | {"frame": row["frame"]} if it_is else rung
         for rung, it_is in zip(row["rungs"], same, strict=True)

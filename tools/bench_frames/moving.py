@@ -34,7 +34,7 @@ STEPS = 360
 CLOSER, SIDEWAYS = 0.01, 0.4
 """Of a walk, per frame: share of the distance, degrees about the scene's middle."""
 PAIRS = 3
-"""Pairs of frames one after the other that are traced as references, the last of them at the end."""
+"""Pairs of frames one after the other that are traced as references, the last of them near the end."""
 GATHERINGS: dict[str, tuple[float, dict[str, Any]]] = {
     "gathered x2, edges": (2, {}),
     "gathered x1, edges": (1, {"most_other": MOST_DIFFUSE}),
@@ -74,8 +74,9 @@ def measure(
     """
     found = {}
     for move, views in moves(scene, frames).items():
-        last = [round((frames - 1) * (i + 1) / PAIRS) for i in range(PAIRS)]
+        last = [round((frames - 2) * (i + 1) / PAIRS) for i in range(PAIRS)]  # each with a frame after it
         chosen = sorted({*last, *(number - 1 for number in last)})
+        near = {number + step for number in chosen for step in (-1, 0, 1)}
         reference = make_references(scene, [views[i] for i in chosen], move, spp, kind, folder, tell)
         truth = dict(zip(chosen, (scene.shown(picture) for picture in reference.pictures), strict=True))
         halves = {
@@ -84,23 +85,25 @@ def measure(
         surfaces = {i: surface_of(views[i], scene.frames.gbuffer(views[i])) for i in chosen}
         rivals = Rivals(scene, ours, baselines)
         ours.begin()
-        pictures: dict[str, dict[int, torch.Tensor]] = {}
-        took: dict[str, list[float]] = {}
+        judged = _Judged(chosen)
         for number, view in enumerate(views):
-            judged = number in truth
-            for name, (picture, ms) in (
-                _own(ours, view, clock, judged) | rivals.frame(view, number, clock, judged)
-            ).items():
-                took.setdefault(name, []).append(ms)
-                pictures.setdefault(name, {})[number] = picture.half()
+            if number in truth:
+                judged.take(number, _timed(ours.frame(view, clock)))
+            if number in near:
+                judged.take(number, _timed(ours.frame(view, clock, remember=True)))
+            else:
+                ours.remember(view, clock)
+            if number - 1 in truth:
+                judged.take(number - 1, _timed(ours.filtered(clock)))
+            judged.take(number, rivals.frame(view, number, clock, number in truth))
             tell(f"{scene.name}: {move}, frame {number + 1} of {frames}")
-        rows = {name: _figures(shown, truth, halves, surfaces, last, lpips) for name, shown in pictures.items()}
+        rows = {name: _figures(shown, truth, halves, surfaces, last, lpips) for name, shown in judged.pictures.items()}
         found[move] = {
             "frames": frames,
             "reference": reference.kind,
             "reference_spp": spp,
             "reference_noise": float(np.mean(reference.noise)),
-            "rows": {name: {"ms": float(np.median(took[name])), **row} for name, row in rows.items()},
+            "rows": {name: {"ms": float(np.median(judged.took[name])), **row} for name, row in rows.items()},
         }
     return found
 
@@ -147,12 +150,23 @@ def surface_of(view: View, gbuffer: dict[str, np.ndarray]) -> Surface:
     return Surface(view, position, gbuffer["depth.Z"].astype(np.float64), gbuffer["mask"] > 0.5)
 
 
-def _own(ours: Ours, view: View, clock: Clock, judged: bool) -> dict[str, tuple[Any, float]]:
-    """By name: (display picture, ms); of a frame that is not judged nothing but what the next ones remember."""
-    if not judged:
-        ours.remember(view, clock)
-        return {}
-    found = {**ours.frame(view, clock), **ours.frame(view, clock, remember=True)}
+class _Judged:
+    """By renderer: pictures of the frames that are judged, and their milliseconds."""
+
+    def __init__(self, numbers: list[int]) -> None:
+        self.numbers = numbers
+        self.pictures: dict[str, dict[int, torch.Tensor]] = {}
+        self.took: dict[str, list[float]] = {}
+
+    def take(self, number: int, found: dict[str, tuple[Any, float]]) -> None:
+        """found: by name, a frame's (display picture, ms); dropped where the frame is not judged."""
+        for name, (picture, ms) in found.items() if number in self.numbers else ():
+            self.took.setdefault(name, []).append(ms)
+            self.pictures.setdefault(name, {})[number] = picture.half()
+
+
+def _timed(found: dict[str, dict[str, Any]]) -> dict[str, tuple[Any, float]]:
+    """By name: (display picture, ms)."""
     return {name: (frame["picture"], sum(frame["parts"].values())) for name, frame in found.items()}
 
 

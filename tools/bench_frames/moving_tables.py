@@ -81,6 +81,6 @@ def lines(scenes: Sequence[Mapping[str, Any]]) -> list[str]:
 def _as_standing(scene: Mapping[str, Any]) -> dict[str, Any]:
     """What `equal_time` reads, with the moves' rows in place of those of single views; ours are those that remember."""
     rows = over_moves(scene)
-    ours = [name for name in rows if is_own(name) and name.endswith(REMEMBERS)]
+    ours = [name for name in rows if is_own(name) and REMEMBERS in name]
     kept = {key: scene[key] for key in ("scene", "upfront") if key in scene}
     return {**kept, "rows": rows, "standing": ours}

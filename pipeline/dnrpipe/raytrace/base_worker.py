@@ -19,10 +19,13 @@ from .light_worker import read_light
 from .recorded import Stopwatch
 from .smoothing import Smoother
 from .tasks import BakedCommon, BaseAnswer, BaseTask, SampledCommon
+from .temporal_filter import Finished, TemporalFilter
 
 COLOUR = ("base.R", "base.G", "base.B", "base.A")
 PREMULTIPLIED = tuple(f"{kind}.{c}" for kind in ("base", "diffuse", "albedo", "shown", "fresh") for c in "RGB")
 LEAST_ALPHA = 1e-6
+KNOWN = 3
+"""Frames of a moving camera that are kept: one and those next to it."""
 WITHIN = (*CHAIN, *SHOWN, *FACING)
 """Channels that no file holds."""
 
@@ -48,6 +51,8 @@ class Worker(BundleWorker):
         self.silhouettes: dict[tuple[int, int], Frames] = {}
         self.history, self.seen = History(self.engine.mi), list[tuple[View, int | None, int, bool]]()
         """Of the frames ``seen``, with their rays per pixel, the number of the first, and whether they are smoothed."""
+        self.filter, self.known = TemporalFilter(self.engine.mi), list[tuple[list[tuple[View, int]], Finished]]()
+        """The last frames that were filtered, or filtered with, each with the way to it and the first one's number."""
         self.repaired = self.masked = 0  # pixels of the view at hand: samples left out, set to zero
 
     def __call__(self, asked: dict[str, Any]) -> BaseAnswer:
@@ -55,7 +60,12 @@ class Worker(BundleWorker):
         view = task.view
         self.repaired = self.masked = 0
         watch, earlier = Stopwatch(), task.earlier
-        channels = self.channels(view) if earlier is None else self.remembered(view, earlier, task.number)
+        if earlier is None:
+            channels = self.channels(view)
+        elif task.filtered:
+            channels = self.filtered(view, earlier, task.number, task.after)
+        else:
+            channels = self.remembered(view, earlier, task.number)
         answer: BaseAnswer = {
             **watch.costs(),
             "kind": self.common.kind,
@@ -111,6 +121,30 @@ class Worker(BundleWorker):
         for frame, *_ in way[known:-1]:
             self._taken(frame, samples, smooth)
         return self.finished(self._taken(view, samples, smooth), smooth)
+
+    def filtered(
+        self, view: View, earlier: Sequence[View], number: int = 0, after: View | None = None
+    ) -> dict[str, np.ndarray]:
+        """`remembered`, with a base image that is averaged with those of the frame before and the frame ``after``.
+
+        The last KNOWN frames are not rendered again.
+        """
+
+        def seen(way: Sequence[View]) -> Finished:
+            key = [(frame, number) for frame in way]
+            found = next((finished for known, finished in self.known if known == key), None)
+            if found is None:
+                channels = self.remembered(way[-1], way[:-1], number)
+                found = Finished(way[-1], channels | {c: channels[f"base.{c}"] for c in "RGBA"})
+                self.known = [*self.known, (key, found)][-KNOWN:]
+            return found
+
+        way = [*earlier, view]
+        before, own = seen(way[:-1]) if earlier else None, seen(way)
+        channels = self.filter(own, before, None if after is None else seen([*way, after]))
+        return {name: plane for name, plane in channels.items() if name not in "RGBA"} | {
+            f"base.{c}": channels[c] for c in "RGB"
+        }
 
     def finished(self, channels: dict[str, np.ndarray], smooth: bool) -> dict[str, np.ndarray]:
         """Channels of `grainy`, smoothed, or denoised where the workspace's are; they are changed in place."""

@@ -234,11 +234,14 @@ class SampledCommon(BundleCommon):
 
 class BaseTask(Task):
     """Render a view's base image into ``output``, an EXR file. earlier: the frames of a moving camera that it remembers
-    (see `history`), in their order; None: it stands alone. number: of the first of them in the camera's way."""
+    (see `history`), in their order; None: it stands alone. number: of the first of them in the camera's way. after: the
+    next frame. filtered: with that and the one before it (see `temporal_filter`)."""
 
     view: View
     earlier: tuple[View, ...] | None = None
     number: int = 0
+    after: View | None = None
+    filtered: bool = False
     output: Path
     fingerprint: str
 

@@ -42,7 +42,7 @@ KEPT = 0.5
 """Share of D's finest detail."""
 LEVEL = 16.0
 """Of colours, times the frame's exposure: middle grey becomes 1.4."""
-TAKEN = ("R", "G", "B", "A", "depth.Z", "normal.X", "normal.Y", "normal.Z", "object.Id")
+TAKEN = ("R", "G", "B", "A", "depth.Z", "normal.X", "normal.Y", "normal.Z")
 """Channels that are read, in the kernel's order."""
 LEAST_ALPHA, SAME_ALPHA = 1e-3, 0.1
 """Of a pixel; and up to which difference another counts: at the rim of what stands before nothing, colours are as dark
@@ -52,7 +52,7 @@ as they are transparent."""
 @dataclass(frozen=True)
 class Finished:
     """A frame. layers: float32 [H, W] each, those of TAKEN among them; colour linear Rec.709, premultiplied, depth
-    planar in the view's units, normals of world space, object 0 where there is none."""
+    planar in the view's units and 0 where there is no surface, normals of world space."""
 
     view: View
     layers: Mapping[str, np.ndarray]
@@ -66,16 +66,19 @@ class TemporalFilter:
         self.kernel = Recorded(self._kernel)
 
     def __call__(self, frame: Finished, before: Finished | None, after: Finished | None) -> dict[str, np.ndarray]:
-        """The frame's layers with another R, G and B. before, after: of its size; None: there is none.
+        """The frame's layers with another R, G and B. before, after: None: there is none; nor is one of another size.
 
         Alpha, which has no grain, stays, and colours keep to it. Shares are data: one kernel serves frames with and
         without others next to them.
         """
-        if before is None and after is None:
-            return dict(frame.layers)
         import drjit as dr
 
         mi, size = self.mi, (frame.view.height, frame.view.width)
+        before, after = (
+            None if each is None or (each.view.height, each.view.width) != size else each for each in (before, after)
+        )
+        if before is None and after is None:
+            return dict(frame.layers)
         three = frame, before or frame, after or frame
         flat = inputs_of(mi, (each.layers[name] for each in three for name in TAKEN))
         planes = [flat[first : first + len(TAKEN)] for first in range(0, len(flat), len(TAKEN))]
@@ -99,19 +102,19 @@ class TemporalFilter:
 
         mi, picture = self.mi, Picture(self.mi, width, height)
         packets = [mi.Vector4f(*(dr.log(1 + level * c) for c in each[:3]), each[3]) for each in planes]
-        own = picture.surfaces(cameras[0], mi.Normal3f(*planes[0][5:8]), planes[0][8] > 0.5, planes[0][4])
+        own = picture.surfaces(cameras[0], mi.Normal3f(*planes[0][5:8]), planes[0][4] > 0, planes[0][4])
         colour, change = packets[0], mi.Vector4f(0)
         plain = mi.Color3f(colour.x, colour.y, colour.z)
         place, inner = dr.select(own.edge, own.front, own.point), own.mask & ~own.edge
         for camera, each, packet, share in zip(cameras[1:], planes[1:], packets[1:], shares, strict=True):
             origin, sight, stretch = picture.sights(camera)
             point = mi.Point3f(origin + sight * (each[4] * stretch))
-            points, normals = dr.ravel(mi.Vector4f(*point, each[8])), dr.ravel(mi.Vector4f(*each[5:8], 0))
+            points, normals = dr.ravel(mi.Vector4f(*point, each[4])), dr.ravel(mi.Vector4f(*each[5:8], 0))
             at = Places(mi, picture, camera, place)
             seen = at.inside & (own.edge | inner)
             for index in at.corners:
                 there, facing = (dr.gather(mi.Vector4f, values, index) for values in (points, normals))
-                seen &= own.edge | ((there.w > 0.5) & own.holds(there.xyz, facing.xyz))
+                seen &= own.edge | ((there.w > 0) & own.holds(there.xyz, facing.xyz))
             looked = at.spline(dr.ravel(packet), seen, colour)
             seen &= dr.abs(looked.w - colour.w) < SAME_ALPHA
             within = picture.clipped(mi.Color3f(looked.x, looked.y, looked.z), plain, SPREAD)

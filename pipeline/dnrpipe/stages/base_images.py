@@ -43,6 +43,8 @@ SPP = {"traced": 16, "gathered": 32}
 GATHER_FROM = 0.4
 """Share of the light that direct light alone would miss, from which on it is gathered: it pays at 0.49 (`interior`) and
 does not at 0.21 (`materials`)."""
+MOST_AT_ONCE = 1 << 22
+"""Pixels of a frame beside which others are kept in memory."""
 CHUNK, WARM_UP = 64, 8
 """Frames of a sequence that remember one another; those before a chunk's first that are rendered for it once more, so
 that no seam is seen. A chunk is what an interrupted run does again at most."""
@@ -140,8 +142,8 @@ def base_views(
         split: that they are of; the ledger names them by it.
         paths: where they go instead of ``base/<split>``.
         purpose: they are booked under, instead of the stage's.
-        sequence: they are the frames of a moving camera, and remember those before them (baked light that is not
-            denoised; other kinds cannot).
+        sequence: they are the frames of a moving camera, remember those before them and are filtered with those next
+            to them (baked light; other kinds cannot).
 
     Raises UserError where this machine has no jit variant of Mitsuba.
     """
@@ -159,7 +161,9 @@ def base_views(
         task = {"view": data, "output": str(path)}
         if remembers:
             task |= {"earlier": cameras[begin:number], "number": begin}
-        known = [task[key] for key in ("earlier", "number") if key in task]
+            if views[number].width * views[number].height <= MOST_AT_ONCE:
+                task |= {"after": (cameras[number + 1 :] or [None])[0], "filtered": True}
+        known = [task[key] for key in ("earlier", "number", "after", "filtered") if key in task]
         tasks.append(task | {"fingerprint": digest([BASE_VERSION, renderer.fingerprint, data, *known])})
     run.view_tasks(
         "base images",

@@ -17,7 +17,7 @@ from ...core.workspace import digest
 from ...workers.placement import HERE
 from ...workers.task_list import TaskResult, run_tasks
 from ...workers.view_tasks import is_made, warn_of_retries
-from ..base_images import CHUNK, WARM_UP
+from ..base_images import CHUNK, MOST_AT_ONCE, WARM_UP
 from ..stage import Run
 from .frame_tasks import FrameTask, Way
 from .records import ShotFrame
@@ -25,8 +25,6 @@ from .renderers import Renderer
 
 FRAMES_VERSION = 9
 FRAME_WORKER = "dnrpipe.stages.shots.frame_worker"
-MOST_AT_ONCE = 1 << 22
-"""Pixels of a frame beside which others are kept in memory."""
 FRAMES_FOLDER, PICTURES_FOLDER = "frames", "pictures"
 """Of a shot's folder."""
 

@@ -25,6 +25,7 @@ from ...raytrace.base_worker import denoised, with_coverage
 from ...raytrace.history import History
 from ...raytrace.light_worker import read_light
 from ...raytrace.smoothing import Smoother
+from ...raytrace.temporal_filter import Finished, TemporalFilter
 from ...stages.base_images import light_path
 from .scene import BenchScene, Clock
 
@@ -32,8 +33,9 @@ TIMED = ("none", "baked")
 """Base images that this benchmark can render frame by frame."""
 NEURAL, BASE, SMOOTH = "neural", "base image alone", "base image, smoothed"
 NEURAL_SMOOTH = "smoothed, neural"
-REMEMBERS = ", remembers"
-"""Ends the names of frames that remember the ones before."""
+REMEMBERS, FILTERED = ", remembers", ", filtered"
+"""End the names of frames that remember the ones before, and of those of them that are filtered with the ones next to
+them."""
 
 
 def is_own(name: str) -> bool:
@@ -84,9 +86,13 @@ class Ours:
         # Smoothed, denoised, or left as they are, base images have samples of their own (`sequence`).
         kinds = (None,) if not denoises else (True, False) if smoothed else (False,)
         self.histories = {(count, smooth): History(scene.engine.mi) for count in counts for smooth in kinds}
+        self.filter = TemporalFilter(scene.engine.mi)
+        self.last: dict[tuple[int | None, bool | None], list[tuple[Finished, dict[str, float]]]] = {}
+        """Of the frames that remember, the last three, with ms by part."""
 
     def begin(self) -> None:
         """Forget the frames so far."""
+        self.last = {}
         for history in self.histories.values():
             history.begin()
 
@@ -105,18 +111,46 @@ class Ours:
         for (samples, smooth), history in self.histories.items():
             memory = history if remember else None
             channels, parts = self._inputs(samples, smooth, view, clock, memory)
-            rays = "" if samples is None else f", {samples} rays"
-            rays += REMEMBERS if remember else ""
-            base, neural = (SMOOTH, NEURAL_SMOOTH) if smooth else (BASE, NEURAL)
             if self.renderer is not None and smooth is not None:
                 channels, parts["coverage"] = clock.time(partial(with_coverage, channels))
                 clean = partial(denoised, channels, diffuse=self.renderer.lets_through)
                 found, ms = clock.time(partial(self.smoother, channels) if smooth else clean)
                 channels, parts["smoothing" if smooth else "denoiser"] = channels | found, ms
-            if samples is not None:
-                result[base + rays] = {"picture": self._picture(channels), "parts": dict(parts)}
-            if self.model is not None:
-                result[neural + rays] = self._neural(view, channels, parts, clock)
+            if remember and samples is not None:
+                finished = Finished(view, channels | {c: channels[f"base.{c}"] for c in "RGBA"})
+                self.last[samples, smooth] = [*self.last.get((samples, smooth), []), (finished, parts)][-3:]
+            result |= self._shown(samples, smooth, view, channels, parts, clock, REMEMBERS if remember else "")
+        return result
+
+    def filtered(self, clock: Clock) -> dict[str, dict[str, Any]]:
+        """As `frame`, of the frame before the last that remembers, filtered with those next to it."""
+        result: dict[str, dict[str, Any]] = {}
+        for (samples, smooth), last in self.last.items():
+            (after, _), (own, parts), *before = reversed(last)
+            found, ms = clock.time(partial(self.filter, own, before[0][0] if before else None, after))
+            channels = {**own.layers, **{f"base.{c}": found[c] for c in "RGB"}}
+            spent = {**parts, "temporal filter": ms}
+            result |= self._shown(samples, smooth, own.view, channels, spent, clock, REMEMBERS + FILTERED)
+        return result
+
+    def _shown(
+        self,
+        samples: int | None,
+        smooth: bool | None,
+        view: View,
+        channels: dict[str, np.ndarray],
+        parts: dict[str, float],
+        clock: Clock,
+        end: str,
+    ) -> dict[str, dict[str, Any]]:
+        """A frame by its base image and by the network: see `frame`. end: of the names."""
+        base, neural = (SMOOTH, NEURAL_SMOOTH) if smooth else (BASE, NEURAL)
+        result: dict[str, dict[str, Any]] = {}
+        if samples is not None:
+            result[f"{base}, {samples} rays{end}"] = {"picture": self._picture(channels), "parts": dict(parts)}
+        if self.model is not None:
+            rays = "" if samples is None else f", {samples} rays"
+            result[neural + rays + end] = self._neural(view, channels, parts, clock)
         return result
 
     def _neural(
