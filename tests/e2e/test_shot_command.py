@@ -63,9 +63,9 @@ def test_a_ball_rolls_and_the_frames_are_right(tmp_path: Path) -> None:
 @pytest.mark.robustness
 @pytest.mark.parametrize(("size", "gib"), [("1920x1080", 4), ("3840x2160", 8.5)], ids=["1920x1080", "3840x2160"])
 def test_large_frames_fit_in_memory(tmp_path: Path, size: str, gib: float) -> None:
-    """Base image, network and files of a frame, and the path-traced one that it is checked by."""
+    """Base image, network and files of a frame, the frame next to it, and the path-traced ones of the check."""
     scene = shot_scenes.rolling(tmp_path)
-    words = ("shot", str(scene), "--frames", "1", "--size", size, "--way", "neural", "--set", "base.light_size=2048")
+    words = ("shot", str(scene), "--frames", "1-2", "--size", size, "--way", "neural", "--set", "base.light_size=2048")
     answer = json.loads(run(*words, "--json", folder=tmp_path).stdout)
     assert answer["check"]["psnr"] > 30
     rows = [json.loads(line) for line in (tmp_path / "rolling.shot.dnr" / "costs.jsonl").read_text().splitlines()]

@@ -88,6 +88,8 @@ class Worker:
 
     def __call__(self, asked: dict[str, Any]) -> FrameAnswer:
         task = FrameTask.model_validate(asked)
+        if task.before is None and task.after is None:
+            self.known = self.known[-1:]  # the others are of a way that has ended, and large
         finished = self._finished(task)
         began, beside = time.monotonic(), 0.0
         with ThreadPoolExecutor(1) as writer:
