@@ -19,13 +19,11 @@ from .light_worker import read_light
 from .recorded import Stopwatch
 from .smoothing import Smoother
 from .tasks import BakedCommon, BaseAnswer, BaseTask, SampledCommon
-from .temporal_filter import Finished, TemporalFilter
+from .temporal_filter import KNOWN, Finished, TemporalFilter
 
 COLOUR = ("base.R", "base.G", "base.B", "base.A")
 PREMULTIPLIED = tuple(f"{kind}.{c}" for kind in ("base", "diffuse", "albedo", "shown", "fresh") for c in "RGB")
 LEAST_ALPHA = 1e-6
-KNOWN = 3
-"""Frames of a moving camera that are kept: one and those next to it."""
 WITHIN = (*CHAIN, *SHOWN, *FACING)
 """Channels that no file holds."""
 
@@ -135,16 +133,13 @@ class Worker(BundleWorker):
             found = next((finished for known, finished in self.known if known == key), None)
             if found is None:
                 channels = self.remembered(way[-1], way[:-1], number)
-                found = Finished(way[-1], channels | {c: channels[f"base.{c}"] for c in "RGBA"})
+                found = as_finished(way[-1], channels)
                 self.known = [*self.known, (key, found)][-KNOWN:]
             return found
 
         way = [*earlier, view]
         before, own = seen(way[:-1]) if earlier else None, seen(way)
-        channels = self.filter(own, before, None if after is None else seen([*way, after]))
-        return {name: plane for name, plane in channels.items() if name not in "RGBA"} | {
-            f"base.{c}": channels[c] for c in "RGB"
-        }
+        return as_channels(self.filter(own, before, None if after is None else seen([*way, after])))
 
     def finished(self, channels: dict[str, np.ndarray], smooth: bool) -> dict[str, np.ndarray]:
         """Channels of `grainy`, smoothed, or denoised where the workspace's are; they are changed in place."""
@@ -172,6 +167,18 @@ class Worker(BundleWorker):
         found = channels | {name: picture[..., i] for i, name in enumerate(COLOUR)}
         clean = denoised(found)
         return clean | {"base.A": found["base.A"]} | {f"diffuse.{c}": clean[f"base.{c}"] for c in "RGB"}
+
+
+def as_finished(view: View, channels: dict[str, np.ndarray]) -> Finished:
+    """A base image as the temporal filter takes it."""
+    return Finished(view, channels | {c: channels[f"base.{c}"] for c in "RGBA"})
+
+
+def as_channels(layers: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What the filter makes of `as_finished`, as the base image's channels."""
+    return {name: plane for name, plane in layers.items() if name not in "RGBA"} | {
+        f"base.{c}": layers[c] for c in "RGB"
+    }
 
 
 def without_grain(channels: dict[str, np.ndarray], renderer: BaseRenderer) -> dict[str, np.ndarray]:

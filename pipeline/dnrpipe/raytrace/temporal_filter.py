@@ -44,6 +44,8 @@ LEVEL = 16.0
 """Of colours, times the frame's exposure: middle grey becomes 1.4."""
 TAKEN = ("R", "G", "B", "A", "depth.Z", "normal.X", "normal.Y", "normal.Z")
 """Channels that are read, in the kernel's order."""
+KNOWN = 3
+"""Frames that are kept where one follows the other: one and those next to it."""
 LEAST_ALPHA, SAME_ALPHA = 1e-3, 0.1
 """Of a pixel; and up to which difference another counts: at the rim of what stands before nothing, colours are as dark
 as they are transparent."""

@@ -161,7 +161,7 @@ def base_views(
         task = {"view": data, "output": str(path)}
         if remembers:
             task |= {"earlier": cameras[begin:number], "number": begin}
-            if views[number].width * views[number].height <= MOST_AT_ONCE:
+            if is_small(views[number]):
                 task |= {"after": (cameras[number + 1 :] or [None])[0], "filtered": True}
         known = [task[key] for key in ("earlier", "number", "after", "filtered") if key in task]
         tasks.append(task | {"fingerprint": digest([BASE_VERSION, renderer.fingerprint, data, *known])})
@@ -177,6 +177,11 @@ def base_views(
     )
     warn_of_repairs(tasks, run.console)
     return tasks
+
+
+def is_small(view: View) -> bool:
+    """Whether other frames are kept in memory beside one of that size."""
+    return view.width * view.height <= MOST_AT_ONCE
 
 
 def ready_renderer(workspace: Workspace, settings: Settings) -> BaseRenderer:

@@ -27,7 +27,7 @@ from dnrpipe.raytrace.denoise import denoise
 from dnrpipe.raytrace.engine import Engine, masked, masked_channels
 from dnrpipe.raytrace.frames import Frames
 from dnrpipe.raytrace.recorded import Stopwatch, timed
-from dnrpipe.raytrace.temporal_filter import Finished, TemporalFilter
+from dnrpipe.raytrace.temporal_filter import KNOWN, Finished, TemporalFilter
 from dnrtrain.dataset import view_in_memory
 from dnrtrain.display import DisplayTransform
 from dnrtrain.exr import compress_by, write_exr
@@ -42,8 +42,6 @@ MAX_RAYS = 1 << 22
 """Of a launch of the path tracer: bounds its memory."""
 EACH = 16
 """Samples per pixel of a launch at most: a kernel is recorded for each number of them."""
-KNOWN = 3
-"""Frames that are kept: one and those next to it."""
 Layers = dict[str, np.ndarray]
 
 
@@ -54,6 +52,10 @@ class _Rendered:
     task: FrameTask
     layers: list[Layers]
     answer: FrameAnswer
+
+    def shown(self, i: int) -> Finished:
+        """Its picture, or (1) its base image alone."""
+        return Finished(self.task.view, self.layers[i])
 
 
 class Worker:
@@ -105,17 +107,17 @@ class Worker:
 
     def _finished(self, task: FrameTask) -> _Rendered:
         """Filtered. The answer counts what the frame and the filter took, not what those next to it did."""
-        three = [None if each is None else self._rendered(each) for each in (task.before, task.alone, task.after)]
-        before, own, after = three
-        assert own is not None
+        before = task.before and self._rendered(task.before)
+        own = self._rendered(task.alone)
+        after = task.after and self._rendered(task.after)
         if before is None and after is None:
             return replace(own, task=task)
         ms, watch = dict(own.answer["ms"]), Stopwatch()
-        pictures = [
-            [None if each is None else Finished(each.task.view, each.layers[i]) for each in three]
-            for i in range(len(own.layers))
-        ]
-        layers = timed(ms, "temporal filter", lambda: [self._filtered(*picture) for picture in pictures])
+
+        def filtered(i: int) -> Layers:
+            return self.filter(own.shown(i), before and before.shown(i), after and after.shown(i))
+
+        layers = timed(ms, "temporal filter", lambda: [filtered(i) for i in range(len(own.layers))])
         costs = watch.costs()
         answer: FrameAnswer = {
             **own.answer,
@@ -125,10 +127,6 @@ class Worker:
             "ms": {name: round(value, 2) for name, value in ms.items()},
         }
         return _Rendered(task, layers, answer)
-
-    def _filtered(self, before: Finished | None, frame: Finished | None, after: Finished | None) -> Layers:
-        assert frame is not None
-        return self.filter(frame, before, after)
 
     def _rendered(self, task: FrameTask) -> _Rendered:
         """Not filtered. task: one that stands `alone`. The last KNOWN are not rendered again."""

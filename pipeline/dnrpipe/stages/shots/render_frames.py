@@ -10,14 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from dnrtrain.contract import View
-
 from ...core.ledger import Purpose
 from ...core.workspace import digest
 from ...workers.placement import HERE
 from ...workers.task_list import TaskResult, run_tasks
 from ...workers.view_tasks import is_made, warn_of_retries
-from ..base_images import CHUNK, MOST_AT_ONCE, WARM_UP
+from ..base_images import CHUNK, WARM_UP, is_small
 from ..stage import Run
 from .frame_tasks import FrameTask, Way
 from .records import ShotFrame
@@ -95,17 +93,13 @@ def next_to(frames: Sequence[ShotFrame], place: int) -> tuple[int | None, int | 
     whose motion the filter does not know; a lens is out of focus, where no pixel shows one place alone; or three
     pictures are too large for the memory."""
     frame = frames[place]
-    if frame.moving or frame.lens is not None or not _is_small(frame.view):
+    if frame.moving or frame.lens is not None or not is_small(frame.view):
         return None, None
     before, after = (
         other if 0 <= other < len(frames) and goes_on(frames[other], frame) else None
         for other in (place - 1, place + 1)
     )
     return before, after
-
-
-def _is_small(view: View) -> bool:
-    return view.width * view.height <= MOST_AT_ONCE
 
 
 def goes_on(before: ShotFrame, after: ShotFrame) -> bool:
@@ -122,7 +116,7 @@ def is_whole(task: FrameTask) -> bool:
 def in_succession(tasks: Sequence[FrameTask]) -> list[FrameTask]:
     """The tasks, each but the last with the one that follows it, which is rendered while it is written. Not of pictures
     so large that two of them would take too much memory."""
-    after = [following if _is_small(task.view) else None for task, following in pairwise(tasks)]
+    after = [following if is_small(task.view) else None for task, following in pairwise(tasks)]
     return [task.model_copy(update={"following": one}) for task, one in zip(tasks, [*after, None], strict=False)]
 
 

@@ -21,11 +21,11 @@ from dnrtrain.model import render_views
 
 from ...core.errors import UserError
 from ...raytrace.base_renderer import BaseRenderer
-from ...raytrace.base_worker import denoised, with_coverage
+from ...raytrace.base_worker import as_channels, as_finished, denoised, with_coverage
 from ...raytrace.history import History
 from ...raytrace.light_worker import read_light
 from ...raytrace.smoothing import Smoother
-from ...raytrace.temporal_filter import Finished, TemporalFilter
+from ...raytrace.temporal_filter import KNOWN, Finished, TemporalFilter
 from ...stages.base_images import light_path
 from .scene import BenchScene, Clock
 
@@ -117,8 +117,8 @@ class Ours:
                 found, ms = clock.time(partial(self.smoother, channels) if smooth else clean)
                 channels, parts["smoothing" if smooth else "denoiser"] = channels | found, ms
             if remember and samples is not None:
-                finished = Finished(view, channels | {c: channels[f"base.{c}"] for c in "RGBA"})
-                self.last[samples, smooth] = [*self.last.get((samples, smooth), []), (finished, parts)][-3:]
+                last = [*self.last.get((samples, smooth), []), (as_finished(view, channels), parts)]
+                self.last[samples, smooth] = last[-KNOWN:]
             result |= self._shown(samples, smooth, view, channels, parts, clock, REMEMBERS if remember else "")
         return result
 
@@ -128,9 +128,8 @@ class Ours:
         for (samples, smooth), last in self.last.items():
             (after, _), (own, parts), *before = reversed(last)
             found, ms = clock.time(partial(self.filter, own, before[0][0] if before else None, after))
-            channels = {**own.layers, **{f"base.{c}": found[c] for c in "RGB"}}
             spent = {**parts, "temporal filter": ms}
-            result |= self._shown(samples, smooth, own.view, channels, spent, clock, REMEMBERS + FILTERED)
+            result |= self._shown(samples, smooth, own.view, as_channels(found), spent, clock, REMEMBERS + FILTERED)
         return result
 
     def _shown(
