@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from tools.bench_shots import REEL, equal_rung, markdown
+from tools.bench_shots import REEL, equal_rung, markdown, seconds_as_good
 
 
 def figures(psnr: float, lpips: float) -> dict[str, float]:
@@ -40,6 +40,16 @@ def test_path_tracing_must_be_as_good_in_both() -> None:
     assert (equal_rung(row(), ("psnr",)) or {})["spp"] == 8
     assert cells(row())[9] == "16 spp, high"
     assert float(cells(row())[14]) == pytest.approx((100 + REEL * 2) / (REEL * 8), abs=0.01)
+
+
+def test_between_rungs_path_tracing_is_no_better_than_ours() -> None:
+    """Ours has the dB of halfway from 4 to 8 samples, and the LPIPS of halfway from 8 to 16: by the logarithm."""
+    assert seconds_as_good(row(), ("psnr",)) == pytest.approx(4 * 2**0.5 / 2)
+    geometric = row(ours=figures(30.0, (0.06 * 0.04) ** 0.5))
+    assert seconds_as_good(geometric, ("psnr", "lpips")) == pytest.approx(8 * 2**0.5 / 2)
+    assert float(cells(geometric)[15]) == pytest.approx((100 + REEL * 2) / (REEL * 8 * 2**0.5 / 2), abs=0.01)
+    assert seconds_as_good(row(ours=figures(20.0, 0.2)), ("psnr", "lpips")) == 2.0, "the first rung is the cheapest"
+    assert seconds_as_good(row(ours=figures(40.0, 0.05)), ("psnr", "lpips")) is None
 
 
 def test_the_rival_is_the_cheaper_of_the_two_path_tracers() -> None:

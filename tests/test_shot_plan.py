@@ -14,7 +14,7 @@ from dnrpipe.core.cameras import look_at_view
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import CameraSettings, resolve
 from dnrpipe.core.shot_records import told_frames
-from dnrpipe.raytrace.temporal_filter import Finished
+from dnrpipe.raytrace.temporal_filter import Finished, Latest
 from dnrpipe.stages.base_images import CHUNK, WARM_UP
 from dnrpipe.stages.shots import render_frames
 from dnrpipe.stages.shots.check import held_out
@@ -314,7 +314,7 @@ def test_a_frame_is_rendered_while_the_one_before_is_written(tmp_path, monkeypat
     ]
     assert in_succession([]) == []
     worker: Any = object.__new__(Worker)
-    worker.known = []
+    worker.latest = Latest()
     rendered, filtered, written, broken = [], [], [], [2]
 
     def render(task: FrameTask, _ms: dict[str, float]) -> tuple[list[Any], int]:

@@ -19,7 +19,7 @@ from .light_worker import read_light
 from .recorded import Stopwatch
 from .smoothing import Smoother
 from .tasks import BakedCommon, BaseAnswer, BaseTask, SampledCommon
-from .temporal_filter import KNOWN, Finished, TemporalFilter
+from .temporal_filter import Finished, Latest, TemporalFilter
 
 COLOUR = ("base.R", "base.G", "base.B", "base.A")
 PREMULTIPLIED = tuple(f"{kind}.{c}" for kind in ("base", "diffuse", "albedo", "shown", "fresh") for c in "RGB")
@@ -49,8 +49,8 @@ class Worker(BundleWorker):
         self.silhouettes: dict[tuple[int, int], Frames] = {}
         self.history, self.seen = History(self.engine.mi), list[tuple[View, int | None, int, bool]]()
         """Of the frames ``seen``, with their rays per pixel, the number of the first, and whether they are smoothed."""
-        self.filter, self.known = TemporalFilter(self.engine.mi), list[tuple[list[tuple[View, int]], Finished]]()
-        """The last frames that were filtered, or filtered with, each with the way to it and the first one's number."""
+        self.filter, self.latest = TemporalFilter(self.engine.mi), Latest[list[tuple[View, int]], Finished]()
+        """Frames that were filtered, or filtered with, by the way to each and the first one's number."""
         self.repaired = self.masked = 0  # pixels of the view at hand: samples left out, set to zero
 
     def __call__(self, asked: dict[str, Any]) -> BaseAnswer:
@@ -123,19 +123,11 @@ class Worker(BundleWorker):
     def filtered(
         self, view: View, earlier: Sequence[View], number: int = 0, after: View | None = None
     ) -> dict[str, np.ndarray]:
-        """`remembered`, with a base image that is averaged with those of the frame before and the frame ``after``.
-
-        The last KNOWN frames are not rendered again.
-        """
+        """`remembered`, with a base image that is averaged with those of the frame before and the frame ``after``."""
 
         def seen(way: Sequence[View]) -> Finished:
             key = [(frame, number) for frame in way]
-            found = next((finished for known, finished in self.known if known == key), None)
-            if found is None:
-                channels = self.remembered(way[-1], way[:-1], number)
-                found = as_finished(way[-1], channels)
-                self.known = [*self.known, (key, found)][-KNOWN:]
-            return found
+            return self.latest(key, lambda: as_finished(way[-1], self.remembered(way[-1], way[:-1], number)))
 
         way = [*earlier, view]
         before, own = seen(way[:-1]) if earlier else None, seen(way)

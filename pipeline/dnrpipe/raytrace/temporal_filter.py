@@ -18,9 +18,9 @@ it. A lookup between pixels blurs, so that D has what is lost of C's finest deta
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -49,6 +49,7 @@ KNOWN = 3
 LEAST_ALPHA, SAME_ALPHA = 1e-3, 0.1
 """Of a pixel; and up to which difference another counts: at the rim of what stands before nothing, colours are as dark
 as they are transparent."""
+Key, Value = TypeVar("Key"), TypeVar("Value")
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,26 @@ class Finished:
 
     view: View
     layers: Mapping[str, np.ndarray]
+
+
+class Latest(Generic[Key, Value]):
+    """The last KNOWN that were made: where frames follow one another, each is made once."""
+
+    def __init__(self) -> None:
+        self.kept: list[tuple[Key, Value]] = []
+
+    def __call__(self, key: Key, make: Callable[[], Value]) -> Value:
+        """What is kept under the key, or was made now."""
+        for known, value in self.kept:
+            if known == key:
+                return value
+        value = make()
+        self.kept = [*self.kept, (key, value)][-KNOWN:]
+        return value
+
+    def forget(self) -> None:
+        """All but the last one."""
+        self.kept = self.kept[-1:]
 
 
 class TemporalFilter:

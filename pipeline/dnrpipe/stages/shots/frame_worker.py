@@ -27,7 +27,7 @@ from dnrpipe.raytrace.denoise import denoise
 from dnrpipe.raytrace.engine import Engine, masked, masked_channels
 from dnrpipe.raytrace.frames import Frames
 from dnrpipe.raytrace.recorded import Stopwatch, timed
-from dnrpipe.raytrace.temporal_filter import KNOWN, Finished, TemporalFilter
+from dnrpipe.raytrace.temporal_filter import Finished, Latest, TemporalFilter
 from dnrtrain.dataset import view_in_memory
 from dnrtrain.display import DisplayTransform
 from dnrtrain.exr import compress_by, write_exr
@@ -74,8 +74,8 @@ class Worker:
         )  # by (width, height)
         self.background = Background(self.engine, settings.bundle) if settings.background else None
         self.filter = TemporalFilter(self.engine.mi)
-        self.known: list[_Rendered] = []
-        """The last frames that were rendered, not filtered."""
+        self.latest = Latest[FrameTask, _Rendered]()
+        """Frames that were rendered, not filtered."""
 
     @functools.cached_property
     def model(self) -> Any:
@@ -91,7 +91,7 @@ class Worker:
     def __call__(self, asked: dict[str, Any]) -> FrameAnswer:
         task = FrameTask.model_validate(asked)
         if task.before is None and task.after is None:
-            self.known = self.known[-1:]  # the others are of a way that has ended, and large
+            self.latest.forget()  # the others are of a way that has ended, and large
         finished = self._finished(task)
         began, beside = time.monotonic(), 0.0
         with ThreadPoolExecutor(1) as writer:
@@ -100,16 +100,16 @@ class Worker:
                 # What goes wrong here does so again when the frame is asked for.
                 with contextlib.suppress(Exception):
                     for each in task.following.takes:
-                        self._rendered(each)
+                        self._once(each)
                 beside = time.monotonic() - began
             written.result()
         return {**finished.answer, "write_seconds": time.monotonic() - began - beside}
 
     def _finished(self, task: FrameTask) -> _Rendered:
         """Filtered. The answer counts what the frame and the filter took, not what those next to it did."""
-        before = task.before and self._rendered(task.before)
-        own = self._rendered(task.alone)
-        after = task.after and self._rendered(task.after)
+        before = task.before and self._once(task.before)
+        own = self._once(task.alone)
+        after = task.after and self._once(task.after)
         if before is None and after is None:
             return replace(own, task=task)
         ms, watch = dict(own.answer["ms"]), Stopwatch()
@@ -128,11 +128,11 @@ class Worker:
         }
         return _Rendered(task, layers, answer)
 
+    def _once(self, task: FrameTask) -> _Rendered:
+        """Not filtered. task: one that stands `alone`."""
+        return self.latest(task, lambda: self._rendered(task))
+
     def _rendered(self, task: FrameTask) -> _Rendered:
-        """Not filtered. task: one that stands `alone`. The last KNOWN are not rendered again."""
-        for known in self.known:
-            if known.task == task:
-                return known
         ms: dict[str, float] = {}
         if task.way.name == "neural":
             assert self.model is not None  # loaded by now: that is no part of a frame
@@ -145,9 +145,7 @@ class Worker:
             "masked": lost,
             "ms": {name: round(value, 2) for name, value in ms.items()},
         }
-        rendered = _Rendered(task, found, answer)
-        self.known = [*self.known, rendered][-KNOWN:]
-        return rendered
+        return _Rendered(task, found, answer)
 
     def _write(self, rendered: _Rendered) -> None:
         task, (layers, *plain) = rendered.task, rendered.layers
