@@ -49,7 +49,8 @@ KNOWN = 3
 LEAST_ALPHA, SAME_ALPHA = 1e-3, 0.1
 """Of a pixel; and up to which difference another counts: at the rim of what stands before nothing, colours are as dark
 as they are transparent."""
-Key, Value = TypeVar("Key"), TypeVar("Value")
+Key = TypeVar("Key")
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
