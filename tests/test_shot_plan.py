@@ -135,9 +135,12 @@ def test_smoothed_frames_are_as_clean_as_denoised_ones() -> None:
     clean = option("base", 40, 33.0, 0.107, spp=4)
     smooth = clean.model_copy(update={"way": Way(name="base", spp=4, smooth=True), "seconds": 30.0})
     assert choose([clean, smooth], Wanted())[0] is smooth
-    grainy = smooth.model_copy(update={"lpips": 0.112})
+    grainy = smooth.model_copy(update={"psnr": 32.8, "lpips": 0.112})
     assert choose([clean, grainy], Wanted())[0] is clean
     assert choose([clean, grainy], Wanted(lpips=0.12))[0] is grainy, "asked for"
+    soft = grainy.model_copy(update={"psnr": 33.1})
+    assert choose([clean, soft], Wanted())[0] is soft, "grain would take decibels away"
+    assert choose([clean, soft.model_copy(update={"lpips": 0.13})], Wanted())[0] is clean
 
 
 def test_baked_light_that_is_worse_than_good_path_tracing_is_not_taken() -> None:

@@ -16,9 +16,11 @@ NEAR = 0.5, 1.1
 are half a decibel where a frame is good."""
 SAME_PRICE = 1.05
 """Times the seconds of the cheapest that is near, within which the best is taken: seconds vary by more than that."""
-SMOOTH_ENOUGH = 1.02
+SMOOTH_ENOUGH, SHARP_ENOUGH = 1.02, 1.2
 """Times the LPIPS of denoised frames that smoothed ones of as many rays may have: windows tell grain poorly, since the
-references' own noise is in their LPIPS (`interior`: .112 and .107, in whole frames of 1280x720 .110 and .051)."""
+references' own noise is in their LPIPS (`interior`: .112 and .107, in whole frames of 1280x720 .110 and .051). The
+second is of smoothed ones with at least the PSNR, which grain takes away: they are but less sharp (`ship`, eight rays:
+.067 and .058, in whole frames .039 and .035, which look alike)."""
 
 USUAL = 31.0, 0.03
 """PSNR and LPIPS that base images of eight rays have on the pilot's windows, give or take (`food` 31.6 dB, .024; `ship`
@@ -129,11 +131,13 @@ def choose(options: Sequence[Option], wanted: Wanted) -> tuple[Option, str]:
     def is_near(option: Option, other: Option) -> bool:
         return option.reaches(quality(other) - NEAR[0], None if other.lpips is None else other.lpips * NEAR[1])
 
-    denoised = {own.way.spp: own.lpips for own in baked if own.way.name == "base" and not own.way.smooth}
+    denoised = {own.way.spp: own for own in baked if own.way.name == "base" and not own.way.smooth}
 
     def is_clean(own: Option) -> bool:
-        least = denoised.get(own.way.spp) if own.way.smooth else None
-        return least is None or own.lpips is None or own.lpips <= least * SMOOTH_ENOUGH
+        other = denoised.get(own.way.spp) if own.way.smooth else None
+        if other is None or other.lpips is None or own.lpips is None:
+            return True
+        return own.lpips <= other.lpips * (SHARP_ENOUGH if quality(own) >= quality(other) else SMOOTH_ENOUGH)
 
     clean = [own for own in baked if is_clean(own)]
     usual = [own for own in clean if not own.way.smooth or own.way.spp <= PATIENCE]
