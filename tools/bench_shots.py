@@ -43,6 +43,7 @@ from dnrpipe.stages.shots.references import compared, display_of, shown
 from dnrpipe.stages.shots.render_frames import FRAMES_FOLDER, frame_outcomes, in_succession
 from dnrpipe.stages.shots.renderers import path_tracer
 from dnrpipe.stages.stage import Run
+from dnrpipe.studies.frames.pareto_front import crossover
 from dnrpipe.workers.task_list import run_tasks
 from dnrpipe.workers.view_tasks import worker_count
 from dnrtrain.atomic import write_json
@@ -374,21 +375,15 @@ def seconds_as_good(row: dict[str, Any], names: Sequence[str]) -> float | None:
     found = []
     for rungs in ladders.values():
         rungs.sort(key=lambda rung: rung["spp"])
-        samples = [math.log(rung["spp"]) for rung in rungs]
-        heights = {name: [height(rung, name) for rung in rungs] for name in names}
-        wanted = {name: height(row["ours"], name) for name in names}
-        if all(wanted[name] <= max(heights[name]) for name in names):
-            needed = [crossing(samples, heights[name], wanted[name]) for name in names]
-            found.append(np.interp(math.exp(max(needed)), np.exp(samples), [rung["frame"] for rung in rungs]))
+        needed = [
+            crossover([(rung["spp"], height(rung, name)) for rung in rungs], height(row["ours"], name))
+            for name in names
+        ]
+        enough = [count for count in needed if count is not None]
+        if len(enough) == len(needed):
+            samples, seconds = ([rung[key] for rung in rungs] for key in ("spp", "frame"))
+            found.append(np.interp(max(enough), samples, seconds))
     return float(min(found)) if found else None
-
-
-def crossing(x: Sequence[float], y: Sequence[float], level: float) -> float:
-    """Where y, straight between the points, reaches the level first; the first x where it begins there."""
-    place = next(i for i, height in enumerate(y) if height >= level)
-    if not place:
-        return x[0]
-    return float(np.interp(level, y[place - 1 : place + 1], x[place - 1 : place + 1]))
 
 
 def last_rung(row: dict[str, Any]) -> dict[str, Any]:
