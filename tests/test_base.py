@@ -26,8 +26,8 @@ from dnrpipe.raytrace.recorded import planes_of
 from dnrpipe.raytrace.second_targets import second_targets
 from dnrpipe.raytrace.sensors import sensor_dict
 from dnrpipe.raytrace.surface_maps import SurfaceMapper
+from dnrpipe.raytrace.tasks import CHUNK, WARM_UP
 from dnrpipe.raytrace.texels import grouped_meshes, seen_sides
-from dnrpipe.stages.base_images import WARM_UP
 from dnrtrain.contract import BASE_CHANNELS, FRESH_CHANNELS, View
 from dnrtrain.exr import read_exr, write_exr
 
@@ -612,6 +612,19 @@ def test_frames_that_remember_are_the_same_when_a_sequence_is_taken_up_again(
     assert (frames[0]["rays"][inside] == 2).all() and np.median(frames[3]["rays"][inside]) == 8
     alone = rendered_by(resumed, 3, earlier=False)
     assert (alone["rays"][inside] == 2).all() and not (alone["base.R"] == again["base.R"]).all()
+
+    # Where the next chunk begins, no frame is rendered again, and it is as if it had been.
+    way = [camera(0.3 + 0.02 * number) for number in range(CHUNK - WARM_UP - 2, CHUNK + 2)]
+    rendered: list[View] = []
+    steady, resumed = Worker(common), Worker(common)
+    frame = steady.renderer.frame
+    steady.renderer.frame = lambda view, *given, **more: (rendered.append(view), frame(view, *given, **more))[1]  # type: ignore[method-assign]
+    for i in range(1, len(way)):
+        first = 0 if i + CHUNK - WARM_UP - 2 < CHUNK else 2
+        last = steady.remembered(way[i], way[first:i], CHUNK - WARM_UP - 2 + first)
+    assert rendered == way
+    again = resumed.remembered(way[-1], way[2:-1], CHUNK - WARM_UP)
+    assert all((last[name] == again[name]).all() for name in again)
 
     steady, resumed = Worker(common), Worker(common)
     mean = [rendered_by(steady, number, filtered=True) for number in range(4)]

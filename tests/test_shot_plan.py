@@ -14,8 +14,8 @@ from dnrpipe.core.cameras import look_at_view
 from dnrpipe.core.errors import UserError
 from dnrpipe.core.settings import CameraSettings, resolve
 from dnrpipe.core.shot_records import told_frames
+from dnrpipe.raytrace.tasks import CHUNK, WARM_UP
 from dnrpipe.raytrace.temporal_filter import Finished, Latest
-from dnrpipe.stages.base_images import CHUNK, WARM_UP
 from dnrpipe.stages.shots import render_frames
 from dnrpipe.stages.shots.check import held_out
 from dnrpipe.stages.shots.frame_tasks import FrameCommon, FrameTask, Way

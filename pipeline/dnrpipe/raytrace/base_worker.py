@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from .history import History
 from .light_worker import read_light
 from .recorded import Stopwatch
 from .smoothing import Smoother
-from .tasks import BakedCommon, BaseAnswer, BaseTask, SampledCommon
+from .tasks import CHUNK, BakedCommon, BaseAnswer, BaseTask, SampledCommon, remembers_from
 from .temporal_filter import Finished, Latest, TemporalFilter
 
 COLOUR = ("base.R", "base.G", "base.B", "base.A")
@@ -26,6 +27,29 @@ PREMULTIPLIED = tuple(f"{kind}.{c}" for kind in ("base", "diffuse", "albedo", "s
 LEAST_ALPHA = 1e-6
 WITHIN = (*CHAIN, *SHOWN, *FACING)
 """Channels that no file holds."""
+MOST_BESIDE = 1 << 20
+"""Pixels of a frame up to which the next chunk's memory is kept beside this one's, 128 bytes of each."""
+_Frame = tuple[View, int | None, bool]
+"""That was seen, its rays per pixel, if not the workspace's, and whether it is smoothed."""
+
+
+@dataclass
+class _Memory:
+    """What frames of a camera's way saw. first: number of the first of them."""
+
+    history: History
+    first: int
+    seen: list[_Frame]
+
+    def leads_to(self, first: int, way: Sequence[_Frame]) -> bool:
+        """Whether the way's last frame, and perhaps some before it, are yet to come."""
+        return self.first == first and len(self.seen) < len(way) and self.seen == list(way[: len(self.seen)])
+
+    def take(self, frame: _Frame, channels: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """The channels with what was seen before (`History.take`)."""
+        found = self.history.take(frame[0], channels)
+        self.seen.append(frame)
+        return found
 
 
 class Worker(BundleWorker):
@@ -47,8 +71,9 @@ class Worker(BundleWorker):
         )
         self.smoother = Smoother(self.engine.mi)
         self.silhouettes: dict[tuple[int, int], Frames] = {}
-        self.history, self.seen = History(self.engine.mi), list[tuple[View, int | None, int, bool]]()
-        """Of the frames ``seen``, with their rays per pixel, the number of the first, and whether they are smoothed."""
+        self.memory = _Memory(History(self.engine.mi), 0, [])
+        self.ahead: _Memory | None = None
+        """What the next chunk of frames remembers."""
         self.filter, self.latest = TemporalFilter(self.engine.mi), Latest[list[tuple[View, int]], Finished]()
         """Frames that were filtered, or filtered with, by the way to each and the first one's number."""
         self.repaired = self.masked = 0  # pixels of the view at hand: samples left out, set to zero
@@ -109,14 +134,12 @@ class Worker(BundleWorker):
         """`channels` of a view, with what the frames ``earlier`` of a camera's way saw, the first of that number.
 
         Those that were the last to be seen, by as many rays for the same use, are not rendered again: one frame after
-        the other costs one each.
+        the other costs one each, also where the next chunk begins (`remembers_from`).
         """
-        way = [(other, samples, number, smooth) for other in (*earlier, view)]
-        known = len(self.seen) if self.seen == way[: len(self.seen)] and len(self.seen) < len(way) else 0
-        if not known:
-            self.history.begin(number)
-        self.seen = way
-        for frame, *_ in way[known:-1]:
+        way = [(other, samples, smooth) for other in (*earlier, view)]
+        known = [memory for memory in (self.memory, self.ahead) if memory is not None and memory.leads_to(number, way)]
+        self.memory = known[0] if known else _Memory(self.memory.history.beside(number), number, [])
+        for frame, *_ in way[len(self.memory.seen) : -1]:
             self._taken(frame, samples, smooth)
         return self.finished(self._taken(view, samples, smooth), smooth)
 
@@ -140,7 +163,16 @@ class Worker(BundleWorker):
         return without_grain(channels, self.renderer) if self.denoise else channels
 
     def _taken(self, view: View, samples: int | None, smooth: bool) -> dict[str, np.ndarray]:
-        return self.history.take(view, self.grainy(view, samples, self.history.number, smooth=smooth))
+        """`grainy`, with what was seen before. What the next chunk remembers goes into a memory of its own, too."""
+        memory, each, number = self.memory, (view, samples, smooth), self.memory.history.number
+        channels = self.grainy(view, samples, number, smooth=smooth)
+        begin = remembers_from(number + CHUNK - number % CHUNK)
+        if memory.first < begin <= number and view.width * view.height <= MOST_BESIDE:
+            if number == begin:
+                self.ahead = _Memory(memory.history.beside(begin), begin, [])
+            if self.ahead is not None and self.ahead.seen == memory.seen[begin - memory.first :]:
+                self.ahead.take(each, channels)
+        return memory.take(each, channels)
 
     def _frames(self, view: View) -> Frames:
         """Finer silhouettes than the base image's few rays give, for views of one size."""

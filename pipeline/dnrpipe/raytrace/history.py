@@ -27,6 +27,7 @@ those corners that lie on the same surface.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass
 from itertools import chain
 from typing import Any
@@ -80,6 +81,12 @@ class History:
         """Forget. number: of the next frame, where it stands in the middle of a sequence."""
         self.number = number
         self.before: tuple[View, list[Any]] | None = None
+
+    def beside(self, number: int) -> History:
+        """Another memory that has begun, by the same kernel."""
+        other = copy(self)
+        other.begin(number)
+        return other
 
     def take(self, view: View, channels: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """The channels of a frame with its base image improved by the frames before; float32 [H, W] each.

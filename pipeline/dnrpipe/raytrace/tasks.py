@@ -232,6 +232,16 @@ class SampledCommon(BundleCommon):
     seed: int
 
 
+CHUNK, WARM_UP = 64, 8
+"""Frames of a sequence that remember one another; those before a chunk's first that count for it once more, so that no
+seam is seen. A chunk is what an interrupted run does again at most."""
+
+
+def remembers_from(number: int) -> int:
+    """The first frame of a sequence that frame ``number`` remembers."""
+    return max(0, number - number % CHUNK - WARM_UP)
+
+
 class BaseTask(Task):
     """Render a view's base image into ``output``, an EXR file. earlier: the frames of a moving camera that it remembers
     (see `history`), in their order; None: it stands alone. number: of the first of them in the camera's way. after: the

@@ -24,6 +24,7 @@ from ..core.workspace import Workspace, digest
 from ..effects.plan import DIRECT_DEPTH, EffectPlan
 from ..effects.store import plan_of, trace_config
 from ..raytrace.gathering import COARSE_PATHS
+from ..raytrace.tasks import remembers_from
 from ..raytrace.variants import choose_variant
 from ..workers.placement import HERE
 from ..workers.view_tasks import only_answer, warn_of_repairs
@@ -45,9 +46,6 @@ GATHER_FROM = 0.4
 does not at 0.21 (`materials`)."""
 MOST_AT_ONCE = 1 << 22
 """Pixels of a frame beside which others are kept in memory."""
-CHUNK, WARM_UP = 64, 8
-"""Frames of a sequence that remember one another; those before a chunk's first that are rendered for it once more, so
-that no seam is seen. A chunk is what an interrupted run does again at most."""
 LOOKED_FROM = 16
 """Views of the workspace that say what is seen, where light is baked for that."""
 RAY = 0.6
@@ -157,7 +155,7 @@ def base_views(
     remembers = sequence and chosen.model.base == "baked"
     cameras = [view.model_dump(mode="json") for view in views]
     for number, (data, path) in enumerate(zip(cameras, paths, strict=True)):
-        begin = max(0, number - number % CHUNK - WARM_UP)
+        begin = remembers_from(number)
         task = {"view": data, "output": str(path)}
         if remembers:
             task |= {"earlier": cameras[begin:number], "number": begin}
