@@ -188,7 +188,7 @@ def _children(parent: int) -> list[tuple[int, bytes]]:
 def test_pace() -> None:
     """Slow frames make it coarser, quick ones finer, and it settles where frames fit into the budget."""
     pace = Pace()
-    cost = {0: 400.0, 1: 150.0, 2: 80.0, 3: 40.0, 4: 25.0, 5: 20.0, 6: 18.0}
+    cost = {0: 400.0, 1: 110.0, 2: 60.0, 3: 40.0, 4: 30.0, 5: 25.0, 6: 20.0, 7: 18.0}
     for _ in range(10 * MIN_FRAMES):
         pace.record(256, cost[pace.level])
     assert pace.level == 2

@@ -28,12 +28,13 @@ IDLE_CHECK = 2.0
 REFERENCE_SPP = 4
 MOST_SPP, MOST_RAYS = 1024, 64
 """Per pixel, of a reference and of a base image at rest."""
-BUDGET = 90.0
-"""Milliseconds that a moving frame may take."""
+BUDGET = 66.0
+"""Milliseconds that a moving frame may take: fifteen a second."""
 LEVELS: tuple[tuple[float, int | None], ...] = (
     (1.0, None),
     (1.0, 2),
     (1.0, 1),
+    (0.75, 1),
     (0.5, 2),
     (0.5, 1),
     (0.375, 1),
