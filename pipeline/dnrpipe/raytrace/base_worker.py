@@ -35,11 +35,15 @@ _Frame = tuple[View, int | None, bool]
 
 @dataclass
 class _Memory:
-    """What frames of a camera's way saw. first: number of the first of them."""
+    """What frames of a camera's way saw."""
 
     history: History
-    first: int
     seen: list[_Frame]
+
+    @property
+    def first(self) -> int:
+        """The number of the first of them in the camera's way."""
+        return self.history.number - len(self.seen)
 
     def leads_to(self, first: int, way: Sequence[_Frame]) -> bool:
         """Whether the way's last frame, and perhaps some before it, are yet to come."""
@@ -71,7 +75,7 @@ class Worker(BundleWorker):
         )
         self.smoother = Smoother(self.engine.mi)
         self.silhouettes: dict[tuple[int, int], Frames] = {}
-        self.memory = _Memory(History(self.engine.mi), 0, [])
+        self.memory = _Memory(History(self.engine.mi), [])
         self.ahead: _Memory | None = None
         """What the next chunk of frames remembers."""
         self.filter, self.latest = TemporalFilter(self.engine.mi), Latest[list[tuple[View, int]], Finished]()
@@ -138,7 +142,7 @@ class Worker(BundleWorker):
         """
         way = [(other, samples, smooth) for other in (*earlier, view)]
         known = [memory for memory in (self.memory, self.ahead) if memory is not None and memory.leads_to(number, way)]
-        self.memory = known[0] if known else _Memory(self.memory.history.beside(number), number, [])
+        self.memory = known[0] if known else _Memory(self.memory.history.beside(number), [])
         for frame, *_ in way[len(self.memory.seen) : -1]:
             self._taken(frame, samples, smooth)
         return self.finished(self._taken(view, samples, smooth), smooth)
@@ -169,7 +173,7 @@ class Worker(BundleWorker):
         begin = remembers_from(number + CHUNK - number % CHUNK)
         if memory.first < begin <= number and view.width * view.height <= MOST_BESIDE:
             if number == begin:
-                self.ahead = _Memory(memory.history.beside(begin), begin, [])
+                self.ahead = _Memory(memory.history.beside(begin), [])
             if self.ahead is not None and self.ahead.seen == memory.seen[begin - memory.first :]:
                 self.ahead.take(each, channels)
         return memory.take(each, channels)
