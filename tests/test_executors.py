@@ -13,7 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from dnrpipe.blender.tasks import InspectAnswer, InspectTask
 from dnrpipe.core.errors import UserError
+from dnrpipe.stages.prepare import open_scene
 from dnrpipe.workers import task_list as task_list_module
 from dnrpipe.workers.processes import KeptWorker, LocalWorker, TaskFailed, WorkerDied
 from dnrpipe.workers.task_list import Retry, TaskResult, run_tasks
@@ -212,6 +214,42 @@ def test_closing_the_iterator_kills_the_workers(module: str, tmp_path: Path) -> 
     started = time.monotonic()
     outcomes.close()  # type: ignore[attr-defined]
     assert time.monotonic() - started < 10
+
+
+def test_an_interrupt_while_the_worker_of_a_scene_ends_is_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its answer is here already; the command must end all the same."""
+    code = """
+import os, signal, time
+
+end = os._exit
+
+def interrupt_and_end(code):
+    os.kill(os.getppid(), signal.SIGUSR1)
+    time.sleep(0.5)
+    end(code)
+
+os._exit = interrupt_and_end
+
+class Worker:
+    def __init__(self, common): ...
+    def __call__(self, task):
+        return {"census": {}, "warnings": []}
+"""
+    (tmp_path / "slow_to_end.py").write_text(code)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGUSR1, interrupt)
+    try:
+        task = InspectTask(source=tmp_path / "scene.blend", folder=tmp_path, bake_size=64)
+        with pytest.raises(KeyboardInterrupt):
+            open_scene("slow_to_end", task, InspectAnswer, tmp_path / "log.txt")
+    finally:
+        signal.signal(signal.SIGUSR1, before)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="PR_SET_PDEATHSIG is Linux's")

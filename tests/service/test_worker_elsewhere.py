@@ -37,6 +37,8 @@ from dnrpipe.stages.session import resolve_settings
 
 SCENE = Path(__file__).parents[2] / "blender_scenes" / "hard" / "emissive_only.blend"
 JOBS = 40
+LONGER = TINY | {"cameras.train": 400}
+"""Of a job that is not done before it is stopped: ten seconds, of which a worker tells every other one."""
 
 
 class Elsewhere:
@@ -147,7 +149,7 @@ def test_two_workers_share_a_queue_and_one_is_killed(
 
 def test_cancel_and_limits_reach_a_worker(server: Server, start: Callable[..., Elsewhere]) -> None:
     with server.client() as client:
-        running = _prepare(client, "halfway")
+        running = _prepare(client, "halfway", settings=LONGER)
         worker = start("one")
         _working(client, running.id)
         assert processes_of(worker.root / "cpu")
@@ -195,8 +197,7 @@ def test_a_restart_of_the_server_is_no_end_of_a_job(server: Server, start: Calla
 
 def test_a_worker_stopped_in_order_gives_its_job_back(server: Server, start: Callable[..., Elsewhere]) -> None:
     with server.client() as client:
-        longer = TINY | {"cameras.train": 400}  # it must not be done before it is stopped
-        job = _prepare(client, "passed-on", settings=longer)
+        job = _prepare(client, "passed-on", settings=LONGER)
         first = start("first")
         _working(client, job.id)
         assert first.end(signal.SIGTERM) == 0

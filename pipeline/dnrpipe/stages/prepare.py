@@ -250,13 +250,13 @@ def open_scene(
     Raises UserError: both tries failed; says whether Blender itself died of the file. Raises OSError: a full disk.
     """
     failed: list[Retry] = []
-    for outcome in run_tasks(module, {}, [task.data()], workers=1, log=log, retried=failed.append):
-        if outcome.died:
-            raise UserError(f"{task.source}: Blender could not open it ({outcome.error}): damaged or truncated?")
-        if outcome.result is None:
-            raise UserError(str(outcome.error))
-        return answer.model_validate(outcome.result), failed[0].reason if failed else ""
-    raise AssertionError("run_tasks answers every task")
+    # All of it is taken: a Ctrl-C while the iterator of a loop that was left is thrown away would be lost.
+    (outcome,) = run_tasks(module, {}, [task.data()], workers=1, log=log, retried=failed.append)
+    if outcome.died:
+        raise UserError(f"{task.source}: Blender could not open it ({outcome.error}): damaged or truncated?")
+    if outcome.result is None:
+        raise UserError(str(outcome.error))
+    return answer.model_validate(outcome.result), failed[0].reason if failed else ""
 
 
 def bake(run: Run, source: Path, geometry: Path, pending: PendingBakes) -> list[str]:

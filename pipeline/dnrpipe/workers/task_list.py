@@ -124,7 +124,8 @@ def run_tasks(
             are as many as the cluster has room for.
         kept: the one worker, of this machine, which lives on when all tasks are answered for.
 
-    Closing the iterator (Ctrl-C in the consumer) kills the workers.
+    Closing the iterator (Ctrl-C in the consumer) kills the workers. A consumer that leaves early closes it itself
+    (`contextlib.closing`): Python drops what is raised while it throws an iterator away, a Ctrl-C, too.
 
     Raises UserError: see `TaskTimeout`; no such cluster. Raises OSError: the disk is full.
     """
