@@ -165,12 +165,24 @@ def test_rungs_between_and_beyond_those_measured() -> None:
     high = Measured(Way(name="path", spp=16), pixel=4.0, start=1.0, psnr=34.0, lpips=0.025)
     rungs = reckoned([high, low], 64)
     assert [rung.way.spp for rung in rungs] == [4, 8, 16, 32, 64]
-    assert rungs[0] is low and rungs[2] is high
     assert [rung.psnr for rung in rungs] == pytest.approx([30, 32, 34, 36, 38])
     assert [rung.pixel for rung in rungs] == pytest.approx([1, 2, 4, 8, 16])
     assert [rung.lpips for rung in rungs] == pytest.approx([0.1, 0.05, 0.025, 0.0125, 0.00625])
     blind = reckoned([low, Measured(Way(name="path", spp=16), pixel=4.0, start=1.0, psnr=34.0, lpips=None)], 16)
     assert [rung.lpips for rung in blind] == [0.1, None, None]
+
+
+def test_a_picture_that_had_to_wait_makes_no_samples_cheap() -> None:
+    """As measured on `foliage` when something held up its four samples: by these and eight, 64 cost less than none."""
+    waited = [
+        Measured(Way(name="path", spp=spp), pixel=pixel, start=0.0, psnr=36.0 + spp / 2, lpips=0.01)
+        for spp, pixel in ((1, 0.527), (4, 0.972), (8, 0.676))
+    ]
+    rungs = reckoned(waited, 64, [(32, 1.169)])
+    prices = [rung.pixel for rung in rungs]
+    assert prices == sorted(prices) and 0.5 < prices[0] < 0.8 and 1.5 < prices[-1] < 2.4
+    falling = reckoned(waited[1:], 64)
+    assert [rung.pixel for rung in falling] == [0.972] * 5
 
 
 def test_without_baked_light_what_it_usually_has_is_enough() -> None:

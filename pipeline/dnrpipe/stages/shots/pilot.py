@@ -88,6 +88,7 @@ class Pilot:
         chosen = spread(still or range(len(frames)), FRAMES)  # where all move: as converted
         self.windows = [(index, place) for index in chosen for place in PLACES]
         self.references: dict[int, Truth] = {}
+        self.reference_seconds: dict[int, list[float]] = {}  # of each window's pictures
         self.processes: dict[bool, _Process] = {}  # whether it path traces
         self.rows: dict[Way, list[_Window]] = {}
 
@@ -144,6 +145,7 @@ class Pilot:
                     start = max(0.0, asked - spent)
                 if key is not None and task.seed >= SEED:
                     drawn.setdefault(key, []).append(shown(self.display, task.output))
+                    self.reference_seconds.setdefault(key, []).append(spent)
                 elif key is not None:
                     if task.plain is not None:
                         network = outcome.result["ms"][NETWORK] / 1000
@@ -174,6 +176,15 @@ class Pilot:
         }
         return share, [self._measured(way, rows) for way, rows in mixed.items()]
 
+    def price_of_reference(self) -> tuple[int, float]:
+        """(samples per pixel of a reference, its seconds per pixel of a whole frame). The first of a window's pictures
+        may have waited for a kernel."""
+        return SPP, self._pixel([min(seconds) for seconds in self.reference_seconds.values()], tracing=True)
+
+    def _pixel(self, seconds: Sequence[float], *, tracing: bool) -> float:
+        """Seconds per pixel of a whole frame. seconds: of each window."""
+        return self.processes[tracing].whole * float(np.mean(seconds)) / _pixels(self._view(*self.windows[0]))
+
     def _measured(self, way: Way, rows: Sequence[_Window]) -> Measured:
         every = []
         for row in rows:
@@ -182,11 +193,11 @@ class Pilot:
         # A window without any surface is the same by every way, and would flatter them all.
         figures = [found for found in every if found["psnr"] < SAME] or every
         distances = [found["lpips"] for found in figures if "lpips" in found]
-        process = self.processes[way.name == "path"]
+        tracing = way.name == "path"
         return Measured(
             way=way,
-            pixel=process.whole * float(np.mean([row.spent for row in rows])) / _pixels(self._view(*self.windows[0])),
-            start=process.start,
+            pixel=self._pixel([row.spent for row in rows], tracing=tracing),
+            start=self.processes[tracing].start,
             psnr=decibels(float(np.mean([found["error"] for found in figures]))),
             lpips=float(np.mean(distances)) if distances else None,
             shows=any(found["psnr"] < SAME for found in every),
@@ -268,36 +279,41 @@ def best_mix(pictures: Sequence[tuple[Any, Any, Any]]) -> float:
     return min(SHARES, key=error)
 
 
-def reckoned(measured: Sequence[Measured], most: int) -> list[Measured]:
-    """Path tracing at all powers of two from the least samples measured to ``most``. Those that were not measured lie
-    on the line through the two next to them: decibels and the logarithm of LPIPS by the logarithm of the samples,
-    seconds by the samples. (`bricks`, 64 samples by 4 and 16: 38.05 dB, .0061; measured 38.08, .0050.)
+def reckoned(measured: Sequence[Measured], most: int, prices: Sequence[tuple[int, float]] = ()) -> list[Measured]:
+    """Path tracing at all powers of two from the least samples measured to ``most``.
 
-    measured: two or more, of several samples.
+    Quality of those that were not measured lies on the line through the two next to them: decibels and the logarithm of
+    LPIPS by the logarithm of the samples. (`bricks`, 64 samples by 4 and 16: 38.05 dB, .0061; measured 38.08, .0050.)
+    Seconds of all lie on one line by the samples, which fits those measured best: one picture that had to wait for
+    something else on the machine would bend a line through two, even so far that many samples cost less than none.
+
+    measured: two or more, of several samples. prices: (samples, seconds per pixel) of pictures without such figures.
     """
     rungs = sorted(measured, key=lambda found: found.way.spp)
     known = [rung.way.spp for rung in rungs]
+    fixed, each = _price_line([*zip(known, (rung.pixel for rung in rungs), strict=True), *prices])
     result = []
     spp = known[0]
     while spp <= most:
         place = min(bisect_left(known, spp), len(rungs) - 1)
-        exact = rungs[place] if known[place] == spp else None
-        result.append(exact or _on_line(rungs[place - 1], rungs[place], spp))
+        found = rungs[place] if known[place] == spp else _on_line(rungs[place - 1], rungs[place], spp)
+        result.append(replace(found, pixel=fixed + each * spp))
         spp *= 2
     return result
 
 
+def _price_line(prices: Sequence[tuple[int, float]]) -> tuple[float, float]:
+    """(seconds per pixel without samples, of each sample), none below zero, by the least squares of relative errors."""
+    samples, seconds = np.array(prices, dtype=np.float64).T
+    each, fixed = np.polyfit(samples, seconds, 1, w=1 / seconds)
+    return (max(float(fixed), 0.0), float(each)) if each > 0 else (float(seconds.max()), 0.0)
+
+
 def _on_line(low: Measured, high: Measured, spp: int) -> Measured:
+    """Quality between or beyond two rungs; seconds as the first one's."""
     t = math.log2(spp / low.way.spp) / math.log2(high.way.spp / low.way.spp)
-    share = (spp - low.way.spp) / (high.way.spp - low.way.spp)
     lpips = None
     if low.lpips is not None and high.lpips is not None:
         lpips = max(low.lpips, LEAST_LPIPS) ** (1 - t) * max(high.lpips, LEAST_LPIPS) ** t
-    return Measured(
-        way=low.way.model_copy(update={"spp": spp}),
-        pixel=low.pixel + share * (high.pixel - low.pixel),
-        start=low.start,
-        psnr=low.psnr + t * (high.psnr - low.psnr),
-        lpips=lpips,
-        shows=low.shows,
-    )
+    way, psnr = low.way.model_copy(update={"spp": spp}), low.psnr + t * (high.psnr - low.psnr)
+    return replace(low, way=way, psnr=psnr, lpips=lpips)

@@ -82,7 +82,8 @@ def weigh(
     others = [quickest.model_copy(update={"spp": spp}) for spp in LADDER if spp != QUICK]
     measured = pilot.measure(tracer, [*others, *(Way(name="path", spp=spp) for spp in LADDER)])
     quick += measured[: len(others)]
-    rungs = [*reckoned(quick, max(LADDER)), *reckoned(measured[len(others) :], MOST)]
+    fine = reckoned(measured[len(others) :], MOST, [pilot.price_of_reference()])
+    rungs = [*reckoned(quick, max(LADDER)), *fine]
     options = [path_option(found, shape) for found in rungs]
     if why := _no_baked_light(run, frames, shape, rungs, wanted):
         run.console.say(f"baked light is not weighed: {why}")
