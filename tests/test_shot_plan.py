@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -25,6 +26,7 @@ from dnrpipe.stages.shots.options import Option, Wanted, choose
 from dnrpipe.stages.shots.pilot import Measured, Pilot, _Process, _Window, best_mix, reckoned
 from dnrpipe.stages.shots.plan_shot import (
     Shape,
+    _more_rays,
     _no_baked_light,
     _planned,
     baked_option,
@@ -163,12 +165,12 @@ def test_baked_light_that_is_worse_than_good_path_tracing_is_not_taken() -> None
 def test_rungs_between_and_beyond_those_measured() -> None:
     low = Measured(Way(name="path", spp=4), pixel=1.0, start=2.0, psnr=30.0, lpips=0.1)
     high = Measured(Way(name="path", spp=16), pixel=4.0, start=1.0, psnr=34.0, lpips=0.025)
-    rungs = reckoned([high, low], 64)
+    rungs = reckoned([high, low], [4, 8, 16, 32, 64])
     assert [rung.way.spp for rung in rungs] == [4, 8, 16, 32, 64]
     assert [rung.psnr for rung in rungs] == pytest.approx([30, 32, 34, 36, 38])
     assert [rung.pixel for rung in rungs] == pytest.approx([1, 2, 4, 8, 16])
     assert [rung.lpips for rung in rungs] == pytest.approx([0.1, 0.05, 0.025, 0.0125, 0.00625])
-    blind = reckoned([low, Measured(Way(name="path", spp=16), pixel=4.0, start=1.0, psnr=34.0, lpips=None)], 16)
+    blind = reckoned([low, Measured(Way(name="path", spp=16), pixel=4.0, start=1.0, psnr=34.0, lpips=None)], [4, 8, 16])
     assert [rung.lpips for rung in blind] == [0.1, None, None]
 
 
@@ -178,11 +180,29 @@ def test_a_picture_that_had_to_wait_makes_no_samples_cheap() -> None:
         Measured(Way(name="path", spp=spp), pixel=pixel, start=0.0, psnr=36.0 + spp / 2, lpips=0.01)
         for spp, pixel in ((1, 0.527), (4, 0.972), (8, 0.676))
     ]
-    rungs = reckoned(waited, 64, [(32, 1.169)])
+    rungs = reckoned(waited, [1, 2, 4, 8, 16, 32, 64], [(32, 1.169)])
     prices = [rung.pixel for rung in rungs]
     assert prices == sorted(prices) and 0.5 < prices[0] < 0.8 and 1.5 < prices[-1] < 2.4
-    falling = reckoned(waited[1:], 64)
+    falling = reckoned(waited[1:], [4, 8, 16, 32, 64])
     assert [rung.pixel for rung in falling] == [0.972] * 5
+
+
+def test_base_images_are_weighed_with_rays_between_those_measured() -> None:
+    """Else the fewest that cost half a decibel at most are found in steps of half as many."""
+    found = [
+        Measured(Way(name="base", spp=spp, smooth=True), pixel=spp / 4, start=1.0, psnr=psnr, lpips=0.01)
+        for spp, psnr in ((8, 39.4), (4, 38.8), (16, 40.0))
+    ]
+    rays = _more_rays(found)
+    assert [each.way.spp for each in rays] == [4, 5, 6, 7, 8, 10, 12, 16]
+    assert all(each.way.smooth for each in rays)
+    assert [each.psnr for each in rays] == sorted(each.psnr for each in rays)
+    assert _more_rays(found[:1]) == found[:1] and _more_rays([]) == []
+    odd = replace(found[0], way=Way(name="base", spp=9, smooth=True))
+    assert [each.way.spp for each in _more_rays([found[1], odd])] == [4, 5, 6, 7, 8, 9]
+    shape = Shape(still=100, moving=0, pixels=1, convert=0.0)
+    for weighed, chosen in ((found, 8), (rays, 5)):
+        assert choose([baked_option(each, [], shape) for each in weighed], Wanted())[0].way.spp == chosen
 
 
 def test_without_baked_light_what_it_usually_has_is_enough() -> None:

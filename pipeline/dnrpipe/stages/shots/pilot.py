@@ -34,9 +34,9 @@ FRAMES, SIZE = 2, (192, 108)
 """Frames of the pilot, and pixels of a window."""
 PLACES = ((0.2, 0.7), (0.75, 0.4))
 """Of the windows in a frame."""
-LADDER, MOST = (1, 4, 8), 64
+LADDER = 1, 4, 8
 """Samples per pixel of path-traced pictures, at most a quarter of a reference's: else the denoiser's bias would not
-show; and the most that are reckoned from them (`reckoned`)."""
+show."""
 REFERENCE = Way(name="path", spp=SPP)
 WHOLE = 640
 """Pixels of a whole frame's longer side, at most: pixels of larger ones take as long."""
@@ -279,26 +279,29 @@ def best_mix(pictures: Sequence[tuple[Any, Any, Any]]) -> float:
     return min(SHARES, key=error)
 
 
-def reckoned(measured: Sequence[Measured], most: int, prices: Sequence[tuple[int, float]] = ()) -> list[Measured]:
-    """Path tracing at all powers of two from the least samples measured to ``most``.
+def reckoned(
+    measured: Sequence[Measured], counts: Sequence[int], prices: Sequence[tuple[int, float]] = ()
+) -> list[Measured]:
+    """A way with other numbers of samples per pixel, or rays, from what was measured with some.
 
     Quality of those that were not measured lies on the line through the two next to them: decibels and the logarithm of
     LPIPS by the logarithm of the samples. (`bricks`, 64 samples by 4 and 16: 38.05 dB, .0061; measured 38.08, .0050.)
     Seconds of all lie on one line by the samples, which fits those measured best: one picture that had to wait for
     something else on the machine would bend a line through two, even so far that many samples cost less than none.
 
-    measured: two or more, of several samples. prices: (samples, seconds per pixel) of pictures without such figures.
+    Args:
+        measured: two or more, of several numbers.
+        counts: those wanted, none below the least that was measured.
+        prices: (samples, seconds per pixel) of pictures without such figures.
     """
     rungs = sorted(measured, key=lambda found: found.way.spp)
     known = [rung.way.spp for rung in rungs]
     fixed, each = _price_line([*zip(known, (rung.pixel for rung in rungs), strict=True), *prices])
     result = []
-    spp = known[0]
-    while spp <= most:
+    for spp in counts:
         place = min(bisect_left(known, spp), len(rungs) - 1)
         found = rungs[place] if known[place] == spp else _on_line(rungs[place - 1], rungs[place], spp)
         result.append(replace(found, pixel=fixed + each * spp))
-        spp *= 2
     return result
 
 

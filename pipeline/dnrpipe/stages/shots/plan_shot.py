@@ -21,12 +21,16 @@ from ..stage import Run
 from ..worth import worth
 from .frame_tasks import Way
 from .options import QUICK, USUAL, Option, Wanted
-from .pilot import LADDER, MOST, Measured, Pilot, reckoned
+from .pilot import LADDER, Measured, Pilot, reckoned
 from .records import ShotFrame
 from .renderers import Renderer, shipped_renderer
 
+SAMPLES = 1, 2, 4, 8, 16, 32, 64
+"""Per pixel, of path tracing that is weighed. Those that the pilot does not measure are reckoned (`reckoned`), as are
+RAYS of base images."""
+RAYS = 4, 5, 6, 7, 8, 10, 12, 16
 FEWER = (4, 6)
-"""Rays per pixel of base images that are tried beside the settings'."""
+"""Rays per pixel of base images that are measured beside the settings'."""
 SMOOTH = (4, 8, 16)
 """The same of base images that are smoothed instead of denoised: that takes as long as three to eight rays do, and does
 less where most light comes straight from a sky or lies baked on matt surfaces. The last is for where few path-traced
@@ -82,8 +86,8 @@ def weigh(
     others = [quickest.model_copy(update={"spp": spp}) for spp in LADDER if spp != QUICK]
     measured = pilot.measure(tracer, [*others, *(Way(name="path", spp=spp) for spp in LADDER)])
     quick += measured[: len(others)]
-    fine = reckoned(measured[len(others) :], MOST, [pilot.price_of_reference()])
-    rungs = [*reckoned(quick, max(LADDER)), *fine]
+    fine = reckoned(measured[len(others) :], SAMPLES, [pilot.price_of_reference()])
+    rungs = [*reckoned(quick, [n for n in SAMPLES if n <= max(LADDER)]), *fine]
     options = [path_option(found, shape) for found in rungs]
     if why := _no_baked_light(run, frames, shape, rungs, wanted):
         run.console.say(f"baked light is not weighed: {why}")
@@ -97,11 +101,12 @@ def weigh(
     renderer, trust = shipped_renderer(run, tracer.common.background, trust=1.0), 0.0
 
     measured = pilot.measure(renderer, [*ways, *smooth])
-    ours = sorted((found for found in measured if found.way.name == "base"), key=lambda found: not found.way.smooth)
+    base = [found for found in measured if found.way.name == "base"]
+    ours = [each for smooth in (True, False) for each in _more_rays([b for b in base if b.way.smooth == smooth])]
     if wanted.way != "base":
         trust, corrected = pilot.trusted(ways)
         run.console.say(_trust_told(trust))
-        ours += corrected if trust or wanted.way == "neural" else []
+        ours += _more_rays(corrected) if trust or wanted.way == "neural" else []
     options += [baked_option(found, options, shape) for found in ours]
     prepared = run.workspace.manifest.prepared
     candidates = prepared.views["train"] if prepared else 0
@@ -126,6 +131,14 @@ def weigh(
             )
         return options, trust
     return _running(options, tracing=False), trust
+
+
+def _more_rays(measured: Sequence[Measured]) -> list[Measured]:
+    """Base images of as many rays as were measured, and of RAYS between; the most are last."""
+    known = sorted(found.way.spp for found in measured)
+    if len(known) < 2:
+        return [*measured]
+    return reckoned(measured, sorted({*known, *(n for n in RAYS if known[0] < n < known[-1])}))
 
 
 def _running(options: Sequence[Option], *, tracing: bool) -> list[Option]:
