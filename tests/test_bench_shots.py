@@ -75,3 +75,22 @@ def test_where_nothing_is_as_good_the_last_rungs_bound_the_ratio() -> None:
     found = cells(poor | {"cycles": [rung(64, 5.0, 35.0, 0.02)]})
     assert found[9] == "not by Cycles, 64 spp, high" and found[10] == "> 5.00"
     assert float(found[14].removeprefix("< ")) == pytest.approx((100 + REEL * 2) / (REEL * 5), abs=0.01)
+
+
+def test_the_first_table_says_each_scenes_part_of_path_tracings_time_and_flicker() -> None:
+    """By size, the largest first; scenes by what they save there."""
+    changes = {"flicker": 0.004, "flicker_rms": 0.006}
+    rungs = [each | {"flicker": 0.008, "flicker_rms": 0.024} for each in row()["rungs"]]
+    rows = [
+        row(),
+        row(scene="b", size="1280x720", frame=5.0, rungs=rungs, ours=figures(30.0, 0.05) | changes),
+        row(scene="c", size="1280x720", ours=figures(40.0, 0.05)),
+    ]
+    lines = markdown({"rows": rows}).splitlines()
+    assert lines[2].startswith("| scene | 1280x720: time |") and "640x360: time" in lines[2]
+    found = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[4:7]]
+    ours = 100 / REEL + 2.0
+    between = seconds_as_good(rows[1], ("psnr", "lpips")) or 0.0
+    assert found[0] == ["c", f"< {ours / 8:.2f}", "", "1.00", "", "", "", "", ""]
+    assert found[1] == ["b", f"{(ours + 3) / 8:.2f}", f"{(ours + 3) / between:.2f}", "0.50", "0.25", "", "", "", ""]
+    assert found[2][0] == "a" and found[2][1:5] == [""] * 4 and found[2][5] == f"{ours / 8:.2f}"

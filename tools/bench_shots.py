@@ -407,17 +407,50 @@ def as_good(rung: dict[str, Any], own: dict[str, Any], names: Sequence[str]) -> 
 
 
 def markdown(results: dict[str, Any]) -> str:
-    """Seconds and quality of every shot, and path tracing at equal quality: a table for each machine."""
+    """Two tables for each machine: each scene's part of path tracing's time and flicker; and what that is made of."""
     by_machine: dict[str, list[dict[str, Any]]] = {}
     for row in results["rows"]:
         by_machine.setdefault(row["machine"], []).append(row)
-    return "\n\n".join(_table(machine, rows) for machine, rows in by_machine.items()) or "Not measured yet."
+    parts = [f"Measured on {machine}.\n\n{_ratios(rows)}\n\n{_table(rows)}" for machine, rows in by_machine.items()]
+    return "\n\n".join(parts) or "Not measured yet."
 
 
-def _table(machine: str, rows: Sequence[dict[str, Any]]) -> str:
+def _ratios(rows: Sequence[dict[str, Any]]) -> str:
+    """A line a scene: the shot's part of path tracing's time and flicker, at each size."""
+    sizes = sorted({row["size"] for row in rows}, key=parse_size, reverse=True)
+    of_place = {(row["scene"], row["size"]): row for row in rows}
+    found = [[of_place.get((scene, size)) for size in sizes] for scene in {row["scene"]: None for row in rows}]
+    found.sort(key=lambda each: [time_ratios(row) if row else (math.inf,) * 2 for row in each])
+    heads = [f"{size}: time | between rungs | flicker | without noise" for size in sizes]
+    lines = [f"| scene | {' | '.join(heads)} |", f"|{'---|' * (1 + 4 * len(sizes))}"]
+    for each in found:
+        cells = [next(row["scene"] for row in each if row)]
+        for row in each:
+            numbers = (*time_ratios(row), *flicker_ratios(row)) if row else (math.nan,) * 4
+            texts = ["" if math.isnan(number) else f"{number:.2f}" for number in numbers]
+            bound = "< " if row and not equal_rung(row, ("psnr", "lpips")) else ""
+            cells += [bound + texts[0], *texts[1:]]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def time_ratios(row: dict[str, Any]) -> tuple[float, float]:
+    """Of REEL frames, by the rung that is as good and by the line between rungs; where none is as good, the last one
+    bounds the former, and the latter is not known."""
+    rung = equal_rung(row, ("psnr", "lpips")) or last_rung(row)
+    exact = seconds_as_good(row, ("psnr", "lpips"))
+    ours = row["before"] / REEL + row["frame"]
+    return ours / rung["frame"], math.nan if exact is None else ours / exact
+
+
+def flicker_ratios(row: dict[str, Any]) -> tuple[float, ...]:
+    """Of the mean change, and of its root mean square without the reference's noise (older rows lack that)."""
+    rung = equal_rung(row, ("psnr", "lpips")) or last_rung(row)
+    return tuple(row["ours"][name] / rung[name] if name in row["ours"] else math.nan for name in FLICKER)
+
+
+def _table(rows: Sequence[dict[str, Any]]) -> str:
     lines = [
-        f"Measured on {machine}.",
-        "",
         "| scene | size | way, rays | before the first frame, s | a frame, s | dB | LPIPS | FLIP | flicker"
         " | path tracing as good (dB and LPIPS) | its frame, s | its flicker"
         " | 240 frames, s | path tracing, s | ratio | between rungs | N* at equal PSNR | at equal LPIPS |",
@@ -430,15 +463,12 @@ def _table(machine: str, rows: Sequence[dict[str, Any]]) -> str:
         way = f"{chosen['name']}{', smoothed,' if chosen.get('smooth') else ''} {chosen['spp']}"
         cells = [row["scene"], row["size"], way, f"{row['before']:.0f}", f"{row['frame']:.2f}"]
         cells += [f"{own['psnr']:.2f}", f"{own['lpips']:.4f}", f"{own['flip']:.4f}", flicker_of(own)]
-        if rung is None:
-            last = last_rung(row)
-            cells += [f"not by {named(last)}", f"> {last['frame']:.2f}", flicker_of(last)]
-            cells += [f"{ours:.0f}", f"> {REEL * last['frame']:.0f}", f"< {ours / (REEL * last['frame']):.2f}"]
-        else:
-            cells += [named(rung), f"{rung['frame']:.2f}", flicker_of(rung)]
-            cells += [f"{ours:.0f}", f"{REEL * rung['frame']:.0f}", f"{ours / (REEL * rung['frame']):.2f}"]
-        exact = seconds_as_good(row, ("psnr", "lpips"))
-        cells.append("" if exact is None else f"{ours / (REEL * exact):.2f}")
+        last = rung or last_rung(row)
+        over, under = ("", "") if rung else ("> ", "< ")
+        cells += [named(last) if rung else f"not by {named(last)}", f"{over}{last['frame']:.2f}", flicker_of(last)]
+        by_rungs, between = time_ratios(row)
+        cells += [f"{ours:.0f}", f"{over}{REEL * last['frame']:.0f}", f"{under}{by_rungs:.2f}"]
+        cells.append("" if math.isnan(between) else f"{between:.2f}")
         cells += [break_even(row, name) for name in ("psnr", "lpips")]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
