@@ -23,7 +23,7 @@ from dnrpipe.stages.shots.frame_tasks import FrameCommon, FrameTask, Way
 from dnrpipe.stages.shots.frame_worker import Worker
 from dnrpipe.stages.shots.open_shot import parse_size, resized
 from dnrpipe.stages.shots.options import Option, Wanted, choose
-from dnrpipe.stages.shots.pilot import Measured, Pilot, _Process, _Window, best_mix, reckoned
+from dnrpipe.stages.shots.pilot import Measured, Pilot, _Window, best_mix, kind_of, reckoned
 from dnrpipe.stages.shots.plan_shot import (
     Shape,
     _more_rays,
@@ -412,7 +412,7 @@ def test_windows_that_show_nothing_do_not_count() -> None:
     pilot.lpips, pilot.windows = None, [(0, (0.5, 0.5))]
     pilot.frames = frames(1, cut=1)
     way = Way(name="path", spp=4)
-    pilot.processes = {True: _Process(start=2.0, whole=0.5)}
+    pilot.starts, pilot.wholes = {True: 2.0}, {kind_of(way): 0.5}
     rows = [_Window(0, white, 1.0), _Window(1, black + 0.1, 3.0)]
     found = pilot._measured(way, rows)
     assert found.psnr == pytest.approx(20, abs=0.01) and found.start == 2.0
@@ -421,6 +421,22 @@ def test_windows_that_show_nothing_do_not_count() -> None:
     assert found.shows
     nothing = pilot._measured(way, rows[:1])
     assert nothing.psnr == pytest.approx(80, abs=0.01) and not nothing.shows
+
+
+def test_each_kind_of_way_is_priced_by_a_whole_frame_of_its_own() -> None:
+    """The network's frame says nothing of what smoothed rays take where windows show more sky than the frame."""
+    pilot: Any = object.__new__(Pilot)
+    pilot.frames, pilot.wholes = frames(2, cut=2), {}
+    pilot.windows = [(0, (0.2, 0.7)), (0, (0.7, 0.4)), (1, (0.2, 0.7))]
+    view = pilot._view(*pilot.windows[0])
+    pixels = view.width * view.height
+    network, smoothed = Way(name="neural", spp=6), Way(name="base", spp=8, smooth=True)
+    black = torch.zeros(1, 3, 8, 8)
+    rows = [_Window(0, black, 1.0), _Window(1, black, 3.0), _Window(2, black, 50.0)]
+    pilot._set_whole(network, rows, 1.0 / pixels)
+    pilot._set_whole(smoothed, rows, 3.0 / pixels)
+    assert pilot._pixel([4.0], network.model_copy(update={"spp": 4})) == pytest.approx(4.0 * 0.5 / pixels)
+    assert pilot._pixel([4.0, 8.0], smoothed.model_copy(update={"spp": 16})) == pytest.approx(6.0 * 1.5 / pixels)
 
 
 def test_a_frame_in_which_things_move_is_not_remembered(tmp_path) -> None:  # type: ignore[no-untyped-def]

@@ -45,7 +45,7 @@ from .renderers import Renderer, path_tracer, shipped_renderer, trained_renderer
 
 CHECKED = 2
 """Frames of a shot that are traced to check it."""
-PLAN_VERSION = 22
+PLAN_VERSION = 23
 LIGHT_SIDE, MORE = 1024, (1, 2, 4)
 """Texels of the light map's side, and times as many paths a texel for more pixels."""
 BATCH = 8

@@ -46,6 +46,10 @@ SAME, LEAST_LPIPS = 99.0, 1e-6
 """PSNR above which, and LPIPS below which, pictures are the same."""
 
 
+_Kind = tuple[str, bool]
+"""Name, and whether it is smoothed: path tracing is one kind, whatever the denoiser's quality."""
+
+
 @dataclass(frozen=True)
 class Measured:
     """A way on the pilot's windows. pixel: seconds per pixel of a whole frame, files included. start: seconds until its
@@ -69,15 +73,6 @@ class _Window:
     spent: float
 
 
-@dataclass(frozen=True)
-class _Process:
-    """start: seconds from its start to its first picture. whole: those of a frame by its pixels over those of the
-    frame's windows by theirs, of one way: windows show more than the sky, and each has a price of its own."""
-
-    start: float
-    whole: float
-
-
 class Pilot:
     """Renders windows of a shot's frames."""
 
@@ -89,12 +84,16 @@ class Pilot:
         self.windows = [(index, place) for index in chosen for place in PLACES]
         self.references: dict[int, Truth] = {}
         self.reference_seconds: dict[int, list[float]] = {}  # of each window's pictures
-        self.processes: dict[bool, _Process] = {}  # whether it path traces
+        self.starts: dict[bool, float] = {}
+        """Seconds from a process' start to its first picture, by whether it path traces."""
+        self.wholes: dict[_Kind, float] = {}
+        """Seconds of a frame by its pixels over those of the frame's windows by theirs, of one way of each kind:
+        windows show more than the sky, and each has a price of its own."""
         self.rows: dict[Way, list[_Window]] = {}
 
     def measure(self, renderer: Renderer, ways: Sequence[Way]) -> list[Measured]:
         """The ways on the windows, one after the other; of each neural one also the base image that it corrects,
-        before it. The references come first where there are none yet; last a whole frame by the first way, twice.
+        before it. The references come first where there are none yet; last a whole frame by a way of each kind.
 
         Raises UserError: a frame failed twice.
         """
@@ -102,7 +101,6 @@ class Pilot:
         keys: list[int | None] = []  # the window, where it is measured
         drawn: dict[int, list[Any]] = {}
         tracing = ways[0].name == "path"
-        known = tracing in self.processes
         references = [] if self.references else [REFERENCE] * FEWEST
         for turn, way in enumerate([*references, *ways]):
             for key, (index, place) in enumerate(self.windows):
@@ -112,13 +110,20 @@ class Pilot:
                     steps = self._steps(way, index, place, len(tasks))
                 keys += [*[None] * (len(steps) - 1), key]
                 tasks += steps
-        if not known:  # the first one readies what its size takes, and takes up to twice as long
-            asked_for = ways[0], self.windows[0][0], None, None if tracing else ()
-            first, second = (self._task(*asked_for, len(tasks) + i, i) for i in (0, 1))
-            keys += [None, None]
-            tasks += in_succession([first, second.model_copy(update={"before": first})])
+        kinds = {kind_of(way): [other for other in ways if kind_of(other) == kind_of(way)] for way in ways}
+        examples = [of_kind[len(of_kind) // 2] for kind, of_kind in kinds.items() if kind not in self.wholes]
+        if examples:
+            index, earlier = self.windows[0][0], None if tracing else ()
+            # The first of each readies what its size takes, and takes up to twice as long.
+            asked = [way for way in examples for _ in (1, 2)]
+            wholes = [self._task(way, index, None, earlier, len(tasks) + i, i) for i, way in enumerate(asked)]
+            alone = [None, *wholes[:-1]]
+            wholes = [task.model_copy(update={"before": one}) for task, one in zip(wholes, alone, strict=True)]
+            keys += [None] * len(wholes)
+            tasks += in_succession(wholes)
         found: dict[Way, list[_Window]] = {}
-        start, whole, writing, kept = None, 0.0, 0.0, self.run.kept
+        start, writing, kept = None, 0.0, self.run.kept
+        whole: list[tuple[float, float]] = []  # seconds of a task, and what of it is the network's
         label = "pilot: " + ("path tracing" if tracing else "base image and network")
         with (
             closing(frame_outcomes(self.run, renderer, tasks, "pilot")) as outcomes,
@@ -138,8 +143,10 @@ class Pilot:
                     height=task.view.height,
                 )
                 spent = outcome.result["seconds"] + outcome.result["write_seconds"]
+                network = outcome.result["ms"].get(NETWORK, 0.0) / 1000
                 # Of a whole frame, what writing the one before took longer than rendering this one.
-                whole, writing = outcome.result["seconds"] + writing, outcome.result["write_seconds"]
+                whole.append((outcome.result["seconds"] + writing, network))
+                writing = outcome.result["write_seconds"]
                 if start is None:
                     asked = outcome.seconds if kept is None else time.monotonic() - kept.started
                     start = max(0.0, asked - spent)
@@ -148,16 +155,17 @@ class Pilot:
                     self.reference_seconds.setdefault(key, []).append(spent)
                 elif key is not None:
                     if task.plain is not None:
-                        network = outcome.result["ms"][NETWORK] / 1000
                         row = _Window(key, shown(self.display, task.plain), spent - network)
                         found.setdefault(base_of(task.way), []).append(row)
                     row = _Window(key, shown(self.display, task.output), spent)
                     found.setdefault(task.way, []).append(row)
                 bar.advance(note=task.way.told)
-        if not known:
-            own = [row.spent for row in found[ways[0]] if self.windows[row.key][0] == self.windows[0][0]]
-            pixel = float(np.mean(own)) / _pixels(tasks[0].view)
-            self.processes[tracing] = _Process(start or 0.0, whole / _pixels(tasks[-1].view) / pixel)
+        self.starts.setdefault(tracing, start or 0.0)
+        for way, (seconds, network) in zip(examples, whole[len(tasks) - 2 * len(examples) + 1 :: 2], strict=True):
+            pixels = _pixels(tasks[-1].view)
+            self._set_whole(way, found[way], seconds / pixels)
+            if way.name == "neural":
+                self._set_whole(base_of(way), found[base_of(way)], (seconds - network) / pixels)
         self.references |= {key: Truth.of(pictures) for key, pictures in drawn.items()}
         self.rows |= found
         return [self._measured(way, rows) for way, rows in found.items()]
@@ -179,11 +187,16 @@ class Pilot:
     def price_of_reference(self) -> tuple[int, float]:
         """(samples per pixel of a reference, its seconds per pixel of a whole frame). The first of a window's pictures
         may have waited for a kernel."""
-        return SPP, self._pixel([min(seconds) for seconds in self.reference_seconds.values()], tracing=True)
+        return SPP, self._pixel([min(seconds) for seconds in self.reference_seconds.values()], REFERENCE)
 
-    def _pixel(self, seconds: Sequence[float], *, tracing: bool) -> float:
+    def _pixel(self, seconds: Sequence[float], way: Way) -> float:
         """Seconds per pixel of a whole frame. seconds: of each window."""
-        return self.processes[tracing].whole * float(np.mean(seconds)) / _pixels(self._view(*self.windows[0]))
+        return self.wholes[kind_of(way)] * float(np.mean(seconds)) / _pixels(self._view(*self.windows[0]))
+
+    def _set_whole(self, way: Way, rows: Sequence[_Window], pixel: float) -> None:
+        """rows: windows by the way. pixel: seconds of the first window's whole frame, by its pixels."""
+        own = [row.spent for row in rows if self.windows[row.key][0] == self.windows[0][0]]
+        self.wholes[kind_of(way)] = pixel * _pixels(self._view(*self.windows[0])) / float(np.mean(own))
 
     def _measured(self, way: Way, rows: Sequence[_Window]) -> Measured:
         every = []
@@ -193,11 +206,10 @@ class Pilot:
         # A window without any surface is the same by every way, and would flatter them all.
         figures = [found for found in every if found["psnr"] < SAME] or every
         distances = [found["lpips"] for found in figures if "lpips" in found]
-        tracing = way.name == "path"
         return Measured(
             way=way,
-            pixel=self._pixel([row.spent for row in rows], tracing=tracing),
-            start=self.processes[tracing].start,
+            pixel=self._pixel([row.spent for row in rows], way),
+            start=self.starts[way.name == "path"],
             psnr=decibels(float(np.mean([found["error"] for found in figures]))),
             lpips=float(np.mean(distances)) if distances else None,
             shows=any(found["psnr"] < SAME for found in every),
@@ -263,6 +275,11 @@ class Pilot:
 
 def _pixels(view: View) -> int:
     return view.width * view.height
+
+
+def kind_of(way: Way) -> _Kind:
+    """Of which a whole frame is timed for all."""
+    return way.name, way.smooth
 
 
 def base_of(way: Way) -> Way:
