@@ -123,7 +123,7 @@ class Pilot:
             tasks += in_succession(wholes)
         found: dict[Way, list[_Window]] = {}
         start, writing, kept = None, 0.0, self.run.kept
-        whole: list[tuple[float, float]] = []  # seconds of a task, and what of it is the network's
+        costs: list[tuple[float, float]] = []  # seconds of a task, and what of it is the network's
         label = "pilot: " + ("path tracing" if tracing else "base image and network")
         with (
             closing(frame_outcomes(self.run, renderer, tasks, "pilot")) as outcomes,
@@ -145,7 +145,7 @@ class Pilot:
                 spent = outcome.result["seconds"] + outcome.result["write_seconds"]
                 network = outcome.result["ms"].get(NETWORK, 0.0) / 1000
                 # Of a whole frame, what writing the one before took longer than rendering this one.
-                whole.append((outcome.result["seconds"] + writing, network))
+                costs.append((outcome.result["seconds"] + writing, network))
                 writing = outcome.result["write_seconds"]
                 if start is None:
                     asked = outcome.seconds if kept is None else time.monotonic() - kept.started
@@ -161,7 +161,7 @@ class Pilot:
                     found.setdefault(task.way, []).append(row)
                 bar.advance(note=task.way.told)
         self.starts.setdefault(tracing, start or 0.0)
-        for way, (seconds, network) in zip(examples, whole[len(tasks) - 2 * len(examples) + 1 :: 2], strict=True):
+        for way, (seconds, network) in zip(examples, costs[len(tasks) - 2 * len(examples) + 1 :: 2], strict=True):
             pixels = _pixels(tasks[-1].view)
             self._set_whole(way, found[way], seconds / pixels)
             if way.name == "neural":
