@@ -420,7 +420,7 @@ def _ratios(rows: Sequence[dict[str, Any]]) -> str:
     sizes = sorted({row["size"] for row in rows}, key=parse_size, reverse=True)
     of_place = {(row["scene"], row["size"]): row for row in rows}
     found = [[of_place.get((scene, size)) for size in sizes] for scene in {row["scene"]: None for row in rows}]
-    found.sort(key=lambda each: [time_ratios(row) if row else (math.inf,) * 2 for row in each])
+    found.sort(key=lambda each: [time_ratios(row)[0] if row else math.inf for row in each])
     heads = [f"{size}: time | between rungs | flicker | without noise" for size in sizes]
     lines = [f"| scene | {' | '.join(heads)} |", f"|{'---|' * (1 + 4 * len(sizes))}"]
     for each in found:
